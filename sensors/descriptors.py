@@ -163,14 +163,10 @@ def band_pairs(first: np.ndarray, second: np.ndarray, reach: np.ndarray | float)
 def gate_pairs(
     z: np.ndarray, noise: np.ndarray, mean: np.ndarray, cov: np.ndarray, gate: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (C,) of measurements and (C,) of predictions that are near to one another.
+    """Rows (C,) of measurements z (K, p) and (C,) of predictions (M, p) that are near to one another.
 
-    Args:
-        z: (K, p) places of features.
-        noise: (K, p, p) their covariances.
-        mean: (M, p) predicted places; those that are not finite are near to nothing.
-        cov: (M, p, p) their covariances, without the measurements' noise.
-        gate: largest squared Mahalanobis distance.
+    `gate` is the largest squared Mahalanobis distance; cov (M, p, p) is without the measurements' noise (K, p, p).
+    Predictions that are not finite are near to nothing.
     """
     held = np.flatnonzero(np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
     mean, cov = mean[held], cov[held]
@@ -220,11 +216,7 @@ class DescriptorStore:
         return self._descriptors[: self._count]
 
     def add(self, ids: np.ndarray, descriptors: np.ndarray) -> None:
-        """Adds descriptors (k, d) of new landmarks (k,).
-
-        Raises:
-            InputError: the ids do not ascend beyond those held, or the descriptors have another length.
-        """
+        """Adds descriptors (k, d) of new landmarks (k,), whose ids ascend beyond those held; else an InputError."""
         ids = np.asarray(ids, dtype=np.int64)
         if descriptors.shape != (ids.size, self.length):
             raise InputError(
@@ -243,11 +235,7 @@ class DescriptorStore:
         self._count = total
 
     def remove(self, ids: np.ndarray) -> None:
-        """Drops landmarks (k,).
-
-        Raises:
-            InputError: one is not held.
-        """
+        """Drops landmarks (k,); an InputError if one is not held."""
         rows = self.rows(ids)
         if not rows.size:
             return
@@ -259,11 +247,7 @@ class DescriptorStore:
         self._count = total
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
-        """Rows (k,) of landmarks (k,).
-
-        Raises:
-            InputError: one is not held.
-        """
+        """Rows (k,) of landmarks (k,); an InputError if one is not held."""
         ids = np.asarray(ids, dtype=np.int64)
         rows, held = self.find(ids)
         if not held.all():
@@ -285,11 +269,7 @@ class DescriptorStore:
         self._count = self._ids.size
 
     def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
-        """The landmark (K,) of each feature with a descriptor (K, d), each landmark once; NULL where there is none.
-
-        Raises:
-            InputError: the descriptors have another length.
-        """
+        """The landmark (K,) of each descriptor (K, d), each once; NULL where there is none, an InputError for another d."""
         if descriptors.ndim != 2 or descriptors.shape[1] != self.length:
             raise InputError(f"descriptors must be (K, {self.length}), got {descriptors.shape}")
         matches = match_all(descriptors, self.descriptors, limits)

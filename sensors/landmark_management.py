@@ -79,11 +79,7 @@ class LandmarkManager:
         return self.observations >= self.config.observations
 
     def observe(self, names: np.ndarray) -> np.ndarray:
-        """Begins a frame in which descriptors (k,), each once, were seen again; returns names (j,) of those that are dropped.
-
-        Raises:
-            InputError: a landmark is not held.
-        """
+        """Begins a frame in which landmarks (k,) were seen again; returns names (j,) of those dropped. Errors as `remove`."""
         rows = self._rows(names)
         self.frame += 1
         self._table[rows, 1] += 1
@@ -129,11 +125,7 @@ class LandmarkManager:
         return names
 
     def remove(self, names: np.ndarray) -> None:
-        """Drops descriptors (k,), landmarks or not.
-
-        Raises:
-            InputError: a landmark is not held.
-        """
+        """Drops descriptors (k,), landmarks or not; an InputError where one is not held."""
         self._table = np.delete(self._table, self._rows(names), axis=0)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -76,14 +76,8 @@ class NamedLandmarkSensor(Sensor):
 class AnonymousLandmarkSensor(Sensor):
     """Unknown association: maximum likelihood per particle with mutual exclusion; spurious landmarks are deleted.
 
-    The map must keep evidence (`LandmarkMap(space, evidence=True)`).
-
-    Args:
-        model: how a landmark is measured; its `visible` says which ones should have been seen.
-        landmark: its parametrisation.
-        gates: candidates, and the cost of new landmarks and clutter.
-        existence: counts observations and misses.
-        likelihood: of the innovation, None is Gaussian.
+    The map must keep evidence (`LandmarkMap(space, evidence=True)`); the model's `visible` says which landmarks should have
+    been seen. Without a likelihood that of the innovation is Gaussian.
     """
 
     def __init__(

@@ -42,11 +42,7 @@ class SiftConfig(Ranged):
 
 @final
 class Sift(FeatureExtractor, Descriptor):
-    """Finds and describes keypoints.
-
-    Args:
-        config: settings.
-    """
+    """Finds and describes keypoints."""
 
     def __init__(self, config: SiftConfig | None = None) -> None:
         self.config = config or SiftConfig()

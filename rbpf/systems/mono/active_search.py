@@ -73,7 +73,6 @@ class RobustMotionGate(OutlierGate):
     def fit(
         self, nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, trusted: np.ndarray
     ) -> MotionFit:
-        """See `OutlierGate`."""
         from rbpf.kernels.robust_fit import robust_fit
 
         rank = factor.shape[1]
@@ -114,14 +113,7 @@ class SearchResult:
 
 @final
 class ActiveSearch:
-    """Looks for the features of a table.
-
-    Args:
-        features: where the belief has them; a feature's name is its row in the table.
-        table: how they look.
-        config: settings of the search.
-        gate: which matches agree with one motion.
-    """
+    """Looks for the features of a table, under whose rows the belief has them; by default with a `RobustMotionGate`."""
 
     def __init__(
         self, features: FeatureSensor, table: FeatureTable, config: SearchConfig, gate: OutlierGate | None = None

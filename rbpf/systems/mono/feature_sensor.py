@@ -55,14 +55,9 @@ class UnknownDepth(ABC):
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
     ) -> list[Observations]:
-        """Of features (K,) at z (K, 2): what they say of the pose and of themselves.
+        """What features (K,) of this parametrisation at z (K, 2) px, cov (K, 2, 2) px², say of the pose and of themselves.
 
-        Args:
-            belief: predicted.
-            z: (K, 2) px.
-            cov: (K, 2, 2) px².
-            ids: (K,) landmarks of this parametrisation.
-            scaled: whether points are seen that hold the scale, which else the prior of depth does.
+        `scaled` is whether points are seen that hold the scale, which else the prior of depth does.
         """
 
     @abstractmethod
@@ -87,12 +82,7 @@ class UnknownDepth(ABC):
 
 @final
 class InverseDepthRays(UnknownDepth):
-    """Rays with an inverse depth from where a feature was seen first, E06 §5.
-
-    Args:
-        camera: of the images.
-        config: settings.
-    """
+    """Rays with an inverse depth from where a feature was seen first, E06 §5."""
 
     landmark: InverseDepth
     model: CameraRay
@@ -193,14 +183,8 @@ class InverseDepthRays(UnknownDepth):
 class FeatureSensor(Sensor):
     """Takes features with names (`FeatureFrame`), and says where the map has features.
 
-    A feature's name is its landmark's id. Members of a constellation have none of their own; its id is the first one's name.
-
-    Args:
-        camera: of the images.
-        unknown_depth: what features are as long as their depth is not known.
-        max_new_per_frame: features started in one frame at most.
-        group: known points that are one landmark, a constellation; None where there is none.
-        fixed: the map is known: its points say where the camera is, and are not changed by what is seen of them.
+    A feature's name is its landmark's id. Members of a constellation, the known points of `group`, have none of their own;
+    its id is the first one's name. The points of a `fixed` map say where the camera is, and are not changed by what is seen.
     """
 
     def __init__(
@@ -274,11 +258,7 @@ class FeatureSensor(Sensor):
     def innovations(
         self, belief: Belief, names: np.ndarray, px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of features (K,) found at px (K, 2), in the heaviest particle at its predicted pose.
-
-        Returns:
-            Which features, ν (k, 2), H (k, 2, d) and J P Jᵀ (k, 2, 2).
-        """
+        """Of features (K,) found at px (K, 2), in the heaviest particle: which, ν (k, 2), H (k, 2, d), J P Jᵀ (k, 2, 2)."""
         which, nus, jacs, covs = [], [], [], []
         for model, chosen, ids in self._by_model(belief, names):
             z = px[chosen].reshape(1, -1) if isinstance(model, GroupView) else px[chosen]

@@ -96,11 +96,7 @@ class FeatureTable:
     def nearest_appearance(
         self, rows: np.ndarray, position: np.ndarray, world_from_camera: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of features (k,) at homogeneous points (k, 4), the patches that were kept from the direction nearest to a pose.
-
-        Returns:
-            The patches (k, S, S), and the poses (k, 7) from which they were seen.
-        """
+        """Patches (k, S, S) of features at points (k, 4) kept from nearest to a pose's direction, and from where (k, 7)."""
         first, last = self.first_pose[rows], self.last_pose[rows]
         of_first, of_last = (view_change(position, pose, world_from_camera)[0] for pose in (first, last))
         later = of_last > of_first
@@ -132,11 +128,7 @@ def patch_affines(
 ) -> np.ndarray:
     """∂(pixel in the patch's image)/∂(pixel now) (K, 2, 2) of patches that face the camera that saw them (E06 §4.1).
 
-    Args:
-        camera: of both images.
-        position: (K, 4) homogeneous world points.
-        first_pose: (K, 7) world_from_camera of the patches' images.
-        world_from_camera: (7,) now.
+    They are at homogeneous world points (K, 4), and were seen from poses (K, 7); now the camera is at (7,).
     """
     point = position[:, :3] / np.maximum(position[:, 3:], MIN_WEIGHT)
     normal = SE3.translation(first_pose) - point
@@ -154,13 +146,7 @@ def patch_affines(
 
 
 def view_change(position: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Between two cameras, of each feature: cosine (K,) of the lines of sight, and ratio (K,) of the distances.
-
-    Args:
-        position: (K, 4) homogeneous world points.
-        one_pose: (7,) or (K, 7) world_from_camera.
-        other_pose: likewise.
-    """
+    """From two poses, (7,) or (K, 7), to points (K, 4): cosine (K,) of the lines of sight, ratio (K,) of distances."""
     one, other = (position[:, :3] - position[:, 3:] * SE3.translation(pose) for pose in (one_pose, other_pose))
     far, near = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):

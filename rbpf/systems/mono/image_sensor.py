@@ -61,12 +61,8 @@ class Measurement:
 class ImageSensor(Sensor):
     """Finds the features of the map in images, and new ones. It takes a `Measurement` and fills it in.
 
-    Args:
-        features: what turns found features into observations and landmarks; a feature's name is its row in `table`.
-        config: settings of the search.
-        gate: which matches of a frame agree with one motion of the camera.
-        detector: finds the corners that become features, and those by which a lost camera is found.
-        descriptor: tells them apart where a camera was lost.
+    A feature's name is its row in `table`. The detector finds the corners that become features, and those by which a lost
+    camera is found; these the descriptor tells apart.
     """
 
     def __init__(
@@ -103,14 +99,7 @@ class ImageSensor(Sensor):
     def begin_lost(
         self, patches: np.ndarray, first_px: np.ndarray, first_pose: np.ndarray, positions: np.ndarray
     ) -> None:
-        """Takes the points of a map that is known, K of them; where in it the camera is has to be found out.
-
-        Args:
-            patches: (K, S, S) uint8 of their first appearances.
-            first_px: (K, 2) where those were.
-            first_pose: (K, 7) world_from_camera then.
-            positions: (K, 3) of the points.
-        """
+        """Takes the points (K, 3) of a known map, and their first appearances: where the camera is has to be found out."""
         rows = self.table.add(patches, first_px, first_pose)
         self.table.position[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
         self.bad_frames = self.config.lost_frames
@@ -174,10 +163,7 @@ class ImageSensor(Sensor):
     def resampled(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
         """Remembers where all features are and were seen first, after the particles were resampled from a batch posterior.
 
-        Args:
-            belief: of the new particles.
-            path: (T, 7) of the heaviest one.
-            started: (F,) in which of the T frames each feature of the table was started.
+        The heaviest particle's path is (T, 7); each feature of the table was started in one (F,) of its frames.
         """
         table, rows = self.table, np.arange(started.size)
         held = belief.map.holds(rows)

@@ -82,11 +82,7 @@ class KnownMap:
         return 0.5 * float(np.linalg.norm(np.ptp(places, axis=0)))
 
     def require_camera(self, camera: Pinhole, what: str) -> None:
-        """Refuses another camera than the map's.
-
-        Raises:
-            InputError: sizes, focal lengths or kinds of lens differ.
-        """
+        """Refuses, by an InputError, another camera than the map's: size, focal length or kind of lens differ."""
         mine = self.camera
         if mine.distortion_model != camera.distortion_model:
             raise InputError(
@@ -165,12 +161,8 @@ def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
 def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored | None) -> MapEstimate:
     """Every landmark of a filter's map, in the order of their names, with the column `ray`.
 
-    A ray is linearised at its mean inverse depth; its ends are those in the heaviest particle.
-
-    Args:
-        filter_: of monocular SLAM.
-        features: its sensor's part that knows what landmarks are.
-        world: the reported world in each particle's own; None where they are one.
+    A ray is linearised at its mean inverse depth; its ends are those in the heaviest particle. `world` is the reported world
+    in each particle's own; None where they are one.
     """
     belief, unknown_depth = filter_.belief(), features.unknown_depth
     landmark_map, weights, mode = belief.map, belief.weights, belief.mode
@@ -214,13 +206,8 @@ def known_map_of(
 ) -> KnownMap:
     """The points of a run's map that it still holds and whose depth is known, with how they look.
 
-    Args:
-        camera: of the run.
-        gauge: of its world.
-        found: its map.
-        table: its features.
-        world_in_mode: (7,) the reported world in the heaviest particle's own; None where it is the same.
-        poses: (T, 7) that were tracked.
+    The reported world is `world_in_mode` (7,) in the heaviest particle's own, None where it is the same; poses (T, 7) were
+    tracked.
     """
     kept = np.flatnonzero(~found.is_ray() & table.alive[found.ids])
     rows, positions = found.ids[kept], found.mean[kept]

@@ -36,12 +36,7 @@ MIN_TEXTURE = 2.0
 
 
 def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.ndarray:
-    """Pose world_from_camera (7,) that best explains the known points, each of them counting alike.
-
-    Args:
-        camera: of the first image.
-        known: M points.
-        noise_px: standard deviation of where they are seen.
+    """Pose world_from_camera (7,) that best explains the known points in the first image, each of them counting alike.
 
     Raises:
         InputError: a point lies outside the image, two are at one place, the points do not determine the camera, or no
@@ -79,18 +74,8 @@ def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tupl
 
     What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
     standard deviation is taken. Across it the first image has the word: where even the best camera leaves residuals
-    beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions.
-
-    Args:
-        camera: of the first image.
-        known: M points.
-        noise_px: standard deviation of where they are seen.
-
-    Returns:
-        The points, whose covariances have the traces std_m², and world_from_camera (7,).
-
-    Raises:
-        InputError: as `resect_known`.
+    beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Their
+    covariances have the traces std_m². Errors as `resect_known`.
     """
     from scipy.stats import chi2
 
@@ -119,22 +104,14 @@ class KnownStart:
 
     @classmethod
     def from_pixels(cls, camera: Pinhole, known: KnownPixels, noise_px: float) -> "KnownStart":
-        """Of points that are given with their pixels in the first image.
-
-        Raises:
-            InputError: as `resect_known`.
-        """
+        """Of points that are given with their pixels in the first image; errors as `resect_known`."""
         points, pose = located_points(camera, known, noise_px)
         noise = np.tile(noise_px**2 * np.eye(2), (known.names.size, 1, 1))
         return cls(points, pose, points.names, FeatureFrame(0, points.names, known.px, noise))
 
     @classmethod
     def from_frame(cls, camera: Pinhole, known: KnownPoints, first: FeatureFrame) -> "KnownStart":
-        """Of points that are named features of the first frame.
-
-        Raises:
-            InputError: fewer than four known points are seen in it, or they do not determine the camera.
-        """
+        """Of named features of the first frame; an InputError if fewer than four, or they do not determine the camera."""
         inside = np.flatnonzero(camera.inside(first.z))
         _, rows, which = np.intersect1d(known.names, first.landmarks[inside], return_indices=True)
         k = inside[which]
@@ -143,11 +120,7 @@ class KnownStart:
 
 
 def constellation(points: KnownPoints) -> Constellation | UncertainConstellation:
-    """Known points as one landmark.
-
-    Raises:
-        InputError: too many points have errors of their own.
-    """
+    """Known points as one landmark; an InputError where too many have errors of their own."""
     if not points.cov.any():
         return Constellation(points.positions)
     return UncertainConstellation(points.positions, points.cov)
@@ -160,14 +133,8 @@ def constellation_records(
 
     The frame is hardly known before: an update linearised there would leave errors of the second order, larger than a
     pixel, in everything that is mapped afterwards. So the optimum of both, what is given and what is seen, is found
-    first, and the covariance is taken there.
-
-    Args:
-        camera: of the image.
-        start: what the image shows of the points.
-        group: the points as one landmark.
-        n: number of particles.
-        cov_frame: (6, 6) of the points' frame around where the resection puts it.
+    first, and the covariance is taken there. `cov_frame` (6, 6) is that of the points' frame around where the resection
+    puts it.
     """
     fit = _FirstImage(camera, start, cov_frame, isinstance(group, Constellation))
     x = least_squares(fit.residual, np.zeros(fit.size), fit.jacobian, method="lm").x
@@ -220,15 +187,7 @@ class _FirstImage:
 
 
 def require_texture(image: np.ndarray, known: KnownPixels) -> None:
-    """Refuses known points that could not be found again.
-
-    Args:
-        image: the first one, (H, W) uint8.
-        known: M points that are seen in it.
-
-    Raises:
-        InputError: there is nothing to recognise at a point.
-    """
+    """Refuses, by an InputError, known points where the first image (H, W) uint8 shows nothing to recognise."""
     score = corner_score(image, known.px)
     worst = int(np.argmin(score))
     if score[worst] < MIN_TEXTURE:

@@ -96,11 +96,7 @@ def _image(array: np.ndarray, camera: Pinhole) -> np.ndarray | None:
 
 @final
 class ImageScreen:
-    """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen.
-
-    Args:
-        camera: that takes them.
-    """
+    """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen."""
 
     def __init__(self, camera: Pinhole) -> None:
         self.camera = camera
@@ -173,11 +169,8 @@ class LostPrior(NamedTuple):
 class TrackingLoss:
     """Remembers where the camera was last trusted, and says where it may be while it is lost.
 
-    Args:
-        sensor: of the run.
-        config: all settings.
-        views: (V, 7) poses to look from as well, where the map was made before this run; None for other runs.
-        size_m: of such a map: how far from where it is assumed the camera may be as long as it was never found.
+    A map that was made before this run has views (V, 7) to look from as well, and a size_m: so far from where it is assumed
+    the camera may be as long as it was never found.
     """
 
     def __init__(
@@ -290,12 +283,7 @@ class Candidates:
 
 @final
 class Relocaliser:
-    """Finds the camera in the map by the appearance of its features.
-
-    Args:
-        sensor: that remembers it.
-        config: when a pose is accepted.
-    """
+    """Finds the camera in the map by the appearance of its features."""
 
     def __init__(self, sensor: ImageSensor, config: RelocalisationConfig) -> None:
         self.sensor = sensor
@@ -304,13 +292,9 @@ class Relocaliser:
         self._described: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def find(self, belief: Belief, image: np.ndarray, near: np.ndarray, last: "LastView | None" = None) -> Attempt:
-        """Where the camera must be, if enough of the map's landmarks with known depth are seen.
+        """Where the camera must be, if enough of the map's landmarks with known depth are seen in an image (H, W) uint8.
 
-        Args:
-            belief: where they are, in the heaviest particle.
-            image: (H, W) uint8.
-            near: (7,) world_from_camera from which the landmarks' appearances are predicted: the last trusted pose.
-            last: the image from there, if there is one.
+        Their appearances are predicted from a pose near by (7,), the last trusted one; `last` is the image from there.
         """
         config, camera = self.config, self.camera
         rows, points = self.known_landmarks(belief)
@@ -465,13 +449,8 @@ class LastView:
     """The last image before a loss and where it was taken.
 
     The depth of its corners is not known: each says on which line it must be seen. Hundreds of them determine how
-    the camera turned and in which direction it went; how far, the map's landmarks say.
-
-    Args:
-        sensor: its camera, detector and descriptor.
-        image: (H, W) uint8.
-        world_from_camera: (7,) in the world of the map's particle.
-        config: number and distance of the corners.
+    the camera turned and in which direction it went; how far, the map's landmarks say. `world_from_camera` (7,) is in the
+    world of the map's particle.
     """
 
     def __init__(
@@ -490,12 +469,9 @@ class LastView:
         """(K, d)."""
 
     def match(self, descriptors: np.ndarray, px: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, Sights] | None:
-        """Its corners (P,) and where another image shows them; None where there are too few.
+        """Its corners (P,) and where another image shows them, described at px (M, 2) in S sizes; None where too few.
 
-        Args:
-            descriptors: (S, M, d) of corners of the other image, at S sizes.
-            px: (M, 2) these corners.
-            landmarks: (L, 3) in the world: the corners are about as far away as those in view.
+        They are taken to be about as far away as the landmarks (L, 3) in view.
         """
         held = SE3.inverse_transform(self.world_from_camera, landmarks)
         held = held[self.camera.visible(held), 2]
@@ -590,11 +566,7 @@ def match_by_ratio(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (M,), (M,) of landmark and corner that are like each other and like nothing else (D. Lowe's ratio).
 
-    Args:
-        distances: (L, K) of descriptors.
-        points: (L, 3) of the landmarks; nearer than `SAME_POINT` they are no rivals.
-        px: (K, 2) of the corners; nearer than `SAME_CORNER` they are no rivals.
-        ratio: of the distances from the best and the next.
+    Landmarks (L, 3) nearer than `SAME_POINT`, corners (K, 2) nearer than `SAME_CORNER` are no rivals.
     """
     best = distances.argmin(axis=1)
     chosen = distances[np.arange(best.size), best]
@@ -631,11 +603,9 @@ def _one_each(best: np.ndarray, chosen: np.ndarray, clear: np.ndarray) -> tuple[
 
 
 def mutual_matches(alike: np.ndarray, px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (P,), (P,) that are most alike both ways and clearly more than the next place.
+    """Pairs (P,), (P,) that are most alike both ways, by products (K, M), and clearly more than the next place.
 
-    Args:
-        alike: (K, M) products of descriptors of unit length.
-        px: (M, 2) places; nearer than `VIEW_SAME_PX` to the best they are no rivals of it.
+    Places (M, 2) nearer than `VIEW_SAME_PX` to the best are no rivals of it.
     """
     best = alike.argmax(axis=1)
     rows = np.arange(best.size)

@@ -205,11 +205,7 @@ class MonoSlam(System):
         return self.take(ImageFrame(stamp_ns, image))
 
     def take(self, frame: ImageFrame | FeatureFrame) -> Tracked:
-        """The life of a frame, of images or of named features.
-
-        Raises:
-            InputError: see `track`.
-        """
+        """The life of a frame, of images or of named features; errors as `track`."""
         before, stamp_ns = self.filter.stamp_ns, int(frame.stamp_ns)
         if before is not None and stamp_ns < before:
             raise InputError(f"time runs backwards: a frame at {stamp_ns} ns after one at {before} ns")
@@ -373,11 +369,7 @@ class MonoSlam(System):
         return files
 
     def export_map(self, poses: np.ndarray) -> KnownMap:
-        """The map as a place in which later runs can find their camera.
-
-        Args:
-            poses: (T, 7) that were tracked: some of them, far from each other, are kept to look from.
-        """
+        """The map as a place in which later runs find their camera, looking from some of the tracked poses (T, 7)."""
         table, world = self.sensor.table, world_of(self.filter)
         mode = None if world is None else world.mean[self.filter.belief().mode]
         return known_map_of(self.camera, self.gauge, self.map(), table, mode, poses)
@@ -406,6 +398,8 @@ class MonoSlam(System):
         motion: MotionModel = MarginalVelocity(velocity.walk_std())
         if velocity.mode != "marginal":
             motion = SampledVelocity(velocity.walk_std(), velocity.mode, velocity.start_std())
+        proposal, resampling = config.proposal.build(), config.resampling.build()
+        rng = np.random.default_rng(config.seed)
         landmark_map = LandmarkMap(motion.space, compiled=config.compiled)
         landmark_map.register(Point(3))
         landmark_map.register(self.features.unknown_depth.landmark)
@@ -414,16 +408,7 @@ class MonoSlam(System):
         parts: list[Conditional] = [landmark_map]
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
-        return Filter(
-            motion,
-            sensor,
-            parts,
-            config.proposal.build(),
-            config.resampling.build(),
-            config.particles,
-            np.random.default_rng(config.seed),
-            lag=config.lag,
-        )
+        return Filter(motion, sensor, parts, proposal, resampling, config.particles, rng, lag=config.lag)
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
@@ -561,13 +546,11 @@ class _Either(Sensor):
         self.images, self.named = images, named
 
     def observe(self, frame: Measurement | FeatureFrame, belief: Belief) -> Sequence[Observations]:
-        """As the sensor does."""
         return self._of(frame).observe(frame, belief)
 
     def new_landmarks(
         self, frame: Measurement | FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """As the sensor does."""
         return self._of(frame).new_landmarks(frame, belief, observed)
 
     def _of(self, frame: Measurement | FeatureFrame) -> Sensor:
@@ -582,10 +565,3 @@ def world_of(filter_: Filter) -> Anchored | None:
     if not isinstance(group, Constellation | UncertainConstellation):
         return None
     return Anchored(*group.frame(landmark_map.read(first)))
-
-
-def particle_points(filter_: Filter, ids: Sequence[int]) -> np.ndarray:
-    """Each particle's own mean of point landmarks (N, K, 3), in the world of the known points."""
-    points = filter_.belief().read(np.asarray(ids)).mean
-    world = world_of(filter_)
-    return points if world is None else SE3.inverse_transform(world.mean[:, None], points)

@@ -111,11 +111,8 @@ class Resampled:
 class UnknownStart:
     """Gathers the first frames, adjusts them when it is time, and resamples the particles.
 
-    Args:
-        config: of the run.
-        features: what the filter observes with.
-        new_filter: makes a filter without particles' past, with `features` as its sensor.
-        needed: whether the run starts without known points and without a map.
+    `new_filter` makes a filter without a past, with `features` as its sensor; `needed` is whether the run starts without known
+    points and without a map.
     """
 
     def __init__(
