@@ -34,8 +34,8 @@ from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.sensors.readers.robot_log import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.image_sensor import ImageScreen
 from rbpf.systems.mono.known_map import KnownMap, read_known_map
-from rbpf.systems.mono.relocalisation import ImageScreen
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam

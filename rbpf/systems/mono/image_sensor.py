@@ -1,4 +1,4 @@
-"""Measures a frame: finds the map's features in an image, judges them, and starts new ones at corners."""
+"""Measures a frame: is its image usable; finds the map's features in it, judges them, and starts new ones at corners."""
 
 import time
 from collections.abc import Sequence
@@ -7,9 +7,11 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, read_one
+from rbpf.core.checkpoint import grey, integers, read, read_one, truths
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
+from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
 from rbpf.sensors.patches.search import cut
@@ -21,7 +23,13 @@ from rbpf.systems.mono.feature_table import PATCH_HALF_PX, FeatureTable, view_ch
 MIN_FIXED = 4
 """Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped."""
 
+MIN_CONTRAST = 10
+"""Grey levels that are all nearer to each other are those of a lens cap."""
+MAX_REPEATS = 5
+"""Times that an image may come again: drivers repeat single images when the camera is late."""
+
 _MAP = frozenset({Part.LANDMARK})
+_SCREEN = {"last": grey("", ""), "repeats": integers(least=0), "was_unusable": truths()}
 
 
 def no_features(stamp_ns: int = 0) -> FeatureFrame:
@@ -55,6 +63,62 @@ class Measurement:
             np.concatenate([self.used.z, self.started.z]),
             np.concatenate([self.used.cov_z, self.started.cov_z]),
         )
+
+
+def held_image(array: np.ndarray, camera: Pinhole) -> np.ndarray | None:
+    """An image of a checkpoint, None where it is empty."""
+    if array.shape not in ((0, 0), (camera.height, camera.width)):
+        raise InputError(f"an image has shape {array.shape}, the camera's is {camera.height, camera.width}")
+    return array if array.size else None
+
+
+@final
+class ImageScreen:
+    """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen."""
+
+    def __init__(self, camera: Pinhole) -> None:
+        self.camera = camera
+        self._last: np.ndarray | None = None
+        self._repeats = 0
+        self._was_unusable = False
+
+    def usable(self, image: np.ndarray | None) -> tuple[np.ndarray | None, str | None]:
+        """The next image, None where it cannot be used; and the reason, which is said of the first such image in a row."""
+        if image is None:
+            return None, None
+        wanted, found = (self.camera.height, self.camera.width), type(image).__name__
+        if isinstance(image, np.ndarray):
+            found = f"{image.shape} {image.dtype}"
+        if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
+            expected = f"{self.camera.width}x{self.camera.height} grey levels of 8 bits"
+            return None, f"the image is not used: expected {expected}, got {found}"
+        image = image.copy()  # a camera's driver may write the next image into the same memory
+        is_same = self._last is not None and np.array_equal(image, self._last)
+        self._last, self._repeats = image, self._repeats + 1 if is_same else 0
+        reason = None
+        if int(image.max()) - int(image.min()) < MIN_CONTRAST:
+            reason = "the image shows nothing, its grey levels are all alike: it is not used"
+        elif self._repeats >= MAX_REPEATS:
+            times = f"the {MAX_REPEATS + 1}th time"
+            reason = f"the image is the same for {times}, the camera may be frozen: it is not used"
+        was_unusable, self._was_unusable = self._was_unusable, reason is not None
+        if reason is None:
+            return image, None
+        return None, None if was_unusable else reason
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {
+            "screen/last": np.zeros((0, 0), dtype=np.uint8) if self._last is None else self._last,
+            "screen/repeats": np.array(self._repeats),
+            "screen/was_unusable": np.array(self._was_unusable),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        found = read(arrays, _SCREEN, "screen/")
+        self._last = held_image(found["last"], self.camera)
+        self._repeats, self._was_unusable = int(found["repeats"]), bool(found["was_unusable"])
 
 
 @final

@@ -1,4 +1,4 @@
-"""Tracking loss: which images say nothing, the pose prior while the camera is lost, and how it is found in the map again.
+"""Tracking loss: the pose prior while the camera is lost, and how it is found in the map again.
 
 A lost camera stays at its last trusted pose, more uncertain with time. In each image it is looked for in the map, without
 a prediction: corners of the image are matched with the map's features by descriptors, triples of matches give poses
@@ -16,7 +16,6 @@ from rbpf.core.checkpoint import grey, integers, numbers, poses, read, truths
 from rbpf.core.filter import Filter
 from rbpf.core.models import Belief
 from rbpf.core.particles import Particles, Prior, mixture_estimate
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
@@ -35,12 +34,8 @@ from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, patch_affines
-from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.image_sensor import ImageSensor, held_image
 
-MIN_CONTRAST = 10
-"""Grey levels that are all nearer to each other are those of a lens cap."""
-MAX_REPEATS = 5
-"""Times that an image may come again: drivers repeat single images when the camera is late."""
 VIEWS_PER_FRAME = 2
 """Views of a known map from which a lost camera is looked for in a frame, in turn."""
 
@@ -76,7 +71,6 @@ MIN_VIEW_CORNERS = 30
 MIN_VIEW_FRACTION = 0.8
 """Of the corners of the last view that are found again, so many must show the motion that the map shows."""
 
-_SCREEN = {"last": grey("", ""), "repeats": integers(least=0), "was_unusable": truths()}
 _LOSS = {
     "pose": poses(),
     "cov": numbers(6, 6),
@@ -85,62 +79,6 @@ _LOSS = {
     "mode": poses(),
     "never_found": truths(),
 }
-
-
-def _image(array: np.ndarray, camera: Pinhole) -> np.ndarray | None:
-    """An image of a checkpoint, None where it is empty."""
-    if array.shape not in ((0, 0), (camera.height, camera.width)):
-        raise InputError(f"an image has shape {array.shape}, the camera's is {camera.height, camera.width}")
-    return array if array.size else None
-
-
-@final
-class ImageScreen:
-    """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen."""
-
-    def __init__(self, camera: Pinhole) -> None:
-        self.camera = camera
-        self._last: np.ndarray | None = None
-        self._repeats = 0
-        self._was_unusable = False
-
-    def usable(self, image: np.ndarray | None) -> tuple[np.ndarray | None, str | None]:
-        """The next image, None where it cannot be used; and the reason, which is said of the first such image in a row."""
-        if image is None:
-            return None, None
-        wanted, found = (self.camera.height, self.camera.width), type(image).__name__
-        if isinstance(image, np.ndarray):
-            found = f"{image.shape} {image.dtype}"
-        if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
-            expected = f"{self.camera.width}x{self.camera.height} grey levels of 8 bits"
-            return None, f"the image is not used: expected {expected}, got {found}"
-        image = image.copy()  # a camera's driver may write the next image into the same memory
-        is_same = self._last is not None and np.array_equal(image, self._last)
-        self._last, self._repeats = image, self._repeats + 1 if is_same else 0
-        reason = None
-        if int(image.max()) - int(image.min()) < MIN_CONTRAST:
-            reason = "the image shows nothing, its grey levels are all alike: it is not used"
-        elif self._repeats >= MAX_REPEATS:
-            times = f"the {MAX_REPEATS + 1}th time"
-            reason = f"the image is the same for {times}, the camera may be frozen: it is not used"
-        was_unusable, self._was_unusable = self._was_unusable, reason is not None
-        if reason is None:
-            return image, None
-        return None, None if was_unusable else reason
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
-        return {
-            "screen/last": np.zeros((0, 0), dtype=np.uint8) if self._last is None else self._last,
-            "screen/repeats": np.array(self._repeats),
-            "screen/was_unusable": np.array(self._was_unusable),
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        found = read(arrays, _SCREEN, "screen/")
-        self._last = _image(found["last"], self.camera)
-        self._repeats, self._was_unusable = int(found["repeats"]), bool(found["was_unusable"])
 
 
 @dataclass(frozen=True)
@@ -262,7 +200,7 @@ class TrackingLoss:
         found = read(arrays, _LOSS, "loss/")
         self._trusted, self._particles = (found["pose"], found["cov"]), None
         self.stamp_ns, self._mode = int(found["stamp_ns"]), found["mode"]
-        self._image, self._view = _image(found["image"], self.sensor.camera), None
+        self._image, self._view = held_image(found["image"], self.sensor.camera), None
         self.never_found = bool(found["never_found"])
 
 

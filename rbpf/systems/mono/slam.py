@@ -35,10 +35,10 @@ from rbpf.systems.mono.active_search import OutlierGate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
-from rbpf.systems.mono.image_sensor import ImageSensor, Measurement
+from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
 from rbpf.systems.mono.known_map import NAME, KnownMap, estimate_mono_map, known_map_arrays, known_map_of
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
-from rbpf.systems.mono.relocalisation import Attempt, ImageScreen, TrackingLoss
+from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
 from rbpf.systems.mono.unknown_start import UnknownStart
 from rbpf.systems.system import (
     DIAGNOSTICS,
