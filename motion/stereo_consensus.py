@@ -23,19 +23,14 @@ FARTHEST = 1e4
 
 @dataclass(frozen=True)
 class RansacConfig(Ranged):
-    """How many triples of matches are tried.
-
-    Attributes:
-        batch: tried at a time.
-        max_triples: of all batches.
-        confidence: with this probability one triple without a false match is among them, given the fraction of matches
-            that agree with the best motion so far.
-    """
+    """How many triples of matches are tried."""
 
     RENAMED: ClassVar[dict[str, str]] = {"most": "max_triples", "certainty": "confidence"}
 
-    batch: Annotated[int, Range(ge=1, le=10000)] = 32
-    max_triples: Annotated[int, Range(ge=1, le=1000000)] = 512
+    batch: Annotated[int, Range(ge=1, le=10000)] = 32  #: tried at a time.
+    max_triples: Annotated[int, Range(ge=1, le=1000000)] = 512  #: of all batches.
+    #: with this probability one triple without a false match is among them, given the fraction of matches that agree
+    #: with the best motion so far.
     confidence: Probability = 0.9999
 
     def needed(self, fraction: float) -> float:

@@ -46,23 +46,17 @@ ROUNDING = 1e-14
 @final
 @dataclass(frozen=True)
 class VoConfig(Ranged):
-    """How a motion is estimated.
-
-    Attributes:
-        points: what the earlier points are taken for, see `rbpf.motion.stereo_geometry.Points`.
-        gate: squared Mahalanobis distance beyond which a match is false; 99 % of the true ones are within, χ² with
-            three degrees of freedom.
-        min_matches: fewer that agree are no motion.
-        ransac: how many triples are tried.
-        rule: when the optimiser stops; the default is a hundredth of the motion's standard deviations.
-    """
+    """How a motion is estimated."""
 
     RENAMED: ClassVar[dict[str, str]] = {"least_matches": "min_matches", "draws": "ransac"}
 
-    points: Points = "adjusted"
+    points: Points = "adjusted"  #: what the earlier points are taken for, see `rbpf.motion.stereo_geometry.Points`.
+    #: squared Mahalanobis distance beyond which a match is false; 99 % of the true ones are within, χ² with three
+    #: degrees of freedom.
     gate: Annotated[float, Range(gt=0.0, le=math.inf)] = 11.345
-    min_matches: Annotated[int, Range(ge=3)] = 8
-    ransac: RansacConfig = field(default_factory=RansacConfig)
+    min_matches: Annotated[int, Range(ge=3)] = 8  #: fewer that agree are no motion.
+    ransac: RansacConfig = field(default_factory=RansacConfig)  #: how many triples are tried.
+    #: when the optimiser stops; the default is a hundredth of the motion's standard deviations.
     rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
 
 
@@ -74,11 +68,11 @@ class MotionEstimate:
     previous_camera_from_camera: Array  #: (7,) increment; the start where none was found.
     cov: Array  #: (6, 6) in the right chart there, order [ω, v]; NaN where none was found.
     inliers: np.ndarray  #: (K,) bool, matches that agree with it.
-    #: Root mean square of the inliers' whitened residuals, by their degrees of freedom and for what the gate cuts off: 1
+    #: root mean square of the inliers' whitened residuals, by their degrees of freedom and for what the gate cuts off: 1
     #: is expected.
     rms: float
     failure: str = ""  #: why no motion was found, in words; empty where one was.
-    #: Motions that matches far from this one agree on, as those on a thing that moves, each with its own inliers; false
+    #: motions that matches far from this one agree on, as those on a thing that moves, each with its own inliers; false
     #: matches agree on none.
     others: tuple["MotionEstimate", ...] = ()
 
@@ -250,17 +244,11 @@ def trimming(gate: float) -> float:
 @final
 @dataclass(frozen=True)
 class MotionPrior(Ranged):
-    """The motion that is expected before anything is seen: the last velocity, or standing still.
+    """The motion that is expected before anything is seen: the last velocity, or standing still."""
 
-    Attributes:
-        std_turn: standard deviation of the angular velocity about the expected one, rad/s.
-        std_speed: of the velocity, m/s. Both defaults are a hand-held camera's or an indoor robot's.
-        keep_velocity: whether the last velocity that was seen is expected to go on.
-    """
-
-    std_turn: Positive = 1.0
-    std_speed: Positive = 1.0
-    keep_velocity: bool = True
+    std_turn: Positive = 1.0  #: standard deviation of the angular velocity about the expected one, rad/s.
+    std_speed: Positive = 1.0  #: of the velocity, m/s. Both defaults are a hand-held camera's or an indoor robot's.
+    keep_velocity: bool = True  #: whether the last velocity that was seen is expected to go on.
 
     def increment(self, velocity: Array, dt: float) -> Odometry:
         """The increment expected after `dt` seconds at a velocity (6,) [ω, v]."""
@@ -288,7 +276,7 @@ class CandidateMotions:
     """
 
     prior: Odometry  #: the motion expected before anything was seen.
-    #: That of the first consensus first; none where matches are too few or do not agree.
+    #: that of the first consensus first; none where matches are too few or do not agree.
     motions: tuple[CandidateMotion, ...]
     failure: str  #: why there is none, in words; empty where there is one.
 

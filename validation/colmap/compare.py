@@ -57,7 +57,7 @@ class ColmapComparison:
 
     reconstruction: Reconstruction
     path: AbsoluteError  #: distances of the camera centres, after the alignment that fits these best.
-    #: Brings COLMAP's world onto the reference's, by the cameras' orientations and centres.
+    #: brings COLMAP's world onto the reference's, by the cameras' orientations and centres.
     reference_from_colmap: Similarity
     cloud: CloudDistance | None  #: distances of the reference's landmarks; None without.
     extent_m: float  #: diagonal of the box that holds the reference's camera centres.

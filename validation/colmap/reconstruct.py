@@ -31,25 +31,15 @@ LEAST_FRAMES = 3
 @final
 @dataclass(frozen=True)
 class ReconstructionOptions(Ranged):
-    """How images are reconstructed.
+    """How images are reconstructed."""
 
-    Attributes:
-        every: every so many frames is a key frame, from the first on.
-        features: most of them per image.
-        overlap: each key frame is matched with so many that follow, and with those 2^i further on.
-        stereo: of a stereo sequence take both images, and the scale from the baseline.
-        least_angle_deg: between the rays of the two images that it begins with.
-        threads: of extraction and matching; mapping takes one, so that the same seed gives the same model.
-        seed: of RANSAC.
-    """
-
-    every: Count = 5
-    features: Count = 4096
-    overlap: Count = 10
-    stereo: bool = True
-    least_angle_deg: Angle = 16.0
-    threads: Count = 1
-    seed: Seed = 0
+    every: Count = 5  #: every so many frames is a key frame, from the first on.
+    features: Count = 4096  #: most of them per image.
+    overlap: Count = 10  #: each key frame is matched with so many that follow, and with those 2^i further on.
+    stereo: bool = True  #: of a stereo sequence take both images, and the scale from the baseline.
+    least_angle_deg: Angle = 16.0  #: between the rays of the two images that it begins with.
+    threads: Count = 1  #: of extraction and matching; mapping takes one, so that the same seed gives the same model.
+    seed: Seed = 0  #: of RANSAC.
 
 
 @final

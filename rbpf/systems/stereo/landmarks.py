@@ -103,7 +103,7 @@ class View(Generic[F]):
     stamp_ns: int
     features: F  #: K of them.
     free: np.ndarray  #: (K,) which of them the map may use.
-    #: The camera's motion was only assumed: matches with the map must agree on one motion, of landmarks that were seen
+    #: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks that were seen
     #: again before, and none are started.
     uncertain: bool = False
     #: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.

@@ -153,7 +153,7 @@ class StereoSlam(System):
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
-        #: Motion from the filter's last update to the last pair, also where it was only expected.
+        #: motion from the filter's last update to the last pair, also where it was only expected.
         self.since_update = SE3.identity()
         self._last_update = 0
         self._kept: Pair[Any] | None = None

@@ -44,20 +44,14 @@ def tracked_features(
 
 @final
 class _Tracks:
-    """The tracks of the pairs so far, and what is to be joined.
-
-    Attributes:
-        rows: number of the pair and of the track of each observation, (k, 2) each.
-        numbers: (k, 9) pixels and packed covariance of each.
-    """
+    """The tracks of the pairs so far, and what is to be joined."""
 
     def __init__(self) -> None:
-        self.rows: list[np.ndarray] = []
-        self.numbers: list[np.ndarray] = []
+        self.rows: list[np.ndarray] = []  # number of the pair and of the track of each observation, (k, 2) each
+        self.numbers: list[np.ndarray] = []  # (k, 9) pixels and packed covariance of each
         self._named: dict[int, int] = {}
         self._joined: list[tuple[int, int]] = []
-        self._count = 0
-        self._step = -1
+        self._count, self._step = 0, -1
         self._last = np.zeros(0, dtype=np.int64), np.zeros((0, 9))
 
     def add(self, step: int, shown: Mapping[str, np.ndarray]) -> None:
