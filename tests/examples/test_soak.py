@@ -24,20 +24,6 @@ def test_the_same_seed_gives_the_same_stream(kind):
     )
 
 
-def test_points_are_replaced_and_names_never_come_back():
-    stream, last = RobotStream(QUICK, 0), {}
-    seen: set[int] = set()
-    for t, (frame, _) in enumerate(islice(stream.frames(), 1500)):
-        for name in frame.landmarks.tolist():
-            last[name] = t
-        seen.update(frame.landmarks.tolist())
-        assert frame.landmarks.size <= 8 and np.unique(frame.landmarks).size == frame.landmarks.size
-    expected = 40 + 1500 * 32 * 0.01
-    assert max(seen) == pytest.approx(expected, rel=0.2)
-    early = [name for name in seen if 8 <= name < 40]
-    assert all(last[name] < 1000 for name in early)
-
-
 def test_forgetting():
     """What has not been seen for three frames is dropped; what is seen is not."""
 

@@ -85,17 +85,6 @@ def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
     assert rigid.as_dict()["scale"] == 1.0
 
 
-def test_landmarks_are_brought_to_the_cloud():
-    ours = made()
-    landmarks = ours.points[::4] + np.array([0.01, 0.0, 0.0])
-    reference = Trajectory(ours.stamps_ns, ours.world_from_camera)
-    cloud = compare_with_path(made(scale=5.0), reference, landmarks).cloud
-    assert cloud.nearest_m == pytest.approx(np.full(50, 0.01), rel=1e-6)
-    gaps = np.linalg.norm(ours.points[:, None] - ours.points, axis=-1) + 1e9 * np.eye(200)
-    assert cloud.as_dict()["cloud_spacing_median_m"] == pytest.approx(np.median(gaps[::4].min(axis=1)))
-    assert "surface_median_sigmas" not in cloud.as_dict()
-
-
 def test_the_distance_from_a_surface_does_not_depend_on_how_sparse_the_cloud_is():
     rng, turn = np.random.default_rng(1), SE3.rotation(SE3.exp(np.array([0.3, 0.5, -0.2, 0.0, 0.0, 0.0])))
     wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.zeros(300)])

@@ -124,6 +124,7 @@ def first_steps(m, count):
     return replace(m, stamps_ns=m.stamps_ns[:count], deltas=m.deltas[: count - 1], covs=m.covs[: count - 1], **kept)
 
 
+@pytest.mark.slow
 def test_the_online_optimum_knows_nothing_of_the_future():
     m = world(2, "range_bearing", singular=True, steps=15)
     found = solve_online(m)

@@ -57,6 +57,7 @@ def test_a_bias_tilts_it():
     assert (counts[:3].sum(axis=0) > 2 * counts[-3:].sum(axis=0)).all()
 
 
+@pytest.mark.slow
 def test_a_filter_of_ones_own_model_is_calibrated():
     """Any model that can simulate: here a filter whose particles start at the prior."""
 
