@@ -163,7 +163,10 @@ class ImageSensor(Sensor):
     def begin_lost(
         self, patches: np.ndarray, first_px: np.ndarray, first_pose: np.ndarray, positions: np.ndarray
     ) -> None:
-        """Takes the points (K, 3) of a known map, and their first appearances: where the camera is has to be found out."""
+        """Takes the points (K, 3) of a known map; where in it the camera is has to be found out.
+
+        They appeared first in patches (K, S, S) uint8 at first_px (K, 2), from first_pose (K, 7) world_from_camera.
+        """
         rows = self.table.add(patches, first_px, first_pose)
         self.table.position[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
         self.bad_frames = self.config.lost_frames

@@ -18,7 +18,7 @@ import numpy as np
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Belief, Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
-from rbpf.core.particles import Estimate, mixture_estimate
+from rbpf.core.particles import mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -257,8 +257,12 @@ class MonoSlam(System):
 
         # 5. What is reported.
         world = world_of(self.filter)
-        estimate = self._estimate(world, report)
-        pose, cov = estimate.mean, estimate.cov
+        if world is None:  # the refined mixture's
+            pose, cov = report.estimate.mean[:7], report.estimate.cov[:6, :6]
+        else:  # the samples', each with its own uncertain world: before sampling the pose and its place are correlated
+            particles = self.filter.particles
+            estimate = relative_estimate(SE3, world, particles.state[:, :7], particles.log_weights)
+            pose, cov = estimate.mean, estimate.cov
         if sensor.lost:
             cov = cov + self.loss.drift(stamp_ns)
         shown = frame if isinstance(frame, FeatureFrame) else measured
@@ -454,17 +458,6 @@ class MonoSlam(System):
         mean = np.broadcast_to(known.positions, (n, *known.positions.shape))
         cov = np.broadcast_to(known.cov, (n, *known.cov.shape))
         landmark_map.add_records(Records(mean, cov), Point(3), ids=known.names)
-
-    def _estimate(self, world: Anchored | None, report: StepReport) -> Estimate:
-        """Mean and covariance of world_from_camera after a step.
-
-        With known points it is that of the samples, each with its own uncertain world: the pose and the world's place are
-        correlated before sampling. Without them it is that of the refined mixture.
-        """
-        if world is None:
-            return Estimate(report.estimate.mean[:7], report.estimate.cov[:6, :6])
-        particles = self.filter.particles
-        return relative_estimate(SE3, world, particles.state[:, :7], particles.log_weights)
 
     def _values(self, measured: Measurement | FeatureFrame, report: StepReport) -> dict[str, Any]:
         """Of `columns`; whether it was relocalised, and the time of the rest, are added."""
