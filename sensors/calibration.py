@@ -259,23 +259,15 @@ class BoardView(NamedTuple):
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """A camera, and how well it explains V views of M corners.
+    """A camera, and how well it explains V views of M corners."""
 
-    Attributes:
-        camera: the camera.
-        std: (P,) standard deviations of fx, fy, cx, cy [px] and the lens's coefficients; 0 for one that was not needed.
-        views: those that were used.
-        residuals: (V, M, 2) where corners were found less where the camera sees them, px.
-        normals: (V, 3) of the board in the camera's frame.
-        left_out: names of views that no camera explains together with the others.
-    """
-
-    camera: Pinhole
+    camera: Pinhole  #: the camera.
+    #: (P,) standard deviations of fx, fy, cx, cy [px] and the lens's coefficients; 0 for one that was not needed.
     std: np.ndarray
-    views: tuple[BoardView, ...]
-    residuals: np.ndarray
-    normals: np.ndarray
-    left_out: tuple[str, ...] = ()
+    views: tuple[BoardView, ...]  #: those that were used.
+    residuals: np.ndarray  #: (V, M, 2) where corners were found less where the camera sees them, px.
+    normals: np.ndarray  #: (V, 3) of the board in the camera's frame.
+    left_out: tuple[str, ...] = ()  #: names of views that no camera explains together with the others.
 
     @property
     def rms_px(self) -> float:

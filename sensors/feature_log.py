@@ -15,38 +15,26 @@ UNIT = 1e-6
 
 @dataclass(frozen=True)
 class FeatureFrame:
-    """One image: which landmarks were seen, and where. It is checked by the `FeatureLog`, which knows its index.
+    """One image: which landmarks were seen, and where. It is checked by the `FeatureLog`, which knows its index."""
 
-    Attributes:
-        stamp_ns: time of the image, integer nanoseconds.
-        landmarks: (K,) int64 names, each once.
-        z: (K, p) pixels: (u, v), or (u_left, v, u_right) of a stereo pair.
-        cov_z: (K, p, p) their covariance, px².
-    """
-
-    stamp_ns: int
-    landmarks: np.ndarray
-    z: np.ndarray
-    cov_z: np.ndarray
+    stamp_ns: int  #: time of the image, integer nanoseconds.
+    landmarks: np.ndarray  #: (K,) int64 names, each once.
+    z: np.ndarray  #: (K, p) pixels: (u, v), or (u_left, v, u_right) of a stereo pair.
+    cov_z: np.ndarray  #: (K, p, p) their covariance, px².
 
 
 @dataclass(frozen=True)
 class KnownPoints:
     """Landmarks known beforehand, such as the corners of a calibration target.
 
-    Attributes:
-        names: (M,) int64, each once.
-        positions: (M, 3) in the world, m.
-        cov: (M, 3, 3) their covariance, m².
-
     Raises:
         InputError: a shape or a type is another one, a number is not finite, a name comes twice,
             or a cov is no covariance.
     """
 
-    names: np.ndarray
-    positions: np.ndarray
-    cov: np.ndarray
+    names: np.ndarray  #: (M,) int64, each once.
+    positions: np.ndarray  #: (M, 3) in the world, m.
+    cov: np.ndarray  #: (M, 3, 3) their covariance, m².
 
     def __post_init__(self) -> None:
         where = "the known points"
@@ -60,18 +48,14 @@ class KnownPoints:
 class CameraTruth:
     """Ground truth of a `FeatureLog`.
 
-    Attributes:
-        stamps_ns: (T,) int64 times of the poses, in order.
-        world_from_camera: (T, 7) poses at these times, unit quaternions.
-        landmarks: name of a landmark to its (3,) position in the world, m.
-
     Raises:
         InputError: a shape or a type is another one, a number is not finite, the stamps are out of order,
             or a quaternion is not of unit length.
     """
 
-    stamps_ns: np.ndarray
-    world_from_camera: np.ndarray
+    stamps_ns: np.ndarray  #: (T,) int64 times of the poses, in order.
+    world_from_camera: np.ndarray  #: (T, 7) poses at these times, unit quaternions.
+    #: name of a landmark to its (3,) position in the world, m.
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -97,23 +81,16 @@ class CameraTruth:
 class FeatureLog:
     """A recording of a camera that sees landmarks.
 
-    Attributes:
-        name: short name of the recording.
-        camera: that took the images.
-        frames: the images in order of time; equal stamps, between which no time passes, are allowed.
-        known: landmarks known beforehand, None where there are none.
-        truth: ground truth, None where the log has none.
-
     Raises:
         InputError: there is no frame, or one is out of order, names a landmark twice, has a shape or a type that
             does not fit the camera, a number that is not finite, or a cov_z that is no covariance.
     """
 
-    name: str
-    camera: Pinhole | RectifiedStereo
-    frames: list[FeatureFrame]
-    known: KnownPoints | None = None
-    truth: CameraTruth | None = None
+    name: str  #: short name of the recording.
+    camera: Pinhole | RectifiedStereo  #: that took the images.
+    frames: list[FeatureFrame]  #: the images in order of time; equal stamps, between which no time passes, are allowed.
+    known: KnownPoints | None = None  #: landmarks known beforehand, None where there are none.
+    truth: CameraTruth | None = None  #: ground truth, None where the log has none.
 
     def __post_init__(self) -> None:
         if not self.frames:

@@ -61,25 +61,15 @@ def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
 @final
 @dataclass(frozen=True)
 class StereoFeatures:
-    """What a pair of images shows, of highest contrast first: the local landmarks {P^L, C^L, α, s, f} of S05 §III-B.
+    """What a pair of images shows, of highest contrast first: the local landmarks {P^L, C^L, α, s, f} of S05 §III-B."""
 
-    Attributes:
-        z: (K, 3) pixels (u_left, v, u_right).
-        cov: (K, 3, 3) of their noise, px².
-        points: (K, 3) P^L in the left camera's frame, m.
-        cov_points: (K, 3, 3) C^L, m²: `cov` through the Jacobian of the triangulation.
-        scale: (K,) of the keypoint, px.
-        orientation: (K,) of the keypoint, radians.
-        descriptors: (K, 36) or (K, 128) float32 of length 1.
-    """
-
-    z: np.ndarray
-    cov: np.ndarray
-    points: np.ndarray
-    cov_points: np.ndarray
-    scale: np.ndarray
-    orientation: np.ndarray
-    descriptors: np.ndarray
+    z: np.ndarray  #: (K, 3) pixels (u_left, v, u_right).
+    cov: np.ndarray  #: (K, 3, 3) of their noise, px².
+    points: np.ndarray  #: (K, 3) P^L in the left camera's frame, m.
+    cov_points: np.ndarray  #: (K, 3, 3) C^L, m²: `cov` through the Jacobian of the triangulation.
+    scale: np.ndarray  #: (K,) of the keypoint, px.
+    orientation: np.ndarray  #: (K,) of the keypoint, radians.
+    descriptors: np.ndarray  #: (K, 36) or (K, 128) float32 of length 1.
 
     @classmethod
     def measured(
@@ -157,46 +147,29 @@ REMEMBERED = 0.9
 class PairConfig(Ranged):
     """How the two images are matched, and how exact the result is.
 
-    Attributes:
-        row_px: rows of a match differ by at most this …
-        row_per_scale: … and this fraction of the keypoint's scale.
-        nearest_m: least depth; disparities above that of this depth are left out.
-        least_disparity_px: nor does a smaller disparity than this tell a depth.
-        scale_ratio: largest ratio of the two scales.
-        turn_rad: largest difference of the two orientations.
-        limits: of the descriptors.
-        filter_impulses: whether impulse noise (salt and pepper) is removed before keypoints are detected.
-        refine: whether the disparity is refined on grey values.
-        half_px: of the refinement's window.
-        least_correlation: of the refined windows, else the match is dropped.
-        shift_px: nor may the refinement move it further than this.
-        place_px: σ_p of a keypoint of scale 0 …
-        place_per_scale: … and what is added to it in quadrature, as a fraction of the scale.
-        disparity_px: σ_d of a keypoint of scale 0 …
-        disparity_per_scale: … and what is added to it in quadrature.
-
     Raises:
         InputError: a number is out of its range.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {"mend": "filter_impulses"}
 
-    row_px: NotNegative = 1.0
-    row_per_scale: NotNegative = 0.25
-    nearest_m: Positive = 0.3
-    least_disparity_px: Positive = 1.0
-    scale_ratio: Ratio = 1.5
-    turn_rad: Annotated[float, Range(gt=0.0, le=7.0)] = 0.35
-    limits: MatchLimits = field(default_factory=MatchLimits)
-    filter_impulses: bool = True
-    refine: bool = True
-    half_px: Annotated[int, Range(ge=1, le=100)] = 5
+    row_px: NotNegative = 1.0  #: rows of a match differ by at most this …
+    row_per_scale: NotNegative = 0.25  #: … and this fraction of the keypoint's scale.
+    nearest_m: Positive = 0.3  #: least depth; disparities above that of this depth are left out.
+    least_disparity_px: Positive = 1.0  #: nor does a smaller disparity than this tell a depth.
+    scale_ratio: Ratio = 1.5  #: largest ratio of the two scales.
+    turn_rad: Annotated[float, Range(gt=0.0, le=7.0)] = 0.35  #: largest difference of the two orientations.
+    limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors.
+    filter_impulses: bool = True  #: whether impulse noise (salt and pepper) is removed before keypoints are detected.
+    refine: bool = True  #: whether the disparity is refined on grey values.
+    half_px: Annotated[int, Range(ge=1, le=100)] = 5  #: of the refinement's window.
+    #: of the refined windows, else the match is dropped.
     least_correlation: Annotated[float, Range(ge=-1.0, le=1.0)] = 0.8
-    shift_px: Positive = 2.0
-    place_px: Positive = 0.25
-    place_per_scale: NotNegative = 0.02
-    disparity_px: Positive = 0.1
-    disparity_per_scale: NotNegative = 0.025
+    shift_px: Positive = 2.0  #: nor may the refinement move it further than this.
+    place_px: Positive = 0.25  #: σ_p of a keypoint of scale 0 …
+    place_per_scale: NotNegative = 0.02  #: … and what is added to it in quadrature, as a fraction of the scale.
+    disparity_px: Positive = 0.1  #: σ_d of a keypoint of scale 0 …
+    disparity_per_scale: NotNegative = 0.025  #: … and what is added to it in quadrature.
 
 
 def calibration_doubt(wrong: float, matches: float) -> str:
@@ -354,15 +327,10 @@ _TINY = 1e-9
 
 @final
 class SubpixelMatches(NamedTuple):
-    """Places in the right image.
+    """Places in the right image."""
 
-    Attributes:
-        u: (K,) column there, px; NaN where a window reaches beyond its image.
-        correlation: (K,) of the two windows, normalised, −1 to 1; 0 where there is no u or no texture.
-    """
-
-    u: np.ndarray
-    correlation: np.ndarray
+    u: np.ndarray  #: (K,) column there, px; NaN where a window reaches beyond its image.
+    correlation: np.ndarray  #: (K,) of the two windows, normalised, −1 to 1; 0 where there is no u or no texture.
 
 
 def refine(

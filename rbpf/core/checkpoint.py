@@ -53,8 +53,9 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     temporary = path.with_name(path.name + ".partial")
     try:
         with open_new(temporary) as file:
-            # All are plain by now; before NumPy 2.2 `allow_pickle` would be one more array.
-            np.savez(file, **arrays)
+            # All are plain by now; before NumPy 2.2 `allow_pickle` would be one more array. Its types take no dict of arrays.
+            plain: dict[str, Any] = dict(arrays)
+            np.savez(file, **plain)
             file.flush()
             # Else a power cut after the renaming could leave neither the old file nor the new one.
             os.fsync(file.fileno())

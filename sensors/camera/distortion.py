@@ -31,13 +31,9 @@ ITERATIONS, HALVINGS = 60, 20
 @final
 @dataclass(frozen=True)
 class RadialTangential:
-    """The distortion, its derivative, and where it can be undone.
+    """The distortion, its derivative, and where it can be undone."""
 
-    Attributes:
-        coefficients: k1, k2, p1, p2, k3.
-    """
-
-    coefficients: tuple[float, float, float, float, float]
+    coefficients: tuple[float, float, float, float, float]  #: k1, k2, p1, p2, k3.
     coefficient_names: ClassVar = ("k1", "k2", "p1", "p2", "k3")
     kind: ClassVar = 0.0
     image_radius: ClassVar = float("inf")
@@ -156,13 +152,9 @@ ANGLE_SETTLED = 1e-15
 @final
 @dataclass(frozen=True)
 class Equidistant:
-    """The lens, its derivative, and where it can be undone; the same methods as `RadialTangential`.
+    """The lens, its derivative, and where it can be undone; the same methods as `RadialTangential`."""
 
-    Attributes:
-        coefficients: k1, k2, k3, k4.
-    """
-
-    coefficients: tuple[float, float, float, float]
+    coefficients: tuple[float, float, float, float]  #: k1, k2, k3, k4.
     coefficient_names: ClassVar = ("k1", "k2", "k3", "k4")
     kind: ClassVar = 1.0
     is_identity: ClassVar = False

@@ -26,28 +26,20 @@ LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidis
 class Pinhole:
     """Pinhole camera with distortion (OpenCV's models and pixel convention).
 
-    Attributes:
-        width: of the image, px.
-        height: of the image, px.
-        fx: focal length along the rows, px.
-        fy: focal length along the columns, px.
-        cx: column of the principal point, px.
-        cy: row of the principal point, px.
-        distortion: k1, k2, p1, p2, k3; of an equidistant lens k1, k2, k3, k4.
-        distortion_model: radial-tangential, or equidistant: a fisheye lens, of which 75° from the axis are seen.
-
     Raises:
         InputError: a size is no positive whole number, a focal length is not positive, a number is not finite,
             there is no such model of distortion, or it has another number of coefficients.
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    width: int  #: of the image, px.
+    height: int  #: of the image, px.
+    fx: float  #: focal length along the rows, px.
+    fy: float  #: focal length along the columns, px.
+    cx: float  #: column of the principal point, px.
+    cy: float  #: row of the principal point, px.
+    #: k1, k2, p1, p2, k3; of an equidistant lens k1, k2, k3, k4.
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    #: radial-tangential, or equidistant: a fisheye lens, of which 75° from the axis are seen.
     distortion_model: str = "radial-tangential"
     dim = 2
 
@@ -190,16 +182,12 @@ class Pinhole:
 class RectifiedStereo:
     """Two equal undistorted pinholes side by side; the left one is the reference.
 
-    Attributes:
-        camera: each of the two.
-        baseline_m: distance of the right one from the left one, along the rows.
-
     Raises:
         InputError: the camera is distorted, or the baseline is not positive.
     """
 
-    camera: Pinhole
-    baseline_m: float
+    camera: Pinhole  #: each of the two.
+    baseline_m: float  #: distance of the right one from the left one, along the rows.
     dim = 3
 
     def __post_init__(self) -> None:

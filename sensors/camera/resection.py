@@ -84,17 +84,12 @@ ROUNDS = 10
 
 @dataclass(frozen=True)
 class Resected:
-    """A camera world_from_camera (7,), and the points that say so, `inliers` (M,).
-
-    Attributes:
-        information: (6, 6) JᵀJ of the inliers' pixels at it, right chart, order [ω, v], 1/px².
-        rms_px: of the inliers, per axis, with their degrees of freedom.
-    """
+    """A camera world_from_camera (7,), and the points that say so, `inliers` (M,)."""
 
     world_from_camera: np.ndarray
-    information: np.ndarray
+    information: np.ndarray  #: (6, 6) JᵀJ of the inliers' pixels at it, right chart, order [ω, v], 1/px².
     inliers: np.ndarray
-    rms_px: float
+    rms_px: float  #: of the inliers, per axis, with their degrees of freedom.
 
 
 def resect_consensus(

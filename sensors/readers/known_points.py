@@ -23,22 +23,16 @@ COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
 class KnownPixels:
     """Landmarks of known position and where they are in the first image.
 
-    Attributes:
-        names: (M,) int64, each once.
-        px: (M, 2) pixels in the first image as it is stored (distorted).
-        positions: (M, 3) in the world, m.
-        std_m: (M,) standard deviation of each position as a whole, the root of its covariance's trace, m.
-        own_frame: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground
-            truth knows nothing.
-
     Raises:
         InputError: a shape is another one, a number is not finite, or a standard deviation is negative.
     """
 
-    names: np.ndarray
-    px: np.ndarray
-    positions: np.ndarray
-    std_m: np.ndarray
+    names: np.ndarray  #: (M,) int64, each once.
+    px: np.ndarray  #: (M, 2) pixels in the first image as it is stored (distorted).
+    positions: np.ndarray  #: (M, 3) in the world, m.
+    std_m: np.ndarray  #: (M,) standard deviation of each position as a whole, the root of its covariance's trace, m.
+    #: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground truth knows
+    #: nothing.
     own_frame: bool = False
 
     def __post_init__(self) -> None:

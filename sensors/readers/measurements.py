@@ -24,38 +24,23 @@ _UNIT = 1e-6
 class Measurements:
     """Odometry, and observations of landmarks whose association is settled; T steps, K observations.
 
-    Attributes:
-        recording: short name of the recording, one line.
-        space: SE2 or SE3, the group of the robot's pose.
-        measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
-        pitch_sign: +1 where positive pitch points up, -1 where it points down.
-        robot_from_sensor: (E,) mounting pose.
-        start: (E,) world_from_robot of step 0, which is known.
-        stamps_ns: (T,) time of each step, integer nanoseconds.
-        deltas: (T - 1, E) odometry, previous_robot_from_robot of the steps from 1 on.
-        covs: (T - 1, d, d) their covariance in the right chart there, order [omega, v]; may be singular.
-        steps: (K,) the step of each observation.
-        landmarks: (K,) the map's name of the landmark seen.
-        z: (K, p) what was measured.
-        cov_z: (K, p, p) covariance of its noise.
-
     Raises:
         InputError: shapes do not fit together, or a number is not as described.
     """
 
-    recording: str
-    space: SE2Group | SE3Group
-    measurement: Kind
-    pitch_sign: float
-    robot_from_sensor: Array
-    start: Array
-    stamps_ns: NDArray[np.int64]
-    deltas: Array
-    covs: Array
-    steps: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
-    z: Array
-    cov_z: Array
+    recording: str  #: short name of the recording, one line.
+    space: SE2Group | SE3Group  #: SE2 or SE3, the group of the robot's pose.
+    measurement: Kind  #: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
+    pitch_sign: float  #: +1 where positive pitch points up, -1 where it points down.
+    robot_from_sensor: Array  #: (E,) mounting pose.
+    start: Array  #: (E,) world_from_robot of step 0, which is known.
+    stamps_ns: NDArray[np.int64]  #: (T,) time of each step, integer nanoseconds.
+    deltas: Array  #: (T - 1, E) odometry, previous_robot_from_robot of the steps from 1 on.
+    covs: Array  #: (T - 1, d, d) their covariance in the right chart there, order [omega, v]; may be singular.
+    steps: NDArray[np.int64]  #: (K,) the step of each observation.
+    landmarks: NDArray[np.int64]  #: (K,) the map's name of the landmark seen.
+    z: Array  #: (K, p) what was measured.
+    cov_z: Array  #: (K, p, p) covariance of its noise.
 
     def __post_init__(self) -> None:
         if self.recording.splitlines() != [self.recording.strip()]:

@@ -27,37 +27,24 @@ _ROUNDING = 1e-5
 
 @dataclass(frozen=True)
 class Frame:
-    """One filter step: the motion since the previous frame and what was then observed.
+    """One filter step: the motion since the previous frame and what was then observed."""
 
-    Attributes:
-        stamp_ns: time of the observations, integer nanoseconds; a log without times counts steps.
-        delta: (E,) odometry, previous_robot_from_robot; None in the first frame.
-        cov_delta: (d, d) its covariance in the right chart at `delta`; None in the first frame.
-        landmarks: (K,) integer names that the log gives the landmarks observed, `UNNAMED` where it gives none.
-        z: (K, p) measurements.
-        cov_z: (K, p, p) their covariance.
-    """
-
-    stamp_ns: int
-    delta: np.ndarray | None
-    cov_delta: np.ndarray | None
+    stamp_ns: int  #: time of the observations, integer nanoseconds; a log without times counts steps.
+    delta: np.ndarray | None  #: (E,) odometry, previous_robot_from_robot; None in the first frame.
+    cov_delta: np.ndarray | None  #: (d, d) its covariance in the right chart at `delta`; None in the first frame.
+    #: (K,) integer names that the log gives the landmarks observed, `UNNAMED` where it gives none.
     landmarks: np.ndarray
-    z: np.ndarray
-    cov_z: np.ndarray
+    z: np.ndarray  #: (K, p) measurements.
+    cov_z: np.ndarray  #: (K, p, p) their covariance.
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth of a log.
+    """Ground truth of a log."""
 
-    Attributes:
-        stamps_ns: (T,) times of the poses.
-        world_from_robot: (T, E) poses at these times.
-        landmarks: name of a landmark to its (D,) position in the world.
-    """
-
-    stamps_ns: np.ndarray
-    world_from_robot: np.ndarray
+    stamps_ns: np.ndarray  #: (T,) times of the poses.
+    world_from_robot: np.ndarray  #: (T, E) poses at these times.
+    #: name of a landmark to its (D,) position in the world.
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -68,26 +55,16 @@ class Truth:
 
 @dataclass(frozen=True)
 class RobotLog:
-    """A recording of a robot that observes landmarks.
+    """A recording of a robot that observes landmarks."""
 
-    Attributes:
-        name: short name of the recording.
-        space: SE2 or SE3, the group of the robot's pose.
-        measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
-        robot_from_sensor: (E,) mounting pose of the sensor.
-        pitch_sign: +1 where positive pitch points up, -1 where it points down.
-        frames: the steps in order of time.
-        truth: ground truth, None where the log has none.
-        misread: whether a reading may be of another landmark than the log says, as of barcodes read by a camera.
-    """
-
-    name: str
-    space: SE2Group | SE3Group
-    measurement: str
-    robot_from_sensor: np.ndarray
-    frames: list[Frame]
-    pitch_sign: float = 1.0
-    truth: Truth | None = None
+    name: str  #: short name of the recording.
+    space: SE2Group | SE3Group  #: SE2 or SE3, the group of the robot's pose.
+    measurement: str  #: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
+    robot_from_sensor: np.ndarray  #: (E,) mounting pose of the sensor.
+    frames: list[Frame]  #: the steps in order of time.
+    pitch_sign: float = 1.0  #: +1 where positive pitch points up, -1 where it points down.
+    truth: Truth | None = None  #: ground truth, None where the log has none.
+    #: whether a reading may be of another landmark than the log says, as of barcodes read by a camera.
     misread: bool = False
 
 
@@ -95,26 +72,18 @@ class RobotLog:
 class LogNoise(Ranged):
     """Noise of a log; None takes what the log says, or the reader's documented default where it says nothing.
 
-    Attributes:
-        std_range_m: of a measured range [m].
-        std_bearing_rad: of a measured bearing (yaw) [rad].
-        std_pitch_rad: of a measured pitch [rad].
-        std_speed_mps: of the forward speed, white noise: its density [m/s per root hertz].
-        std_turn_rate_radps: of the turn rate, white noise: its density [rad/s per root hertz].
-        std_position_m: of each coordinate of a measured position [m].
-        scale_odometry: multiplies the odometry's standard deviations.
-
     Raises:
         InputError: one is not finite, or negative, or zero where only a positive one makes sense.
     """
 
-    std_range_m: Positive | None = None
-    std_bearing_rad: Positive | None = None
-    std_pitch_rad: Positive | None = None
-    std_speed_mps: NotNegative | None = None
+    std_range_m: Positive | None = None  #: of a measured range [m].
+    std_bearing_rad: Positive | None = None  #: of a measured bearing (yaw) [rad].
+    std_pitch_rad: Positive | None = None  #: of a measured pitch [rad].
+    std_speed_mps: NotNegative | None = None  #: of the forward speed, white noise: its density [m/s per root hertz].
+    #: of the turn rate, white noise: its density [rad/s per root hertz].
     std_turn_rate_radps: NotNegative | None = None
-    std_position_m: Positive | None = None
-    scale_odometry: NotNegative | None = None
+    std_position_m: Positive | None = None  #: of each coordinate of a measured position [m].
+    scale_odometry: NotNegative | None = None  #: multiplies the odometry's standard deviations.
 
     def require_only(self, applicable: Collection[str], path: Path, kind: str) -> None:
         """Refuse what would have no effect on a log at a path, of a kind that takes the fields of these names."""

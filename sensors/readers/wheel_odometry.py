@@ -36,19 +36,13 @@ UNIT = 1e-6
 
 @dataclass(frozen=True)
 class WheelOdometry:
-    """Readings of a robot's wheels.
+    """Readings of a robot's wheels."""
 
-    Attributes:
-        stamps_ns: (T,) int64 times, strictly rising.
-        delta: (T - 1, 3) motion from each time to the next, elements of SE(2): [theta, x, y] in the robot's frame.
-        std: (T - 1, 3) standard deviations of theta [rad], x and y [m].
-        robot_from_camera: (7,) pose of the left camera on the robot.
-    """
-
-    stamps_ns: np.ndarray
+    stamps_ns: np.ndarray  #: (T,) int64 times, strictly rising.
+    #: (T - 1, 3) motion from each time to the next, elements of SE(2): [theta, x, y] in the robot's frame.
     delta: np.ndarray
-    std: np.ndarray
-    robot_from_camera: np.ndarray
+    std: np.ndarray  #: (T - 1, 3) standard deviations of theta [rad], x and y [m].
+    robot_from_camera: np.ndarray  #: (7,) pose of the left camera on the robot.
 
     def world_from_robot(self) -> np.ndarray:
         """(T, 3) dead reckoning: elements of SE(2), the first the identity."""

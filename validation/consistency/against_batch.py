@@ -64,31 +64,18 @@ SCALED = "the filter scaled about the first camera onto the optimum; densities a
 @final
 @dataclass(frozen=True, eq=False)
 class AgainstBatch:
-    """A run beside its batch optimum.
+    """A run beside its batch optimum."""
 
-    Attributes:
-        name: of the recording.
-        gauge: how the two worlds were made one, in words.
-        scale: by which the filter was multiplied; 1 where the scale is measured.
-        filter: the run, in that scale.
-        optimum: the batch.
-        path: distances of the filter's online positions from the optimum's, per step, without alignment.
-        landmarks: Gaussians of the map.
-        poses: Gaussians of the last pose; none where the covariances are not known.
-        fit_filter: of the observations of landmarks that both have, by the filter's online poses and its last map.
-        fit_batch: by the optimum.
-    """
-
-    name: str
-    gauge: str
-    scale: float
-    filter: PathAndMap
-    optimum: Optimum
-    path: AbsoluteError
-    landmarks: Differences
-    poses: Differences
-    fit_filter: Fit
-    fit_batch: Fit
+    name: str  #: of the recording.
+    gauge: str  #: how the two worlds were made one, in words.
+    scale: float  #: by which the filter was multiplied; 1 where the scale is measured.
+    filter: PathAndMap  #: the run, in that scale.
+    optimum: Optimum  #: the batch.
+    path: AbsoluteError  #: distances of the filter's online positions from the optimum's, per step, without alignment.
+    landmarks: Differences  #: Gaussians of the map.
+    poses: Differences  #: Gaussians of the last pose; none where the covariances are not known.
+    fit_filter: Fit  #: of the observations of landmarks that both have, by the filter's online poses and its last map.
+    fit_batch: Fit  #: by the optimum.
 
     @property
     def floats(self) -> bool:

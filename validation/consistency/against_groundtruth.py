@@ -53,38 +53,23 @@ _HOW = {
 
 @dataclass(frozen=True)
 class TruthErrors:
-    """A run beside the truth.
+    """A run beside the truth."""
 
-    Attributes:
-        path: filtered poses.
-        truth: at the steps `truth.rows`.
-        positions: errors of the aligned positions.
-        whitened: errors of the poses in units of the filter's own.
-        fitted: parameters of the motion that brought the truth into the run's world; 0 where it is there.
-        landmarks: the map's points whose true places are known; None without any.
-    """
-
-    path: FilteredPath
-    truth: RunTruth
-    positions: AbsoluteError
-    whitened: WhitenedErrors
-    fitted: int
-    landmarks: "LandmarkErrors | None"
+    path: FilteredPath  #: filtered poses.
+    truth: RunTruth  #: at the steps `truth.rows`.
+    positions: AbsoluteError  #: errors of the aligned positions.
+    whitened: WhitenedErrors  #: errors of the poses in units of the filter's own.
+    fitted: int  #: parameters of the motion that brought the truth into the run's world; 0 where it is there.
+    landmarks: "LandmarkErrors | None"  #: the map's points whose true places are known; None without any.
 
 
 @dataclass(frozen=True)
 class LandmarkErrors:
-    """M landmarks beside their true places.
+    """M landmarks beside their true places."""
 
-    Attributes:
-        map: the run's, moved into the truth's world as the path is.
-        truth: (M, D) true places.
-        white: (M, d) errors in units of the filter's own; d is one less than D where the scale is arbitrary.
-    """
-
-    map: MapEstimate
-    truth: np.ndarray
-    white: np.ndarray
+    map: MapEstimate  #: the run's, moved into the truth's world as the path is.
+    truth: np.ndarray  #: (M, D) true places.
+    white: np.ndarray  #: (M, d) errors in units of the filter's own; d is one less than D where the scale is arbitrary.
 
     @property
     def squares(self) -> np.ndarray:

@@ -22,21 +22,13 @@ _PREFIX = "validation_"
 
 @dataclass(frozen=True)
 class Comparison:
-    """One comparison of a run.
+    """One comparison of a run."""
 
-    Attributes:
-        against: with what.
-        accuracy: how good the run is by it, half a sentence: "the path is … m from …".
-        figures: numbers by name.
-        statistics: of the filter's consistency.
-        pictures: files in the run's folder.
-    """
-
-    against: str
-    accuracy: str
-    figures: dict[str, Any]
-    statistics: list[Statistic] = field(default_factory=list)
-    pictures: list[str] = field(default_factory=list)
+    against: str  #: with what.
+    accuracy: str  #: how good the run is by it, half a sentence: "the path is … m from …".
+    figures: dict[str, Any]  #: numbers by name.
+    statistics: list[Statistic] = field(default_factory=list)  #: of the filter's consistency.
+    pictures: list[str] = field(default_factory=list)  #: files in the run's folder.
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> Path:

@@ -36,13 +36,9 @@ Data = Path | RobotRecording | RobotLog | FeatureLog
 
 @dataclass(frozen=True)
 class EvidenceDifference:
-    """Log-evidences of two configurations on the same data, in nats.
+    """Log-evidences of two configurations on the same data, in nats."""
 
-    Attributes:
-        logs_a: (S,) log Ẑ of the first by seed;  logs_b: (S',) of the second.
-    """
-
-    logs_a: np.ndarray
+    logs_a: np.ndarray  #: (S,) log Ẑ of the first by seed;  logs_b: (S',) of the second.
     logs_b: np.ndarray
 
     @property

@@ -48,23 +48,15 @@ Outcome = Literal["supports", "contradicts", "leaves open"]
 
 @dataclass(frozen=True)
 class Statistic:
-    """One number about a filter's consistency.
+    """One number about a filter's consistency."""
 
-    Attributes:
-        name: what it is, in few words.
-        value: of this run.
-        low: end of its 95 % interval;  high: the other.
-        zone: where it may lie.
-        samples: effective degrees of freedom or number of independent samples behind it.
-        kind: a ratio of variances, a bias in standard deviations, or a fraction of cases.
-    """
-
-    name: str
-    value: float
-    low: float
+    name: str  #: what it is, in few words.
+    value: float  #: of this run.
+    low: float  #: end of its 95 % interval;  high: the other.
     high: float
-    zone: tuple[float, float]
-    samples: float
+    zone: tuple[float, float]  #: where it may lie.
+    samples: float  #: effective degrees of freedom or number of independent samples behind it.
+    #: a ratio of variances, a bias in standard deviations, or a fraction of cases.
     kind: Literal["ratio", "bias", "share"] = "ratio"
 
     @property
@@ -91,15 +83,10 @@ class Statistic:
 
 @dataclass(frozen=True)
 class WhitenedErrors:
-    """Errors of T poses in units of what the filter believes, e = cov^(−1/2) Log(mean⁻¹ truth).
+    """Errors of T poses in units of what the filter believes, e = cov^(−1/2) Log(mean⁻¹ truth)."""
 
-    Attributes:
-        errors: (T, d); zero along directions that the filter holds to be known exactly.
-        ranks: (T,) how many directions are not.
-    """
-
-    errors: np.ndarray
-    ranks: np.ndarray
+    errors: np.ndarray  #: (T, d); zero along directions that the filter holds to be known exactly.
+    ranks: np.ndarray  #: (T,) how many directions are not.
 
     @property
     def nees(self) -> np.ndarray:

@@ -49,14 +49,10 @@ _OPENINGS: dict[Trust, str] = {
 
 @dataclass(frozen=True)
 class PathGrade:
-    """How good a path is.
+    """How good a path is."""
 
-    Attributes:
-        grade: the light.
-        sentence: how far it is from what, and how many frames were lost.
-    """
-
-    grade: Grade = "not known"
+    grade: Grade = "not known"  #: the light.
+    #: how far it is from what, and how many frames were lost.
     sentence: str = "How far the path is from the right one is not known: the run was compared with nothing."
 
 
@@ -87,21 +83,13 @@ def grade_path(
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader has to know.
+    """What a reader has to know."""
 
-    Attributes:
-        path: how good the path is.
-        trust: whether its uncertainty can be trusted.
-        reason: why, half a sentence.
-        leaning: to which side the uncertainty is wrong, where it is not to be trusted and that is known.
-        advice: what to try next, a sentence; empty where there is nothing to say.
-    """
-
-    path: PathGrade
-    trust: Trust
-    reason: str
-    leaning: Leaning = ""
-    advice: str = ""
+    path: PathGrade  #: how good the path is.
+    trust: Trust  #: whether its uncertainty can be trusted.
+    reason: str  #: why, half a sentence.
+    leaning: Leaning = ""  #: to which side the uncertainty is wrong, where it is not to be trusted and that is known.
+    advice: str = ""  #: what to try next, a sentence; empty where there is nothing to say.
 
     @property
     def said(self) -> list[str]:

@@ -50,36 +50,24 @@ AFAR = 300
 @final
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """The batch optimum of a problem.
+    """The batch optimum of a problem."""
 
-    Attributes:
-        problem: what was solved: the part that hangs together.
-        estimate: path and map with marginal covariances; only landmarks that the measurements determine. Where not all
-            are determined, poses have no covariances and those of landmarks are NaN.
-        steps: (B,) steps of the run that took part, one per pose.
-        error: half the sum of squared whitened residuals, or the sum of their robust losses.
-    """
-
-    problem: Problem
+    problem: Problem  #: what was solved: the part that hangs together.
+    #: path and map with marginal covariances; only landmarks that the measurements determine. Where not all are
+    #: determined, poses have no covariances and those of landmarks are NaN.
     estimate: PathAndMap
-    steps: NDArray[np.intp]
-    error: float
+    steps: NDArray[np.intp]  #: (B,) steps of the run that took part, one per pose.
+    error: float  #: half the sum of squared whitened residuals, or the sum of their robust losses.
 
 
 @final
 @dataclass(frozen=True)
 class Fit:
-    """How well a path and a map explain observations.
+    """How well a path and a map explain observations."""
 
-    Attributes:
-        log_likelihood: Σ log N(z − h(x̂, m̂); 0, R) [nats].
-        rms_sigmas: root of the mean square whitened residual per measured number.
-        sightings: how many observations took part; the name is that of the key in the file.
-    """
-
-    log_likelihood: float
-    rms_sigmas: float
-    sightings: int
+    log_likelihood: float  #: Σ log N(z − h(x̂, m̂); 0, R) [nats].
+    rms_sigmas: float  #: root of the mean square whitened residual per measured number.
+    sightings: int  #: how many observations took part; the name is that of the key in the file.
 
 
 def problem_of(run: Run) -> Problem:

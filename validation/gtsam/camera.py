@@ -38,26 +38,17 @@ LINE = 1e-3
 @final
 @dataclass(frozen=True, eq=False)
 class CameraSolution:
-    """Most probable path and map; covariances and error as those of `robot.BatchSolution`.
+    """Most probable path and map; covariances and error as those of `robot.BatchSolution`."""
 
-    Attributes:
-        world_from_camera: (T, 7) poses.
-        landmarks: name of each landmark that took part to its (3,) position [m].
-        cov_poses: (T, 6, 6).
-        cov_landmarks: name to (3, 3).
-        error: of the residuals.
-        iterations: of the optimiser.
-        undetermined: names of the landmarks whose place the measurements do not tell, ascending: those seen in one
-            frame by a single camera, and those that an outlier has drawn into its camera, which are both left out,
-            and those whose distance is open for want of parallax, which have a weak prior.
-    """
-
-    world_from_camera: Array
-    landmarks: dict[int, Array]
-    cov_poses: Array
-    cov_landmarks: dict[int, Array]
-    error: float
-    iterations: int
+    world_from_camera: Array  #: (T, 7) poses.
+    landmarks: dict[int, Array]  #: name of each landmark that took part to its (3,) position [m].
+    cov_poses: Array  #: (T, 6, 6).
+    cov_landmarks: dict[int, Array]  #: name to (3, 3).
+    error: float  #: of the residuals.
+    iterations: int  #: of the optimiser.
+    #: names of the landmarks whose place the measurements do not tell, ascending: those seen in one frame by a single
+    #: camera, and those that an outlier has drawn into its camera, which are both left out, and those whose distance
+    #: is open for want of parallax, which have a weak prior.
     undetermined: list[int]
 
 

@@ -246,23 +246,14 @@ class Together:
 
 
 class Adjusted(NamedTuple):
-    """An optimum, with the factors there.
+    """An optimum, with the factors there."""
 
-    Attributes:
-        problem: of which it is one, without the landmarks that had to be left out.
-        values: GTSAM's.
-        graph: likewise.
-        loose: (L,) landmarks with a weak prior.
-        iterations: in all.
-        converged: whether it is one.
-    """
-
-    problem: CameraProblem
-    values: Any
-    graph: Any
-    loose: NDArray[np.bool_]
-    iterations: int
-    converged: bool
+    problem: CameraProblem  #: of which it is one, without the landmarks that had to be left out.
+    values: Any  #: GTSAM's.
+    graph: Any  #: likewise.
+    loose: NDArray[np.bool_]  #: (L,) landmarks with a weak prior.
+    iterations: int  #: in all.
+    converged: bool  #: whether it is one.
 
     @property
     def state(self) -> CameraState:

@@ -48,23 +48,14 @@ class CameraEstimate:
 @final
 @dataclass(frozen=True, eq=False)
 class ObservationTable:
-    """All measurements of a log, one row each, in the order of the frames.
+    """All measurements of a log, one row each, in the order of the frames."""
 
-    Attributes:
-        camera: that took them.
-        steps: (K,) frame of each.
-        index: (K,) its landmark's place in `names`.
-        names: (L,) names of the landmarks, ascending.
-        z: (K, p) [px].
-        cov_z: (K, p, p) [px^2].
-    """
-
-    camera: Pinhole | RectifiedStereo
-    steps: Index
-    index: Index
-    names: NDArray[np.int64]
-    z: Array
-    cov_z: Array
+    camera: Pinhole | RectifiedStereo  #: that took them.
+    steps: Index  #: (K,) frame of each.
+    index: Index  #: (K,) its landmark's place in `names`.
+    names: NDArray[np.int64]  #: (L,) names of the landmarks, ascending.
+    z: Array  #: (K, p) [px].
+    cov_z: Array  #: (K, p, p) [px^2].
 
     def rows(self, kept: NDArray[np.bool_] | Index) -> "ObservationTable":
         """Some of the rows, with the landmarks that they show."""

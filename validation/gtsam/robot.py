@@ -52,24 +52,16 @@ _PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, 
 @final
 @dataclass(frozen=True, eq=False)
 class BatchSolution:
-    """Most probable trajectory and map, with covariances from the Gauss-Newton Hessian there.
+    """Most probable trajectory and map, with covariances from the Gauss-Newton Hessian there."""
 
-    Attributes:
-        world_from_robot: (T, E) poses.
-        landmarks: name of each landmark to its (D,) position.
-        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
-        cov_landmarks: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
-        error: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right
-            about half the number of measured scalars less half that of the landmarks' coordinates.
-        iterations: of the optimiser.
-    """
-
-    world_from_robot: Array
-    landmarks: dict[int, Array]
-    cov_poses: Array
-    cov_landmarks: dict[int, Array]
+    world_from_robot: Array  #: (T, E) poses.
+    landmarks: dict[int, Array]  #: name of each landmark to its (D,) position.
+    cov_poses: Array  #: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
+    cov_landmarks: dict[int, Array]  #: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
+    #: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right about
+    #: half the number of measured scalars less half that of the landmarks' coordinates.
     error: float
-    iterations: int
+    iterations: int  #: of the optimiser.
 
 
 def solve(

@@ -43,23 +43,14 @@ _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 @final
 @dataclass(frozen=True)
 class Chart:
-    """How GTSAM holds the poses of a group.
+    """How GTSAM holds the poses of a group."""
 
-    Attributes:
-        order: (d,) GTSAM's tangent is ours[order].
-        pose: our storage (E,) to GTSAM's object.
-        storage: values and key to our storage (E,).
-        point: values and key to a landmark (D,).
-        between: class of the native odometry factor.
-        prior: class of the factor that holds the start.
-    """
-
-    order: NDArray[np.intp]
-    pose: Callable[[Array], Any]
-    storage: Callable[[Any, int], Array]
-    point: Callable[[Any, int], Array]
-    between: type
-    prior: type
+    order: NDArray[np.intp]  #: (d,) GTSAM's tangent is ours[order].
+    pose: Callable[[Array], Any]  #: our storage (E,) to GTSAM's object.
+    storage: Callable[[Any, int], Array]  #: values and key to our storage (E,).
+    point: Callable[[Any, int], Array]  #: values and key to a landmark (D,).
+    between: type  #: class of the native odometry factor.
+    prior: type  #: class of the factor that holds the start.
 
     def covariance(self, cov: Array) -> Array:
         """Ours of GTSAM's (d, d)."""

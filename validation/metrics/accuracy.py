@@ -21,17 +21,11 @@ Unit = Literal["frames", "metres"]
 @final
 @dataclass(frozen=True)
 class AbsoluteError:
-    """Distances between estimated and true positions.
+    """Distances between estimated and true positions."""
 
-    Attributes:
-        keys: (N,) the reference stamp of each pose, or the name of each landmark.
-        distances: (N,) [m].
-        alignment: what was applied to the estimate first.
-    """
-
-    keys: NDArray[np.int64]
-    distances: Array
-    alignment: Similarity
+    keys: NDArray[np.int64]  #: (N,) the reference stamp of each pose, or the name of each landmark.
+    distances: Array  #: (N,) [m].
+    alignment: Similarity  #: what was applied to the estimate first.
 
     @property
     def rmse(self) -> float:
@@ -57,17 +51,11 @@ class AbsoluteError:
 @final
 @dataclass(frozen=True)
 class RelativeError:
-    """Differences between estimated and true motions over pairs of poses.
+    """Differences between estimated and true motions over pairs of poses."""
 
-    Attributes:
-        pairs: (P, 2) rows of the first and second pose of each pair.
-        translations: (P,) [m].
-        rotations_deg: (P,) angles in [0, 180].
-    """
-
-    pairs: NDArray[np.intp]
-    translations: Array
-    rotations_deg: Array
+    pairs: NDArray[np.intp]  #: (P, 2) rows of the first and second pose of each pair.
+    translations: Array  #: (P,) [m].
+    rotations_deg: Array  #: (P,) angles in [0, 180].
 
     def __len__(self) -> int:
         return len(self.pairs)

@@ -48,25 +48,16 @@ def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Gaussians of the filter beside those of the optimum, K of them.
+    """Gaussians of the filter beside those of the optimum, K of them."""
 
-    Attributes:
-        keys: (K,) names of landmarks, or steps of poses.
-        distances_m: (K,) between the means.
-        sigmas: (K,) between the means in the filter's standard deviations, √(δᵀ P_f⁻¹ δ).
-        kullback_leibler: (K,) KL(optimum ‖ filter) [nats]: what believing the filter instead of the optimum costs.
-        bhattacharyya: (K,) the symmetric distance.
-        sigma_ratio: (K,) the filter's mean standard deviation over the optimum's; below 1 is over-confident.
-        dims: of the Gaussians.
-    """
-
-    keys: NDArray[np.int64]
-    distances_m: Array
-    sigmas: Array
+    keys: NDArray[np.int64]  #: (K,) names of landmarks, or steps of poses.
+    distances_m: Array  #: (K,) between the means.
+    sigmas: Array  #: (K,) between the means in the filter's standard deviations, √(δᵀ P_f⁻¹ δ).
+    #: (K,) KL(optimum ‖ filter) [nats]: what believing the filter instead of the optimum costs.
     kullback_leibler: Array
-    bhattacharyya: Array
-    sigma_ratio: Array
-    dims: int
+    bhattacharyya: Array  #: (K,) the symmetric distance.
+    sigma_ratio: Array  #: (K,) the filter's mean standard deviation over the optimum's; below 1 is over-confident.
+    dims: int  #: of the Gaussians.
 
     def __len__(self) -> int:
         return len(self.keys)

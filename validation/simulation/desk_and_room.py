@@ -41,30 +41,19 @@ class TexturedDesk(Ranged):
     """A desk at a wall, with papers, books and boxes on it, seen by a camera in a hand that is held still at first.
 
     The middle of the desk's top is the origin; the wall is beyond its edge at the greatest y.
-
-    Attributes:
-        frames: number of images.
-        rate_hz: images per second.
-        size_m: of the desk's top along x and y.
-        papers: number of flat things.
-        things: most books and boxes; as many as find a place.
-        board: squares (columns, rows) of a chessboard that lies in the middle; None for none.
-        square_m: side of its squares.
-        hand: that moves the camera.
-        texel_m: side of a texel.
-        contrast: of all textures but the chessboard's; 1 is rich, 0.1 poor.
     """
 
-    frames: Annotated[int, Range(ge=2, le=MOST)] = 300
-    rate_hz: Positive = 30.0
-    size_m: tuple[Positive, Positive] = (2.0, 2.0)
-    papers: CountOrNone = 42
-    things: CountOrNone = 16
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 300  #: number of images.
+    rate_hz: Positive = 30.0  #: images per second.
+    size_m: tuple[Positive, Positive] = (2.0, 2.0)  #: of the desk's top along x and y.
+    papers: CountOrNone = 42  #: number of flat things.
+    things: CountOrNone = 16  #: most books and boxes; as many as find a place.
+    #: squares (columns, rows) of a chessboard that lies in the middle; None for none.
     board: Annotated[tuple[int, int] | None, Range(ge=3, le=1000)] = None
-    square_m: Positive = 0.03
-    hand: HandHeld = OVER_DESK
-    texel_m: Positive = 0.001
-    contrast: NotNegative = 1.0
+    square_m: Positive = 0.03  #: side of its squares.
+    hand: HandHeld = OVER_DESK  #: that moves the camera.
+    texel_m: Positive = 0.001  #: side of a texel.
+    contrast: NotNegative = 1.0  #: of all textures but the chessboard's; 1 is rich, 0.1 poor.
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the textures, the things and the path."""
@@ -121,40 +110,23 @@ class TexturedRoom:
     """A room with pictures on its walls and boxes along them; a camera is carried in a circle and looks outwards.
 
     The middle of the floor is the origin. Walked anticlockwise from (radius_m, 0).
-
-    Attributes:
-        frames: number of images.
-        rate_hz: images per second.
-        size_m: of the room along x, y and z.
-        pictures: number of them on each wall.
-        things: most boxes on the floor; as many as find a place.
-        radius_m: of the circle.
-        eye_m: height of the camera.
-        gaze_deg: the camera looks this far outwards from straight ahead.
-        drop_deg: and this far down.
-        speed_m_s: of walking.
-        shake_m: greatest displacement by the hand, per axis.
-        shake_deg: greatest rotation by it, per axis.
-        start_s: the walk reaches its speed after this time.
-        texel_m: side of a texel.
-        contrast: of all textures; 1 is rich, 0.1 poor.
     """
 
-    frames: Annotated[int, Range(ge=2, le=MOST)] = 600
-    rate_hz: Positive = 30.0
-    size_m: tuple[float, float, float] = (6.0, 5.0, 2.6)
-    pictures: CountOrNone = 5
-    things: CountOrNone = 14
-    radius_m: Positive = 1.0
-    eye_m: Positive = 1.4
-    gaze_deg: float = 60.0
-    drop_deg: Annotated[float, Range(gt=-80.0, lt=80.0)] = 10.0
-    speed_m_s: Positive = 0.4
-    shake_m: NotNegative = 0.03
-    shake_deg: NotNegative = 3.0
-    start_s: NotNegative = 1.0
-    texel_m: Positive = 0.0025
-    contrast: NotNegative = 1.0
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 600  #: number of images.
+    rate_hz: Positive = 30.0  #: images per second.
+    size_m: tuple[float, float, float] = (6.0, 5.0, 2.6)  #: of the room along x, y and z.
+    pictures: CountOrNone = 5  #: number of them on each wall.
+    things: CountOrNone = 14  #: most boxes on the floor; as many as find a place.
+    radius_m: Positive = 1.0  #: of the circle.
+    eye_m: Positive = 1.4  #: height of the camera.
+    gaze_deg: float = 60.0  #: the camera looks this far outwards from straight ahead.
+    drop_deg: Annotated[float, Range(gt=-80.0, lt=80.0)] = 10.0  #: and this far down.
+    speed_m_s: Positive = 0.4  #: of walking.
+    shake_m: NotNegative = 0.03  #: greatest displacement by the hand, per axis.
+    shake_deg: NotNegative = 3.0  #: greatest rotation by it, per axis.
+    start_s: NotNegative = 1.0  #: the walk reaches its speed after this time.
+    texel_m: Positive = 0.0025  #: side of a texel.
+    contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
 
     def __post_init__(self) -> None:
         check_ranges(self)

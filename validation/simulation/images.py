@@ -44,34 +44,21 @@ class Imaging:
     The defaults are those of a small camera indoors: an exposure of a hundredth of a second, the noise of a raised
     gain, an automatic exposure, a lens that is darker in the corners. `examples/studies/mono_realism.py` compares what active
     search finds with them with real recordings.
-
-    Attributes:
-        noise_std: of the sensor, grey levels.
-        exposure_drift: greatest change of the exposure, as a fraction; it goes up and down within seconds.
-        lens_px: standard deviation of the lens's point spread; 0 is sharper than any lens.
-        blur_s: the shutter is open this long, half before and half after the stamp.
-        vignetting: fraction of the light that is missing in the corner farthest from the principal point.
-        blackout: frames in which the light is out, counted from 0.
-        grid: rays per pixel along each side.
-        depth: whether depth images are written.
-        jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
-        known: number of corners in the first image whose positions are given, at least 4; 0 for none.
-        known_std_m: standard deviation of these positions, the root of their covariance's trace.
-        known_exact: leave the positions without their error.
     """
 
-    noise_std: NotNegative = 3.0
-    exposure_drift: Rate = 0.15
-    lens_px: NotNegative = 0.5
-    blur_s: NotNegative = 0.01
-    vignetting: Rate = 0.2
-    blackout: Sequence[int] = ()
-    grid: Annotated[int, Range(ge=1, le=64)] = 2
-    depth: bool = False
+    noise_std: NotNegative = 3.0  #: of the sensor, grey levels.
+    exposure_drift: Rate = 0.15  #: greatest change of the exposure, as a fraction; it goes up and down within seconds.
+    lens_px: NotNegative = 0.5  #: standard deviation of the lens's point spread; 0 is sharper than any lens.
+    blur_s: NotNegative = 0.01  #: the shutter is open this long, half before and half after the stamp.
+    vignetting: Rate = 0.2  #: fraction of the light that is missing in the corner farthest from the principal point.
+    blackout: Sequence[int] = ()  #: frames in which the light is out, counted from 0.
+    grid: Annotated[int, Range(ge=1, le=64)] = 2  #: rays per pixel along each side.
+    depth: bool = False  #: whether depth images are written.
+    #: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
     jpeg: Annotated[int, Range(ge=0, le=100)] = 0
-    known: CountOrNone = 6
-    known_std_m: Positive = 0.001
-    known_exact: bool = False
+    known: CountOrNone = 6  #: number of corners in the first image whose positions are given, at least 4; 0 for none.
+    known_std_m: Positive = 0.001  #: standard deviation of these positions, the root of their covariance's trace.
+    known_exact: bool = False  #: leave the positions without their error.
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -357,19 +357,15 @@ the robot's frame has x forwards, y to the left, z up, its origin between the wh
 class LabDrive:
     """How a robot drives through the laboratory.
 
-    Attributes:
-        trajectory: "tour" through both rooms and back, 4,000 frames over 67.9 m; or "turn_back", 600 frames, on which
-            the robot twice looks away for 5 s and back.
-        frames: most images; None for all.
-        every: only each so many-th frame of the trajectory becomes an image.
-
     Raises:
         InputError: there is no such trajectory, or it has not as many frames.
     """
 
+    #: "tour" through both rooms and back, 4,000 frames over 67.9 m; or "turn_back", 600 frames, on which the robot
+    #: twice looks away for 5 s and back.
     trajectory: Trajectory = "tour"
-    frames: Annotated[int | None, Range(ge=2, le=MOST)] = None
-    every: Count = 1
+    frames: Annotated[int | None, Range(ge=2, le=MOST)] = None  #: most images; None for all.
+    every: Count = 1  #: only each so many-th frame of the trajectory becomes an image.
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -404,19 +400,13 @@ def world_from_camera(world_from_robot: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TexturedLab(Ranged):
-    """Two rooms of 18 m × 10 m together, with shelves, tables, cabinets, cartons and posters.
+    """Two rooms of 18 m × 10 m together, with shelves, tables, cabinets, cartons and posters."""
 
-    Attributes:
-        drive: of the robot that carries the camera.
-        odometer: of the same robot; it is read in every frame of the trajectory, whether that becomes an image or not.
-        texel_m: side of a texel; of floors twice, of the ceiling four times as much.
-        contrast: of all textures; 1 is rich, 0.1 poor.
-    """
-
-    drive: LabDrive = LabDrive()
+    drive: LabDrive = LabDrive()  #: of the robot that carries the camera.
+    #: of the same robot; it is read in every frame of the trajectory, whether that becomes an image or not.
     odometer: WheelOdometer = field(default_factory=WheelOdometer)
-    texel_m: Positive = 0.003
-    contrast: NotNegative = 1.0
+    texel_m: Positive = 0.003  #: side of a texel; of floors twice, of the ceiling four times as much.
+    contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the furniture, the textures and the odometer's slip; the drive is always the same.

@@ -114,32 +114,20 @@ class HandHeld:
 
     The point looked at, the middle of the things' box at first, wanders over the desk, and the camera about that point.
     The path is slowed down until neither `speed_m_s` nor `turn_rad_s` is passed; the hand's tremor comes on top.
-
-    Attributes:
-        nearest_m: least distance of the camera from the point that it looks at.
-        farthest_m: greatest distance.
-        elevation_deg: the camera looks down at this angle, on the average.
-        sweep_deg: greatest turn about the point looked at to either side; a quarter as much up and down.
-        wander: greatest shift of the point looked at, as a fraction of the box's size.
-        wrist_deg: greatest rotation by the wrist, per axis.
-        speed_m_s: highest speed.
-        turn_rad_s: highest rate of turn.
-        tremor_m: greatest displacement by the hand's tremor, per axis.
-        tremor_deg: greatest rotation by it, per axis.
-        start_s: the camera reaches its pace after this time.
     """
 
-    nearest_m: Positive = 1.0
-    farthest_m: Positive = 1.5
-    elevation_deg: float = 55.0
+    nearest_m: Positive = 1.0  #: least distance of the camera from the point that it looks at.
+    farthest_m: Positive = 1.5  #: greatest distance.
+    elevation_deg: float = 55.0  #: the camera looks down at this angle, on the average.
+    #: greatest turn about the point looked at to either side; a quarter as much up and down.
     sweep_deg: NotNegative = 40.0
-    wander: NotNegative = 0.3
-    wrist_deg: NotNegative = 10.0
-    speed_m_s: Positive = 0.3
-    turn_rad_s: Positive = 0.5
-    tremor_m: NotNegative = 0.002
-    tremor_deg: NotNegative = 0.3
-    start_s: NotNegative = 1.0
+    wander: NotNegative = 0.3  #: greatest shift of the point looked at, as a fraction of the box's size.
+    wrist_deg: NotNegative = 10.0  #: greatest rotation by the wrist, per axis.
+    speed_m_s: Positive = 0.3  #: highest speed.
+    turn_rad_s: Positive = 0.5  #: highest rate of turn.
+    tremor_m: NotNegative = 0.002  #: greatest displacement by the hand's tremor, per axis.
+    tremor_deg: NotNegative = 0.3  #: greatest rotation by it, per axis.
+    start_s: NotNegative = 1.0  #: the camera reaches its pace after this time.
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -333,19 +321,15 @@ class WheelOdometer(Ranged):
     Measurement and correction of systematic odometry errors in mobile robots, 1996); slip is a random walk whose
     variance grows with the way of each wheel (K. S. Chong, L. Kleeman, Accurate odometry and error modelling for a
     mobile robot, 1997).
-
-    Attributes:
-        wheelbase_m: true distance between the wheels.
-        scale: both wheels report so much more than they went, as a fraction.
-        inequality: the right one reports so much more than the left one, as a fraction: a drift of the heading.
-        wheelbase_error: the robot takes the distance between its wheels for so much greater, as a fraction.
-        slip_m: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
     """
 
-    wheelbase_m: Positive = 0.4
-    scale: Error = 0.01
+    wheelbase_m: Positive = 0.4  #: true distance between the wheels.
+    scale: Error = 0.01  #: both wheels report so much more than they went, as a fraction.
+    #: the right one reports so much more than the left one, as a fraction: a drift of the heading.
     inequality: Error = 0.002
+    #: the robot takes the distance between its wheels for so much greater, as a fraction.
     wheelbase_error: Error = 0.02
+    #: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
     slip_m: NotNegative = 0.004
 
     def measure(

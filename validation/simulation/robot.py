@@ -19,37 +19,21 @@ from rbpf.sensors.readers.robot_log import UNNAMED
 
 @dataclass(frozen=True)
 class RobotWorld(Ranged):
-    """A robot that drives in a circle (planar) or along a tilted, waving loop (in space) among random landmarks.
+    """A robot that drives in a circle (planar) or along a tilted, waving loop (in space) among random landmarks."""
 
-    Attributes:
-        steps: number of steps.
-        landmarks: number of landmarks.
-        spatial: six degrees of freedom instead of three.
-        radius_m: of the circle.
-        laps: how many times round.
-        extent_m: landmarks lie within this of the circle's centre.
-        max_range_m: of the sensor.
-        half_field_of_view_deg: in yaw (and pitch).
-        std_range_m: noise of the range.
-        std_angle_deg: noise of yaw and pitch.
-        std_translation_m: noise of the odometry per step and axis.
-        std_rotation_deg: likewise.
-        unnamed: the log does not say which landmark was observed.
-    """
-
-    steps: Annotated[int, Range(ge=2, le=MOST)] = 200
-    landmarks: Count = 60
-    spatial: bool = False
-    radius_m: Positive = 5.0
-    laps: float = 2.0
-    extent_m: Positive = 9.0
-    max_range_m: Positive = 6.0
-    half_field_of_view_deg: Angle = 60.0
-    std_range_m: Positive = 0.02
-    std_angle_deg: Positive = 0.3
-    std_translation_m: NotNegative = 0.03
-    std_rotation_deg: NotNegative = 0.3
-    unnamed: bool = False
+    steps: Annotated[int, Range(ge=2, le=MOST)] = 200  #: number of steps.
+    landmarks: Count = 60  #: number of landmarks.
+    spatial: bool = False  #: six degrees of freedom instead of three.
+    radius_m: Positive = 5.0  #: of the circle.
+    laps: float = 2.0  #: how many times round.
+    extent_m: Positive = 9.0  #: landmarks lie within this of the circle's centre.
+    max_range_m: Positive = 6.0  #: of the sensor.
+    half_field_of_view_deg: Angle = 60.0  #: in yaw (and pitch).
+    std_range_m: Positive = 0.02  #: noise of the range.
+    std_angle_deg: Positive = 0.3  #: noise of yaw and pitch.
+    std_translation_m: NotNegative = 0.03  #: noise of the odometry per step and axis.
+    std_rotation_deg: NotNegative = 0.3  #: likewise.
+    unnamed: bool = False  #: the log does not say which landmark was observed.
 
 
 def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:

@@ -39,22 +39,16 @@ class Rectangle:
 
     The centre of texel (row i, column j) of a texture (H, W) lies at corner + (j + ½)/W across + (i + ½)/H down.
 
-    Attributes:
-        corner: (3,) position of the texture's top left corner in the world, m.
-        across: (3,) from there to the top right corner, m.
-        down: (3,) from there to the bottom left corner, m; not parallel to `across`, nor need it be perpendicular.
-        texture: (H, W) uint8 grey levels, at least 2 × 2.
-        gain: brightness of the light on it, a factor on the grey levels.
-
     Raises:
         InputError: the sides span no area, the texture is no grey image, or the gain is negative.
     """
 
-    corner: np.ndarray
-    across: np.ndarray
+    corner: np.ndarray  #: (3,) position of the texture's top left corner in the world, m.
+    across: np.ndarray  #: (3,) from there to the top right corner, m.
+    #: (3,) from there to the bottom left corner, m; not parallel to `across`, nor need it be perpendicular.
     down: np.ndarray
-    texture: np.ndarray
-    gain: float = 1.0
+    texture: np.ndarray  #: (H, W) uint8 grey levels, at least 2 × 2.
+    gain: float = 1.0  #: brightness of the light on it, a factor on the grey levels.
 
     def __post_init__(self) -> None:
         sides = np.array([self.corner, self.across, self.down], dtype=float)
@@ -75,23 +69,14 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class TexturedScene:
-    """A world with everything random about it drawn.
+    """A world with everything random about it drawn."""
 
-    Attributes:
-        name: of the world.
-        stamps_ns: (T,) int64 times of the frames, rising.
-        world_from_camera: (T, 7) true poses at these times, the middles of the exposures.
-        rectangles: what there is to see.
-        boards: chessboards among it.
-        odometry: what the wheels say, if the camera stands on a robot.
-    """
-
-    name: str
-    stamps_ns: np.ndarray
-    world_from_camera: np.ndarray
-    rectangles: Sequence[Rectangle]
-    boards: Sequence["Chessboard"] = ()
-    odometry: WheelOdometry | None = None
+    name: str  #: of the world.
+    stamps_ns: np.ndarray  #: (T,) int64 times of the frames, rising.
+    world_from_camera: np.ndarray  #: (T, 7) true poses at these times, the middles of the exposures.
+    rectangles: Sequence[Rectangle]  #: what there is to see.
+    boards: Sequence["Chessboard"] = ()  #: chessboards among it.
+    odometry: WheelOdometry | None = None  #: what the wheels say, if the camera stands on a robot.
 
 
 @dataclass(frozen=True)

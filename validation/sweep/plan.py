@@ -32,44 +32,27 @@ Value = str | int | float | bool | None
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What the YAML file holds.
+    """What the YAML file holds."""
 
-    Attributes:
-        system: which one is run.
-        sequences: paths, or mappings of the system's fields to paths.
-        particles: numbers of particles; empty for the system's own.
-        seeds: how many, or which.
-        options: by a name, settings by theirs.
-        settings: of all runs.
-    """
-
-    system: str
-    sequences: list[str | dict[str, str]]
-    particles: list[int] = field(default_factory=list)
-    seeds: int | list[int] = 1
+    system: str  #: which one is run.
+    sequences: list[str | dict[str, str]]  #: paths, or mappings of the system's fields to paths.
+    particles: list[int] = field(default_factory=list)  #: numbers of particles; empty for the system's own.
+    seeds: int | list[int] = 1  #: how many, or which.
+    #: by a name, settings by theirs.
     options: dict[str, dict[str, Value]] = field(default_factory=lambda: {"as it is": {}})
-    settings: dict[str, Value] = field(default_factory=dict)
+    settings: dict[str, Value] = field(default_factory=dict)  #: of all runs.
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a sweep.
+    """One run of a sweep."""
 
-    Attributes:
-        system: which one.
-        sequence: the system's fields and their paths, as (name, path).
-        option: name of the option.
-        settings: as key=value, the option's after those of all runs.
-        particles: how many; None for the system's own.
-        seed: of the filter.
-    """
-
-    system: str
-    sequence: tuple[tuple[str, str], ...]
-    option: str
-    settings: tuple[str, ...]
-    particles: int | None
-    seed: int
+    system: str  #: which one.
+    sequence: tuple[tuple[str, str], ...]  #: the system's fields and their paths, as (name, path).
+    option: str  #: name of the option.
+    settings: tuple[str, ...]  #: as key=value, the option's after those of all runs.
+    particles: int | None  #: how many; None for the system's own.
+    seed: int  #: of the filter.
 
     @property
     def key(self) -> str:

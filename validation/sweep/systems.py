@@ -26,16 +26,11 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True)
 class SweepSystem:
-    """A system that a sweep can run.
+    """A system that a sweep can run."""
 
-    Attributes:
-        fields: of a sequence, each a path; the first is the recording itself.
-        check: raises `InputError` where settings are wrong.
-        run: filters a sequence with settings key=value, and given ones by name, to figures.
-    """
-
-    fields: tuple[str, ...]
-    check: Callable[[Sequence[str], Mapping[str, Any]], object]
+    fields: tuple[str, ...]  #: of a sequence, each a path; the first is the recording itself.
+    check: Callable[[Sequence[str], Mapping[str, Any]], object]  #: raises `InputError` where settings are wrong.
+    #: filters a sequence with settings key=value, and given ones by name, to figures.
     run: Callable[[Mapping[str, Path], Sequence[str], Mapping[str, Any]], Figures]
 
 

@@ -229,19 +229,12 @@ def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | N
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A camera as its messages describe it.
+    """A camera as its messages describe it."""
 
-    Attributes:
-        calibration: the camera of the images as they are in the bag.
-        rotation: (3, 3) R, which rectifies the pair that it belongs to.
-        projection: (3, 4) P, of the camera after that rotation; its last column holds the baseline.
-        is_rectified: whether the images have been rotated so.
-    """
-
-    calibration: Calibration
-    rotation: Array
-    projection: Array
-    is_rectified: bool
+    calibration: Calibration  #: the camera of the images as they are in the bag.
+    rotation: Array  #: (3, 3) R, which rectifies the pair that it belongs to.
+    projection: Array  #: (3, 4) P, of the camera after that rotation; its last column holds the baseline.
+    is_rectified: bool  #: whether the images have been rotated so.
 
     @classmethod
     def read(cls, bag: Bag, image_topic: str) -> "CameraInfo":

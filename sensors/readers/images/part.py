@@ -16,19 +16,14 @@ from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Sour
 class Part:
     """Which frames of a recording are used, and images in which size.
 
-    Attributes:
-        start_s: the first is the first one so long after the recording's first, s.
-        end_s: the last is the last one no longer after it, s; None for the recording's.
-        every: of these each so many-th.
-        resize_px: width that they are made smaller to, px; the height follows. None leaves them as they are.
-
     Raises:
         InputError: a number is out of its range.
     """
 
-    start_s: float = 0.0
-    end_s: float | None = None
-    every: int = 1
+    start_s: float = 0.0  #: the first is the first one so long after the recording's first, s.
+    end_s: float | None = None  #: the last is the last one no longer after it, s; None for the recording's.
+    every: int = 1  #: of these each so many-th.
+    #: width that they are made smaller to, px; the height follows. None leaves them as they are.
     resize_px: int | None = None
 
     def __post_init__(self) -> None:

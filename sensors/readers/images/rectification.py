@@ -29,16 +29,11 @@ ROTATED_RAD, ASIDE = 1e-4, 1e-2
 @final
 @dataclass(frozen=True)
 class Rectification:
-    """How images are made into those of a rectified pair.
+    """How images are made into those of a rectified pair."""
 
-    Attributes:
-        rig: the rectified pair.
-        left_from_rectified: (7,) a turn.
-        maps: for each camera, columns and rows (H, W) float32 of the given image that the rectified one shows.
-    """
-
-    rig: RectifiedStereo
-    left_from_rectified: Array
+    rig: RectifiedStereo  #: the rectified pair.
+    left_from_rectified: Array  #: (7,) a turn.
+    #: for each camera, columns and rows (H, W) float32 of the given image that the rectified one shows.
     maps: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     @classmethod

@@ -18,19 +18,13 @@ TOLERANCE_S = 0.005
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """One image or a pair, or the place of one that could not be read.
+    """One image or a pair, or the place of one that could not be read."""
 
-    Attributes:
-        stamp_ns: time of the image, integer nanoseconds.
-        image: (H, W) uint8 grey; None where it could not be read.
-        right: (H, W) uint8 grey, the second camera of a stereo sequence; None where there is none.
-        problem: one sentence that says why an image is missing; None where none is.
-    """
-
-    stamp_ns: int
-    image: np.ndarray | None
+    stamp_ns: int  #: time of the image, integer nanoseconds.
+    image: np.ndarray | None  #: (H, W) uint8 grey; None where it could not be read.
+    #: (H, W) uint8 grey, the second camera of a stereo sequence; None where there is none.
     right: np.ndarray | None = None
-    problem: str | None = None
+    problem: str | None = None  #: one sentence that says why an image is missing; None where none is.
 
 
 class Source(ABC):
@@ -48,27 +42,20 @@ class ImageSequence:
 
     Nothing of it but its first image is decoded before `frames` is called.
 
-    Attributes:
-        name: short name of the recording.
-        camera: of the (left) images as they come out of `frames`.
-        stamps_ns: (T,) int64 times of the images, not decreasing; equal ones, between which no time passes, occur.
-        truth: world_from_camera of the (left) camera at its own stamps, without landmarks; None where unknown.
-        baseline_m: of a rectified stereo pair, None where there is one camera.
-        source: where the images come from.
-        notes: one sentence for each thing that was left out or changed.
-
     Raises:
         InputError: the stamps are no whole numbers, or one is before the one it follows; the camera of a pair is distorted,
             or its baseline is not positive.
     """
 
-    name: str
-    camera: Pinhole
+    name: str  #: short name of the recording.
+    camera: Pinhole  #: of the (left) images as they come out of `frames`.
+    #: (T,) int64 times of the images, not decreasing; equal ones, between which no time passes, occur.
     stamps_ns: np.ndarray
+    #: world_from_camera of the (left) camera at its own stamps, without landmarks; None where unknown.
     truth: CameraTruth | None
-    baseline_m: float | None
-    source: Source
-    notes: tuple[str, ...] = ()
+    baseline_m: float | None  #: of a rectified stereo pair, None where there is one camera.
+    source: Source  #: where the images come from.
+    notes: tuple[str, ...] = ()  #: one sentence for each thing that was left out or changed.
 
     def __post_init__(self) -> None:
         """A sequence may be made by hand."""
@@ -111,15 +98,10 @@ class ImageSequence:
 @final
 @dataclass(frozen=True)
 class Topics:
-    """Names of streams in a recording that holds several, as a ROS bag does.
+    """Names of streams in a recording that holds several, as a ROS bag does."""
 
-    Attributes:
-        images: one, or a left and a right one; empty where the recording is to be asked.
-        truth: the stream of the camera's true poses; None for none.
-    """
-
-    images: tuple[str, ...] = ()
-    truth: str | None = None
+    images: tuple[str, ...] = ()  #: one, or a left and a right one; empty where the recording is to be asked.
+    truth: str | None = None  #: the stream of the camera's true poses; None for none.
 
     @classmethod
     def parse(cls, images: str | None = None, truth: str | None = None) -> Self:
@@ -147,17 +129,11 @@ UNNAMED = Topics()
 @final
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a caller may say about a recording.
+    """What a caller may say about a recording."""
 
-    Attributes:
-        calibration: a `camera.yaml` in place of the recording's own calibration; None for that.
-        topics: of a ROS bag, where they have to be named.
-        tolerance_s: images of two cameras whose times differ by no more belong together.
-    """
-
-    calibration: Path | None = None
-    topics: Topics = UNNAMED
-    tolerance_s: float = TOLERANCE_S
+    calibration: Path | None = None  #: a `camera.yaml` in place of the recording's own calibration; None for that.
+    topics: Topics = UNNAMED  #: of a ROS bag, where they have to be named.
+    tolerance_s: float = TOLERANCE_S  #: images of two cameras whose times differ by no more belong together.
 
 
 class ImageFormat(ABC):
