@@ -1,7 +1,7 @@
 """Digests of what short runs of every system leave: the net under a restructuring, which must keep every one of them.
 
-    python tests/golden/digests.py record FILE       runs the cases and writes their digests
-    python tests/golden/digests.py compare FILE      runs them again and says what differs
+    python benchmarks/digests.py record FILE       runs the cases and writes their digests
+    python benchmarks/digests.py compare FILE      runs them again and says what differs
 
 Runs go through the command line, so that only what a user sees is compared. The last digits of results depend on the
 processor and on the versions of the libraries: record and compare on one machine, from one environment. Arrays are
