@@ -75,7 +75,6 @@ CONSTRUCTION: dict[str, Callable[[], object]] = {
     "keeps at least one step, got 0": lambda: Filter(Walk(), Scripted(), lag=0),
     "at most one landmark map and one Kalman substate": lambda: in_the_plane([MAP, LandmarkMap(SE2)]),
     rf"start must be \(3,\) or \({N}, 3\) finite numbers, got \(2,\)": lambda: in_the_plane(start=np.zeros(2)),
-    rf"start must be .*, got \({N - 1}, 3\)": lambda: in_the_plane(start=np.zeros((N - 1, 3))),
     r"start must be .*, got \(3,\): \[nan": lambda: in_the_plane(start=np.full(3, np.nan)),
     r"mean \(2,\) needs a square cov of that size, got \(3, 3\)":
         lambda: KalmanSubstate(LINE, np.zeros(2), np.eye(3)),
@@ -94,7 +93,6 @@ def test_construction(message):
 
 ODOMETRY = [
     (np.zeros(2), np.eye(3), r"odometry needs delta \(3,\) and cov \(3, 3\), got \(2,\)"),
-    (np.zeros(3), np.eye(2), r"odometry needs delta \(3,\) and cov \(3, 3\), got \(3,\) and \(2, 2\)"),
     (np.zeros(3), -np.eye(3), "the covariance of the odometry is not one: .*negative eigenvalue"),
     (np.zeros(3), np.triu(np.ones((3, 3))), "the covariance of the odometry is not one: .*not symmetric"),
     (np.zeros(3), np.full((3, 3), np.nan), "the covariance of the odometry is not one: .*not finite"),
@@ -125,16 +123,11 @@ class TestMeasurements:
             ([[1.0]], [[[np.inf]]], "a measurement of Position or its covariance is not finite"),
             ([[1.0]], [[[-1.0]]], "the noise of Position has no covariance: .*negative eigenvalue"),
             ([[1.0, 2.0]], None, r"Position measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)"),
-            ([1.0], None, r"Position measures 1 numbers: expected z \(K, 1\)"),
             ([[1.0]], [[1.0]], r"got \(1, 1\) and \(1, 1\)"),
         ],
     )
     def test_numbers_that_are_no_measurement(self, proposal, z, cov, match):
         fails(on_a_line(proposal=proposal), match, seen(Position(), z, cov))
-
-    def test_skewed_covariance(self):
-        groups = seen(RangeBearing(SE2), [[1.0, 2.0]], [[[1.0, 0.5], [0.2, 1.0]]], ids=np.zeros(1, dtype=int))
-        fails(in_the_plane(), "the noise of RangeBearing has no covariance: .*is not symmetric", groups)
 
     def test_no_particle_explains_them(self):
         # Far beyond the range of floating point is still a weight; what cannot be is none.
@@ -173,12 +166,9 @@ class TestModels:
         ("given", "match"),
         [
             ({"mean": np.zeros((N, 2))}, rf"Walk.transition returned mean \({N}, 2\)"),
-            ({"mean": np.zeros(1)}, r"Walk.transition returned mean \(1,\)"),
             ({"noise_factor": np.ones((1, 1))}, rf"\(1, 1\): expected \({N}, 1\) and \({N} or 1, 1, r\)"),
-            ({"noise_factor": np.ones((1, 2, 1))}, r"noise_factor \(1, 2, 1\)"),
             ({"noise_factor": np.ones((N - 1, 1, 1))}, r"noise_factor \(5, 1, 1\)"),
             ({"noise_factor": np.full((1, 1, 1), np.nan)}, "Walk.transition returned NaN or infinity: check"),
-            ({"mean": np.full((N, 1), np.inf)}, "Walk.transition returned NaN or infinity: check the control"),
         ],
     )
     def test_transitions_of_wrong_shape(self, given, match):
@@ -229,13 +219,10 @@ class TestLandmarks:
         [
             (None, "RangeBearing reads a landmark: its observations need ids"),
             ([3], "names landmark 3, which the map does not hold"),
-            ([77], "names landmark 77, which the map does not hold"),
             ([[4]] * (N - 1) + [[10**9]], "names landmark 1000000000, which the map does not hold"),
             ([1, 2], rf"ids of 1 measurements must be \(1,\) or \({N}, 1\), got \(2,\)"),
-            ([[1]], r"got \(1, 1\)"),
             ([-3], "ids of RangeBearing must be integers: landmarks, NULL = -1 or NEW = -2"),
             ([1.0], "ids of RangeBearing must be integers"),
-            ([True], "ids of RangeBearing must be integers"),
         ],
     )
     @pytest.mark.usefixtures("unchecked_shapes")

@@ -125,7 +125,6 @@ SOUND: list[tuple[Any, Any, Example | None]] = [
     (OdometryMotion(SE2), None, None),
     (OdometryMotion(SE3), None, None),
     (OdometryMotion(SE2), None, Example(control=Odometry(np.array([0.1, 1, 0]), np.diag([0.1, 0, 0])))),
-    (OdometryMotion(Euclidean(2)), None, Example(state=np.zeros((1, 2)))),
     (Driven(), None, None),
     (Polar(), None, None),
     (RangeBearing(SE2), None, None),
@@ -186,42 +185,24 @@ MISTAKES: dict[str, Any] = {
     "Broken.transition returned a tuple, expected Transition": moving(lambda t: (t.mean, t.noise_factor)),
     r"Broken.transition: mean has shape \(5, 2\), expected \(5, 3\)": moving(lambda t: replace(t, mean=t.mean[:, :2])),
     "Broken.transition: mean holds NaN or infinity": moving(lambda t: replace(t, mean=t.mean / 0.0)),
-    r"Broken.transition: noise_factor has shape \(1, 3, 6\)":
-        moving(lambda t: replace(t, noise_factor=t.noise_factor[:, :3])),
     "must give coupling, dynamics and drift together, or none of them": moving(lambda t: replace(t, drift=None)),
-    r"Broken.transition: dynamics has shape \(1, 2, 2\)": moving(lambda t: replace(t, dynamics=np.eye(2)[None])),
     "Broken.transition: mean leaves the group SE2": moving(lambda t: replace(t, mean=t.mean + 7.0)),
     "Broken.transition mixes particles": moving(lambda t: replace(t, mean=t.mean - t.mean.mean(axis=0))),
-    "Broken.transition returns different numbers for the same arguments":
-        moving(lambda t: replace(t, noise_factor=t.noise_factor + 1e-9 * next(COUNTS))),
-    "Broken.transition raised ZeroDivisionError": moving(lambda t: 1 // 0),
     "Careless.transition changes its arguments in place": Careless(SE2),
     r"Broken.predict for states \(5, 1, 3\) has shape \(5, 4, 1\)": predicting(lambda z: z[..., :1]),
-    r"Broken.predict for states \(5, 1, 3\) holds NaN or infinity": predicting(lambda z: z * np.nan),
     r"Broken.predict for states \(5, 1, 3\) is a list, expected a NumPy array": predicting(lambda z: z.tolist()),
     "Broken.predict raised ZeroDivisionError for arguments of shapes .*: integer division":
         predicting(lambda z: 1 // 0),
     r"Broken.predict does not broadcast, for a single state": predicting(lambda z: z + z.size),
-    r"Broken.residual of z \(4, 2\) and predictions \(5, 4, 2\) has shape \(5, 4\)":
-        broken(Polar, residual=lambda self, z, h: (z - h)[..., 0]),
     "Broken.residual of a prediction and itself": broken(Polar, residual=lambda self, z, h: z - h + 1),
     "Broken.residual of h [+] δ and h is not δ": broken(Polar, residual=lambda self, z, h: Polar.residual(self, h, z)),
-    r"Broken.visible has shape \(5, 400\), expected \(5, 4\)":
-        broken(Polar, visible=lambda self, state, landmark, const=None: np.ones((5, 400), dtype=bool)),
-    r"Broken.jacobians: block state has shape \(5, 4, 2, 2\), expected \(5, 4, 2, 3\)":
-        with_jacobians(lambda j: Jacobians(j.state[..., :2], j.landmark)),
     "Broken.jacobians: block state differs from the numeric derivative: expected":
         with_jacobians(lambda j: Jacobians(-j.state, j.landmark)),
     "Broken.jacobians: block landmark differs from the numeric derivative: expected":
         with_jacobians(lambda j: Jacobians(j.state, j.landmark * 1.001)),
-    "Broken.jacobians returned a ndarray, expected Jacobians or None": with_jacobians(lambda j: j.state),
     "Broken.invert is not the inverse of predict, residual of .*: expected 0, found":
         broken(Polar, invert=lambda self, state, z: Polar.invert(self, state, z * np.array([1.0, -1.0]))),
-    "Broken.initialise returned a tuple, expected Records": starting(lambda r: (r.mean, r.cov)),
-    r"Broken.initialise: mean has shape \(4, 5, 2\)": starting(lambda r: Records(r.mean.swapaxes(0, 1), r.cov)),
     "Broken.initialise: cov is not positive semi-definite": starting(lambda r: Records(r.mean, -r.cov)),
-    "Broken.initialise: cov is not symmetric, entries differ by 1":
-        starting(lambda r: Records(r.mean, r.cov + np.array([[0.0, 1.0], [0.0, 0.0]]))),
     "Broken.initialise gives estimates whose prediction is .* away from z, expected less":
         starting(lambda r: Records(1.1 * r.mean, r.cov)),
 }
@@ -236,13 +217,8 @@ ALONE: dict[str, Any] = {
     r"Broken.homogeneous for means \(5, 4, 2\) has shape \(5, 4, 2\), expected \(5, 4, 4\) or":
         broken(Flat, homogeneous=lambda self, mean, const=None: mean.copy()),
     "Broken.ready returns int64": broken(Flat, ready=lambda self, records: np.zeros(records.mean.shape[:2], dtype=int)),
-    r"Broken.promote: mean has shape \(5, 4, 1\), expected \(5, 4, 2\) or \(5, 4, 3\)":
-        broken(Flat, promote=lambda self, records: Records(records.mean[..., :1], records.cov)),
     "Broken.log_density integrates to .* at variance 0.3, expected 1: normalise it, or set":
         broken(StudentT, log_density=lambda self, nu, cov: -0.5 * squared_mahalanobis(nu, cov)),
-    r"Broken.log_density for ν \(5, 4, 1\) has shape \(5,\), expected \(5, 4\)":
-        broken(StudentT, log_density=lambda self, nu, cov: -squared_mahalanobis(nu, cov).sum(axis=-1)),
-    "Broken.inlier returns float64": broken(StudentT, inlier=lambda self, nu, cov: np.ones(nu.shape[:-1])),
     r"Broken.kernel_id is 7, expected one of \(-1, 0, 1, 2\)": broken(StudentT, kernel_id=7),
     "Broken.params is not one axis of float64 numbers": broken(StudentT, kernel_id=0, params=[0.0]),
     "Broken.log_density differs from its compiled kernel 0: expected": broken(StudentT, kernel_id=0),
@@ -395,11 +371,8 @@ STARTED = NewLandmarks(Z, COV, RangeBearing(SE2), Point(2))
 OBSERVED: dict[str, Any] = {
     ", for a group, returned a str, expected Observations": "seen",
     r": z of RangeBearing has shape \(2, 1\), expected \(any, 2\)": replace(GROUP, z=Z[:, :1]),
-    ": z of RangeBearing holds NaN": replace(GROUP, z=Z * np.nan),
     r": cov of RangeBearing has shape \(1, 2, 2\), expected \(2, 2, 2\)": replace(GROUP, cov=COV[:1]),
-    ": cov of RangeBearing is not positive semi-definite": replace(GROUP, cov=-COV),
     " gives no ids, but RangeBearing reads a landmark": replace(GROUP, ids=None),
-    r": ids has shape \(3,\), expected \(2,\) or \(40, 2\)": replace(GROUP, ids=np.array([2, 3, 5])),
     ": ids are float64, expected integers": replace(GROUP, ids=np.array([2.0, 5.0])),
     r" names landmarks \[4, 99\], which the map does not hold": replace(GROUP, ids=np.array([99, 4])),
     ": ids below -2 mean nothing": replace(GROUP, ids=np.array([-3, 2])),
@@ -407,7 +380,6 @@ OBSERVED: dict[str, Any] = {
 NEW: dict[str, Any] = {
     ", for a group, returned a Observations, expected NewLandmarks": GROUP,
     r": mask has shape \(2,\), expected \(40, 2\)": replace(STARTED, mask=np.ones(2, dtype=bool)),
-    r": ids has shape \(1,\), expected \(2,\)": replace(STARTED, ids=np.array([7])),
     r" starts landmarks \[2\], which the map holds already": replace(STARTED, ids=np.array([2, 7])),
 }
 # fmt: on
