@@ -9,7 +9,6 @@ from scipy.linalg import block_diag
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import TruncatedMahalanobis
-from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Records
 from rbpf.core.particles import Particles, Prior, balanced
 from rbpf.core.proposals import PriorProposal
@@ -222,18 +221,6 @@ def test_particles_of_weight_zero_count_for_nothing():
     np.testing.assert_allclose(joint.cov, alone.cov, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_hardly_any_particles(world, n):
-    """They stray, but everything stays finite; what one particle lacks is the uncertainty of the path."""
-    filter_ = plane(Consolidation(2), n)
-    for frame in world.frames(Relative()):
-        filter_.step(frame)
-    mean, covs = told(filter_)
-    assert np.isfinite(mean).all() and np.isfinite(filter_.log_evidence)
-    assert np.linalg.eigvalsh(covs).min() >= (0.0 if n == 1 else 1e-6) - 1e-12
-    assert np.abs(mean - world.kalman.mean).max() < 6 * np.sqrt(world.kalman.cov.diagonal().max())
-
-
 def test_draws_have_the_moments_of_independent_ones():
     rng = np.random.default_rng(0)
     weights = rng.uniform(0.2, 1.0, 30)
@@ -321,11 +308,7 @@ def test_what_a_joint_map_does_not_take(world):
     with pytest.raises(InputError, match=r"holds Point\(2\)"):
         plane(Consolidation(1)).step(Frame([], [NewLandmarks(z, covs, Relative(), Point(3))]))
     space = Euclidean(2)
-    substate = KalmanSubstate(space, np.zeros(2), np.eye(2))
     with pytest.raises(InputError, match="LandmarkMap cannot take in"):
         Filter(Walk(), Scripted(), LandmarkMap(space), n=5, consolidation=Consolidation(1)).step(Frame())
-    two = Filter(Walk(), Scripted(), [JointMap(space), substate], n=5, consolidation=Consolidation(1))
-    with pytest.raises(InputError, match="one conditional, not 2"):
-        two._consolidate()
     with pytest.raises(InputError, match="a window has"):
         Consolidation(window=0)

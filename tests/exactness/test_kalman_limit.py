@@ -64,28 +64,6 @@ def test_everything_marginalised_is_a_kalman_filter(proposal, rank, rng):
     np.testing.assert_allclose(filter_.particles.weights, 0.2, rtol=1e-14)
 
 
-@every_proposal
-def test_a_state_without_noise_leaves_a_kalman_filter_of_the_substate(proposal, rng):
-    motion = LinearMotion(
-        np.eye(1), np.vstack([np.zeros((1, 2)), 0.4 * np.eye(2)]), np.zeros((1, 2)), 0.9 * np.eye(2), np.ones(2)
-    )
-    G, C = rng.normal(size=(2, 1)), rng.normal(size=(2, 2))
-    model, fix = LinearObservation(G, C), LinearObservation(by_state=np.eye(1))
-    kalman = Kalman(np.zeros(2), np.eye(2))
-    start = np.array([1.5])
-    substate = KalmanSubstate(motion.space, kalman.mean, kalman.cov)
-    filter_ = Filter(motion, Scripted(), substate, proposal, n=4, rng=rng, start=start)
-    for _ in range(8):
-        z, at = rng.normal(size=2), rng.normal(size=1)
-        kalman.predict(motion.A, 0.16 * np.eye(2), motion.b)
-        kalman.update(z - G @ start, C, 0.2 * np.eye(2))
-        kalman.log_evidence -= 0.5 * float((at - start) @ (at - start) / 0.7 + np.log(2 * np.pi * 0.7))
-        filter_.step(Frame([single(z, 0.2 * np.eye(2), model), single(at, 0.7, fix)]))
-    np.testing.assert_allclose(substate.mean, np.tile(kalman.mean, (4, 1)), atol=TOLERANCE)
-    np.testing.assert_allclose(substate.cov, np.tile(kalman.cov, (4, 1, 1)), atol=TOLERANCE)
-    assert filter_.log_evidence == pytest.approx(kalman.log_evidence, abs=TOLERANCE)
-
-
 @pytest.mark.parametrize("proposal", PROPOSALS[::3], ids=["prior", "iterated"])
 @pytest.mark.parametrize(("rank", "kind"), [(4, Unequal), (1, LinearMotion)], ids=["regular", "fewer"])
 def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, rank, kind, rng):

@@ -7,13 +7,12 @@ import pytest
 from scipy.linalg import block_diag
 
 from rbpf.core.filter import Filter
-from rbpf.core.genealogy import Lineage
-from rbpf.core.models import ObservationModel, Observations, Records
+from rbpf.core.models import Observations, Records
 from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import MixturePoint, Point, ring
+from rbpf.maps.point import MixturePoint, Point
 from tests.exactness.models import (
     SEEDS,
     Frame,
@@ -146,53 +145,3 @@ def test_mixtures_take_no_part_in_the_refinement(frames):
     densities = filter_.marginals.correct(state, np.zeros((5, 2)), [group])
     assert (densities.after_sampling != 0.0).all()
     assert (densities.all != densities.after_sampling).all()
-
-
-class Range(ObservationModel):
-    """z = distance to a beacon + v."""
-
-    dim = 1
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return np.linalg.norm(landmark - state, axis=-1, keepdims=True)
-
-
-def test_a_range_only_beacon_becomes_a_point():
-    """Along a bend one component of the ring remains; until then each is an EKF of its own."""
-    rng = np.random.default_rng(17)
-    beacon, variance, components = np.array([4.0, 3.0]), np.array([[0.01]]), 12
-    path = np.array([[0.8 * t, 1.5 * np.sin(0.5 * t)] for t in range(14)])
-    ranges = np.linalg.norm(beacon - path, axis=1) + 0.1 * rng.normal(size=14)
-    held = LandmarkMap(PLANE)
-    n = 3
-    held.begin(n, Lineage(n))
-    records = ring(np.tile(path[0], (n, 1)), ranges[:1], 0.1, components)
-    held.add_records(records, MixturePoint(components))
-    bank = [Kalman(m, c) for m, c in zip(records.mean[0, 0], records.cov[0, 0], strict=True)]
-    promoted_at = None
-    for t in range(1, 14):
-        state = np.tile(path[t], (n, 1))
-        group = Observations(ranges[t : t + 1, None], variance[None], Range(), ids=np.array([0]))
-        density = held.correct(state, np.zeros((n, 2)), [group])
-        if promoted_at is not None:
-            np.testing.assert_array_equal(density.after_sampling, 0.0)
-            continue
-        before = np.logaddexp.reduce([kalman.log_evidence for kalman in bank]) if t > 1 else np.log(components)
-        for kalman in bank:
-            offset = kalman.mean - path[t]
-            H = (offset / np.linalg.norm(offset))[None]
-            kalman.update(ranges[t] - np.linalg.norm(offset) + H @ kalman.mean, H, variance)
-        after = np.logaddexp.reduce([kalman.log_evidence for kalman in bank])
-        np.testing.assert_allclose(density.after_sampling, after - before, atol=1e-6)
-        np.testing.assert_array_equal(density.all, density.after_sampling)
-        ready = held.ready(np.full(n, 1.0 / n))
-        assert (ready.size == 1) == (max(k.log_evidence for k in bank) - after >= np.log(0.99))
-        held.promote(ready)
-        promoted_at = t if ready.size else None
-    assert promoted_at is not None
-    assert 2 < promoted_at < 12
-    assert isinstance(held.landmark_of(0), Point)
-    final = held.read(np.array([0]))
-    error = final.mean[0, 0] - beacon
-    assert error @ np.linalg.solve(final.cov[0, 0], error) < 9.0
-    assert np.sqrt(np.trace(final.cov[0, 0])) < 0.3

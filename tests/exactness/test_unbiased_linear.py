@@ -144,27 +144,3 @@ def test_marginalising_and_refining_lower_the_spread():
     sampled = np.array([all_sampled(seed) for seed in range(100)])
     assert refined.std() < 0.8 * marginalised.std()
     assert marginalised.std() < 0.8 * sampled.std()
-
-
-def test_in_a_linear_model_the_linearised_weight_is_the_exact_one(driven_by_acceleration):
-    """The correction w₂ is one there: E06's weight and the exact ratio give the same numbers."""
-    runs = []
-    for exact in (True, False):
-        filter_ = driven_by_acceleration.build("ekf", "always", np.random.default_rng(5))
-        filter_.proposal = EkfProposal(exact)
-        runs.append([filter_.step(frame).log_evidence for frame in driven_by_acceleration.frames])
-    np.testing.assert_allclose(runs[0], runs[1], atol=1e-9)
-
-
-def test_weights_that_were_not_reset_stay_in_the_next_step(position_alone):
-    """Never resampled, the bootstrap filter's evidence is the mean of each path's whole likelihood."""
-    filter_ = position_alone.build("prior", "never", np.random.default_rng(6))
-    log_likelihood = np.zeros(filter_.n)
-    for frame in position_alone.frames:
-        filter_.step(frame)
-        nu = frame.groups[0].z[0, 0] - filter_.particles.state[:, 0]
-        log_likelihood -= 0.5 * (nu**2 / 0.25 + np.log(2 * np.pi * 0.25))
-    assert filter_.log_evidence == pytest.approx(np.log(np.exp(log_likelihood).mean()), abs=1e-12)
-    np.testing.assert_allclose(
-        filter_.particles.weights, np.exp(log_likelihood) / np.exp(log_likelihood).sum(), rtol=1e-9
-    )

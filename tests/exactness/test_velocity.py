@@ -1,10 +1,8 @@
 """A velocity that is marginalised: the joint Kalman filter where that is exact, and the sampled velocity's law."""
 
 import numpy as np
-import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.genealogy import Lineage
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Jacobians, ObservationModel, Part
 from rbpf.core.proposals import PriorProposal
@@ -109,46 +107,6 @@ def test_a_shared_covariance_is_the_one_of_each_particle():
     np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-9)
     np.testing.assert_allclose(shared.mean, own.mean, atol=1e-9)
     np.testing.assert_allclose(np.broadcast_to(shared.cov, own.cov.shape), own.cov, atol=1e-10)
-
-
-def test_descendants_inherit_what_their_ancestor_knows():
-    """Resampled between prediction and update, or permuted before both: the same laws."""
-    rng, n, ancestors = np.random.default_rng(4), 5, np.array([3, 3, 0, 4, 1])
-    half = rng.normal(size=(n, 6, 8))
-    mean, cov = rng.normal(size=(n, 6)), half @ np.swapaxes(half, -1, -2)
-    state, increment = SE3.exp(rng.normal(size=(n, 6))), rng.normal(size=(n, 6))
-    results = []
-    for first, later in ((np.arange(n), ancestors), (ancestors, np.arange(n))):
-        part = substate()
-        part.begin(n, Lineage(n))
-        part.mean, part.cov = mean[first], cov[first]
-        part.predict(MarginalVelocity(0.5).transition(state[first], None, 0.3), SE3)
-        part.resample(later)
-        part.correct(SE3.retract(state[ancestors], increment), increment, [])
-        results.append(part)
-    np.testing.assert_array_equal(results[0].mean, results[1].mean)
-    np.testing.assert_array_equal(results[0].cov, results[1].cov)
-    assert np.abs(np.diff(results[0].mean[:2], axis=0)).max() > 1e-3
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_an_observation_of_the_velocity_makes_it_the_particles_own(shared):
-    """Where H depends on the state every particle has its covariance; else it could be shared, and is equal."""
-
-    class Speed(ObservationModel):
-        dim = 3
-        reads = frozenset({Part.STATE, Part.SUBSTATE})
-
-        def predict(self, state, landmark=None, const=None, substate=None):
-            scale = 1.0 if shared else 1.0 + state[..., 4:5]
-            return scale * substate[..., 3:]
-
-    part = substate()
-    filter_ = build(part, 8, 1)
-    for stamp in (0, 100_000_000, 300_000_000):
-        filter_.step(Frame([single(np.array([0.3, 0.1, 0.0]), R, Speed())]), None, stamp)
-    spread = np.abs(part.cov - part.cov[:1]).max()
-    assert (spread < 1e-10) == shared
 
 
 def test_sampled_and_marginal_velocity_have_one_law():
