@@ -47,18 +47,6 @@ def test_a_ray_is_seen_where_its_point_is(camera):
     )
 
 
-def test_without_rotation_it_is_the_papers_model():
-    """E06 (17): h = (u + t_x q, v + t_y q)/(1 + t_z q), with x_camera = x + t; and (18) its slope at t_z = 0."""
-    t, b = np.array([0.1, -0.07, 0.05]), np.array([0.2, -0.3, 0.6])
-    model, anchor = CameraRay(PLAIN), SE3.identity()
-    camera = np.concatenate([[0.0, 0.0, 0.0, 1.0], -t])
-    expected = (b[:2] + t[:2] * b[2]) / (1.0 + t[2] * b[2])
-    np.testing.assert_allclose(PLAIN.unproject(model.predict(camera, b, anchor)), expected, atol=1e-13)
-    sideways = np.concatenate([[0.0, 0.0, 0.0, 1.0], -t * [1.0, 1.0, 0.0]])
-    slope = known(known(model.jacobians(sideways, b, anchor)).landmark) / np.array([[400.0], [410.0]])
-    np.testing.assert_allclose(slope, [[1.0, 0.0, t[0]], [0.0, 1.0, t[1]]], atol=1e-13)
-
-
 @every_camera
 def test_at_infinity_only_rotation_counts(camera):
     rays = Rays.random(seed=3)

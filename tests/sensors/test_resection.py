@@ -16,7 +16,7 @@ from rbpf.sensors.camera.resection import (
     resect_consensus,
     squared_distances,
 )
-from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN
+from tests.sensors.camera_scenes import CAMERAS, PLAIN
 
 SQUARE = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.0]])
 
@@ -78,27 +78,9 @@ def test_with_noise_no_pose_nearby_is_better(count):
         assert found <= 1.01 * cost(PLAIN, near, points, noisy)
 
 
-def test_where_one_start_finds_a_local_optimum():
-    """OpenCV's SQPnP, refined, ends in a worse optimum in some scenes of four noisy points; this never does."""
-    rng, worse = np.random.default_rng(4), 0
-    for _ in range(80):
-        _, points, px = scene(rng, PLAIN)
-        noisy = px + 2.0 * rng.normal(size=px.shape)
-        uv = PLAIN.unproject(noisy)
-        _, turn, shift = cv2.solvePnP(points, uv, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-        single = descended(points, uv, turn, shift)
-        ours = cost(PLAIN, resect(PLAIN, points, noisy), points, noisy)
-        in_front = (SE3.inverse_transform(single, points)[:, 2] > 0.0).all()
-        theirs = cost(PLAIN, single, points, noisy) if in_front else np.inf
-        assert ours <= 1.01 * theirs
-        worse += ours < 0.5 * theirs
-    assert worse >= 1
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_too_few_points(count):
-    with pytest.raises(InputError, match=f"at least four that are seen, got {count}"):
-        resect(PLAIN, SQUARE[:count], np.full((count, 2), 100.0))
+def test_too_few_points():
+    with pytest.raises(InputError, match="at least four that are seen, got 3"):
+        resect(PLAIN, SQUARE[:3], np.full((3, 2), 100.0))
 
 
 @pytest.mark.parametrize("bend", [0.0, 1e-4])
@@ -125,7 +107,7 @@ def test_pixels_of_other_points():
 
 
 def test_pixels_without_a_direction():
-    folding = type(DISTORTED)(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    folding = Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.5, 0.0, 0.0, 0.0, 0.0))
     assert np.isnan(folding.unproject(np.array([2.0, 2.0]))).all()
     px = np.array([[2.0, 2.0], [500.0, 100.0], [400.0, 400.0], [100.0, 300.0]])
     with pytest.raises(InputError, match="the camera's distortion has no direction: check the calibration"):
