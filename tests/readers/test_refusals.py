@@ -1,4 +1,4 @@
-"""What every reader of tables refuses: a bad line by its number, a missing file, an incomplete one, and damaged bytes."""
+"""What every reader of tables refuses: a bad line, a missing file, an incomplete one; and what is of no format at all."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
-from rbpf.sensors.readers import open_log, read_known_points
+from rbpf.sensors.readers import open_images, open_log, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from tests.readers.small import GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, TRACKS, WHEELS, write
 
@@ -146,3 +146,41 @@ def test_a_missing_file_is_named(tmp_path, name, file, words):
     with pytest.raises(InputError, match=re.escape(words)) as caught:
         read(tmp_path)
     assert str(tmp_path) in str(caught.value)
+
+
+KINDS = {
+    open_log: ("MRPT", "MRCLAM", "ODOMETRY"),
+    open_images: ("TUM", "EuRoC", "KITTI", "7-Scenes", "photos", "video", "a folder of images"),
+}
+OTHERS = [
+    ({}, "", "found an empty folder"),
+    ({"b.txt": "1", "a.csv": "1"}, "", "found a folder with a.csv, b.txt"),
+    (dict.fromkeys("gfedcba", "1"), "", "found a folder with a, b, c, d, e and more"),
+    ({}, "nowhere", ""),
+    ({}, "\0", ""),
+    ({}, "x" * 5000, ""),
+]
+"""Files of a folder, what of it is opened, and what is found there."""
+
+
+@pytest.mark.parametrize(("files", "path", "found"), OTHERS)
+@pytest.mark.parametrize("read", KINDS, ids=["log", "images"])
+def test_what_is_of_no_format_is_told_from_what_is_expected(tmp_path, read, files, path, found):
+    with pytest.raises(InputError, match=f"{found}.* expected") as caught:
+        read(write(tmp_path, files) / path if path else str(write(tmp_path, files)))
+    assert path or all(kind in str(caught.value) for kind in KINDS[read])
+
+
+@pytest.mark.parametrize(
+    ("read", "name", "content", "found"),
+    [
+        (open_log, "some.txt", b"", "found an empty file"),
+        (open_log, "some.txt", b"\x00\xff\x01", r"found a file that begins with '\\x00.*'"),
+        (open_log, "some.txt", b"timestamp tx ty\n1 2 3\n", "found a file that begins with 'timestamp tx ty'"),
+        (open_images, "0.png", b"something", "found a file that ends in '.png'"),
+        (open_images, "list", b"something", "found a file"),
+    ],
+)
+def test_a_file_of_another_kind(tmp_path, read, name, content, found):
+    with pytest.raises(InputError, match=f"{found}, expected"):
+        read(write(tmp_path, {name: content}) / name)

@@ -8,7 +8,7 @@ import pytest
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.readers import open_log, read_known_points
+from rbpf.sensors.readers import read_known_points
 from rbpf.sensors.readers.text import read_columns, read_csv
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from tests.readers.small import KNOWN, SECOND, TRACKS, WHEELS, write
@@ -132,37 +132,3 @@ def test_stereo_tracks(tmp_path):
     assert [len(frame.landmarks) for frame in log.frames] == [2, 0]
     with pytest.raises(InputError, match="must be positive, got 0 px"):
         read_stereo_tracks(tmp_path, std_px=0)
-
-
-@pytest.mark.parametrize("path", ["nowhere", "\0", "x" * 5000])
-def test_nothing_there(tmp_path, path):
-    with pytest.raises(InputError, match="; expected a robot log"):
-        open_log(tmp_path / path)
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        ([], "found an empty folder, expected an MRPT log"),
-        (["b.png", "a.csv"], "found a folder with a.csv, b.png, expected"),
-        (list("gfedcba"), "found a folder with a, b, c, d, e and more, expected"),
-    ],
-)
-def test_a_folder_of_another_kind(tmp_path, names, found):
-    with pytest.raises(InputError, match=found):
-        open_log(str(write(tmp_path, dict.fromkeys(names, "something\n"))))
-
-
-@pytest.mark.parametrize(
-    ("content", "found"),
-    [
-        (b"", "found an empty file"),
-        (b"\x00\xff\x01", r"found a file that begins with '\\x00"),
-        (b"timestamp tx ty\n1 2 3\n", "found a file that begins with 'timestamp tx ty', expected"),
-    ],
-)
-def test_a_file_of_another_kind(tmp_path, content, found):
-    with pytest.raises(InputError, match=found) as caught:
-        open_log(write(tmp_path, {"some.txt": content}) / "some.txt")
-    for kind in ("MRPT", "MRCLAM", "ODOMETRY"):
-        assert kind in str(caught.value)
