@@ -6,7 +6,7 @@ import pytest
 from rbpf.core.genealogy import Lineage
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import Belief, Records
-from rbpf.core.particles import Prior, Proposed, mixture_estimate
+from rbpf.core.particles import Prior
 from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
@@ -101,22 +101,3 @@ def test_innovations_of_every_pair(rng):
         moved = by_state @ belief.prior.factor[i]
         within = by_landmark @ records.cov[i, (2, 0)[m]] @ by_landmark.T
         np.testing.assert_allclose(cov[i, k, m], within + moved @ moved.T + noise[k], atol=1e-12)
-
-
-@pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
-@pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
-def test_estimate_is_the_moments_of_the_refined_mixture(space, centred, rng):
-    prior = prior_of(space, rng, centred)
-    rank = space.dim - 1
-    root = np.triu(rng.normal(size=(N, rank, rank)))
-    proposed = Proposed(rng.normal(size=(N, rank)), root, np.zeros(N))
-    log_weights = np.log(rng.dirichlet(np.ones(N)))
-    estimate = mixture_estimate(prior, proposed, log_weights)
-    i = rng.choice(N, size=DRAWS, p=np.exp(log_weights))
-    u = proposed.mean[i] + np.einsum("nab,nb->na", root[i], rng.normal(size=(DRAWS, rank)))
-    state = space.retract(prior.base[i], prior.mean + np.einsum("nar,nr->na", prior.factor[i], u))
-    offset = space.local(estimate.mean, state)
-    expected = offset.T @ offset / DRAWS
-    std = np.sqrt(np.diag(expected))
-    assert (np.abs(offset.mean(axis=0)) < 0.05 * std).all()
-    assert (np.abs(estimate.cov - expected) < 0.04 * np.outer(std, std)).all()

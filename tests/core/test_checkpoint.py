@@ -64,18 +64,6 @@ def test_the_scenario_has_something_to_lose(world):
     assert filter_.history.stored_states < STEPS * 15
 
 
-def test_resumed_in_place_of_a_later_state(world, tmp_path):
-    filter_ = Recipe(n=15).build()
-    drive(filter_, world, 0, 12)
-    filter_.save(tmp_path / "at_12.npz")
-    drive(filter_, world, 12)
-    expected = content(filter_)
-    filter_.load(tmp_path / "at_12.npz")
-    assert filter_.steps == 12
-    drive(filter_, world, 12)
-    assert same(content(filter_), expected)
-
-
 @pytest.mark.parametrize("generator", [np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64])
 def test_every_random_generator(generator, tmp_path):
     filter_ = Recipe(n=5).build()

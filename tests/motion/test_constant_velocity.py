@@ -27,13 +27,6 @@ def states(n: int, seed: int = 0) -> np.ndarray:
 
 
 @every_time_step
-def test_factor_of_the_walk(dt):
-    factor = velocity_walk(WALK, dt)
-    np.testing.assert_allclose(factor @ factor.T, covariance(dt), rtol=1e-13, atol=1e-15)
-    np.testing.assert_array_equal(factor[:6, 6:], 0.0)
-
-
-@every_time_step
 def test_variance_that_the_pose_leaves_to_the_velocity(dt):
     """The last six columns: Schur complement of (5), δΣ/4, which the paper's mode drops."""
     rest = velocity_walk(WALK, dt)[:, 6:]
@@ -147,9 +140,7 @@ def test_bad_standard_deviations(std):
     [
         (PRIOR.mean[:6], PRIOR.cov, r"needs a finite mean \(7,\) and cov \(6, 6\)"),
         (PRIOR.mean * np.nan, PRIOR.cov, r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PRIOR.mean, np.eye(3), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
         (PRIOR.mean, -np.eye(6), "negative eigenvalue"),
-        (PRIOR.mean, np.full((6, 6), np.nan), "not finite|NaN|nan"),
     ],
 )
 def test_bad_priors(mean, cov, sentence):

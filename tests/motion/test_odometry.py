@@ -75,15 +75,6 @@ def test_three_degrees_of_freedom_drop_the_others():
     np.testing.assert_array_equal(found.cov[OTHER], 0.0)
 
 
-def test_with_three_degrees_of_freedom_particles_stay_in_the_plane():
-    filter_ = Filter(OdometryMotion(SE3, free=CAMERA_PLANE), Scripted(), n=100, rng=np.random.default_rng(1))
-    for _ in range(20):
-        filter_.step([], MEASURED)
-    state = filter_.particles.state
-    np.testing.assert_allclose(state[:, [0, 2, 5]], 0.0, atol=1e-9)
-    assert state[:, [4, 6]].std(axis=0).min() > 0.01
-
-
 @pytest.mark.parametrize("free", [None, CAMERA_PLANE])
 def test_it_is_a_sound_model(free):
     state = SE3.exp(np.random.default_rng(3).normal(size=(5, 6)))

@@ -121,6 +121,7 @@ def test_false_matches_are_found(world, fraction):
     assert found.inliers[wrong].sum() <= 1
     assert found.inliers[~wrong].mean() > 0.95
     assert 0.85 < found.rms < 1.1
+    assert found.others == ()
 
 
 class TestTooLittle:
@@ -191,7 +192,6 @@ class TestDegenerate:
     ("z_prev", "z_now", "cov", "complaint"),
     [
         (np.zeros((5, 2)), np.zeros((5, 2)), COV, r"\(K, 3\) arrays of \(u_left, v, u_right\), got \(5, 2\)"),
-        (np.zeros((5, 3)), np.zeros((4, 3)), COV, r"got \(5, 3\) and \(4, 3\)"),
         (np.zeros((5, 3)), np.full((5, 3), np.nan), COV, "NaN or infinity"),
         (np.zeros((5, 3)), np.zeros((5, 3)), np.ones((3, 3)), "cov_prev is no covariance of pixels"),
         (np.zeros((5, 3)), np.zeros((5, 3)), np.ones(3), r"cov_prev must be \(3, 3\) or \(5, 3, 3\), got \(3,\)"),
@@ -282,14 +282,6 @@ def test_matches_on_a_thing_that_moves_are_counted(seed):
     assert 16 <= sum(other.inliers.sum() for other in found.others) <= 20
 
 
-@pytest.mark.parametrize("world", [ROAD, ROOM], ids=["road", "room"])
-def test_false_matches_agree_on_no_motion(world):
-    rng = np.random.default_rng(0)
-    for fraction in (0.0, 0.2, 0.4):
-        matches, _ = mistaken(simulate(world, 80, rng), fraction, rng)
-        assert estimated(matches).others == ()
-
-
 class TestVisualOdometry:
     """What is handed out where the matches tell less than the prior."""
 
@@ -306,13 +298,6 @@ class TestVisualOdometry:
         np.testing.assert_array_equal(motion.odometry.delta, estimate.previous_camera_from_camera)
         np.testing.assert_array_equal(motion.odometry.cov, estimate.cov)
         assert motion.note == found.failure == ""
-
-    def test_several_motions_are_several_candidates(self):
-        rng = np.random.default_rng(1)
-        room, thing = simulate(ROOM, 60, rng), simulate(LEAP, 20, rng)
-        both = joined(room.matches, thing.matches)
-        found = VisualOdometry().candidates(both, np.zeros(6), self.DT, rng)
-        assert len(found.motions) == 2 and found.motions[1].inliers[60:].sum() >= 16
 
     def test_without_a_motion_there_is_the_prior(self):
         none = simulate(ROOM, 20, np.random.default_rng(0)).matches.rows(np.arange(0))

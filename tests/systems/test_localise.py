@@ -129,11 +129,9 @@ def test_the_file_keeps_every_bit(tmp_path, camera, count):
     [
         ({"version": np.array(9)}, "no map of this version"),
         ({"positions": np.zeros((12, 2))}, "positions must hold numbers of shape"),
-        ({"positions": np.full((12, 3), np.nan)}, "positions must hold finite numbers"),
         ({"cov": np.tile(-np.eye(3), (12, 1, 1))}, "none less than zero"),
         ({"alignment": np.array("upside down")}, "is damaged"),
         ({"camera": np.array([-1.0, 1, 1, 1, 0, 0, 0, 0, 0])}, "must be positive"),
-        ({"views": np.zeros((0, 7))}, "expected views"),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, change, words):

@@ -48,16 +48,6 @@ def test_a_flat_scene_is_not_bent(plane):
     assert resampled < 0.5 * bent and resampled < 0.012
 
 
-def test_the_world_starts_at_the_first_camera(plane):
-    np.testing.assert_allclose(plane.log.poses[0], SE3.identity(), atol=1e-12)
-    assert (plane.system.filter.history.paths()[0] == SE3.identity()).all()
-    assert plane.system.start.arrays()["start/names"].size > 10
-    assert (
-        plane.system.filter.steps == 60
-        and plane.system.filter.history.stamps_ns.tolist() == plane.log.stamps_ns.tolist()
-    )
-
-
 @pytest.fixture
 def adjusted(monkeypatch) -> list[int]:
     """Numbers of frames of each adjustment, those that found too little included."""
