@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
@@ -126,16 +125,6 @@ def test_in_the_plane():
     np.testing.assert_allclose(turned[[0, 2, 4]], 0.0, atol=1e-12)
     assert abs(turned[1]) > 0.05
     np.testing.assert_allclose(slam_.reckoning.since_update.cov[[0, 2, 4]], 0.0, atol=1e-12)
-
-
-def test_time_has_to_pass():
-    slam_, (first, second) = slam(), frames(2)
-    slam_.take(first)
-    slam_.take(second)
-    again = slam_.take(second)
-    assert again.messages == ("passed over: it has the stamp of the last one; the last velocity is assumed, widely",)
-    with pytest.raises(InputError, match="time runs backwards"):
-        slam_.take(first)
 
 
 def test_what_triggers():

@@ -14,7 +14,7 @@ from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConf
 from rbpf.systems.stereo.landmarks import View
 from rbpf.systems.stereo.recovery import relocalise_globally
 from rbpf.systems.stereo.slam import StereoSlam
-from rbpf.systems.system import Tracked, TrackingState
+from rbpf.systems.system import TrackingState
 from tests.systems.plane_sequences import texture
 from tests.systems.stereo_sequences import Pairs, errors_m, filtered, pairs
 
@@ -29,14 +29,10 @@ def off_m(run: Run, count: int = COUNT) -> np.ndarray:
     return errors_m(run.log.poses, pairs(count))
 
 
-def blurred(config: StereoConfig = CONFIG, **options) -> Run:
-    """Five pairs of which the odometry makes nothing: the camera is assumed some centimetres from where it is."""
-    return filtered(blur_motion(25, FIRST, BLURRED)(pairs(COUNT)), config, **options)
-
-
 @pytest.fixture(scope="module")
 def found(keypoints_once: None) -> Run:
-    return blurred()
+    """Five pairs of which the odometry makes nothing: the camera is assumed some centimetres from where it is."""
+    return filtered(blur_motion(25, FIRST, BLURRED)(pairs(COUNT)), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -59,25 +55,6 @@ def test_found_again(found):
     (said,) = [message for message in found.messages if "found again by" in message]
     assert said.startswith(f"pair {SHARP}: the camera is found again by ")
     assert said.endswith("pairs whose motion was only assumed")
-
-
-def test_resumed_while_lost(found, tmp_path):
-    """Stopped while it is lost and taken up again: the same bytes."""
-    place = tmp_path / "checkpoint.npz"
-
-    def stop(run: Run, tracked: Tracked) -> None:
-        if len(run.log) == FIRST + 3:
-            assert tracked.values["assumed"] > 0
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        blurred(listeners=[stop], checkpoint=place)
-    run = blurred(checkpoint=place, resume=True)
-    for name in ("assumed", "updated", "observed"):
-        np.testing.assert_array_equal(run.log[name], found.log[name])
-    np.testing.assert_array_equal(run.log.poses, found.log.poses)
-    np.testing.assert_array_equal(run.log.covs, found.log.covs)
-    assert run.messages == found.messages
 
 
 def test_a_map_that_cannot_tell_yet_is_not_waited_for():

@@ -1,0 +1,165 @@
+"""What every system that takes frames promises: to go on from any checkpoint, to survive bad frames, to refuse the past."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from examples.studies.image_faults import blur_motion
+from rbpf.errors import InputError
+from rbpf.sensors.readers import ImageFrame
+from rbpf.systems.mono.config import MonoConfig, StartConfig
+from rbpf.systems.mono.slam import MonoSlam
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.slam import StereoSlam
+from rbpf.systems.system import System, TrackingState
+from tests.core.worlds import content, same
+from tests.systems.mono_logs import SMALL, desk, without_known
+from tests.systems.plane_sequences import CAMERA, known_points, path, sequence, texture, view
+from tests.systems.stereo_sequences import errors_m, flat, missing, pairs
+
+pytestmark = pytest.mark.usefixtures("keypoints_once")
+KNOWN, LOG, DARK = known_points(), desk(2, frames=8), np.zeros((240, 320), dtype=np.uint8)
+LOST = {TrackingState.TRACKED, TrackingState.LOST}
+
+
+def mono(points=None, **options) -> System:
+    return MonoSlam(CAMERA, MonoConfig(particles=5, **options), points)
+
+
+def stereo() -> System:
+    return StereoSlam(pairs(1).rig, StereoConfig(particles=60))
+
+
+def blinking(t, image):
+    """Frozen first, then dark, then as if nothing had been."""
+    if 2 <= t < 9:
+        return view(texture(), path(3)[1])
+    return DARK if 9 <= t < 14 else image
+
+
+@dataclass
+class Case:
+    """A system, its frames, after which of them a run is gone on with, and states that it has been in."""
+
+    make: Callable[[], System]
+    frames: Callable[[], list]
+    after: tuple[int, ...]
+    states: set[TrackingState] = field(default_factory=set)
+
+
+def blurred() -> list:
+    """Five pairs of which the odometry makes nothing."""
+    return list(blur_motion(25, 10, 5)(pairs(18)).frames())
+
+
+RESUMED = {
+    "known points": Case(lambda: mono(KNOWN), lambda: list(sequence(8).frames()), (0, 3, 6)),
+    "separate points": Case(lambda: mono(KNOWN, known="points"), lambda: list(sequence(8).frames()), (0, 3, 6)),
+    "nothing known": Case(mono, lambda: list(sequence(12).frames()), (0, 4, 6, 8, 10), {TrackingState.INITIALISING}),
+    "lost": Case(lambda: mono(KNOWN), lambda: list(sequence(18, blinking).frames()), (1, 4, 8, 10, 12, 14, 16), LOST),
+    "waiting": Case(
+        lambda: mono(KNOWN), lambda: list(sequence(4, lambda t, i: None if t < 2 else i).frames()), (0, 1, 2)
+    ),
+    "named": Case(lambda: MonoSlam(LOG.camera, SMALL, LOG.known), lambda: LOG.frames, (0, 3, 6)),
+    "named, nothing known": Case(
+        lambda: MonoSlam(LOG.camera, replace(SMALL, start=StartConfig(first_adjustment=4))),
+        lambda: without_known(LOG).frames,
+        (0, 2, 3, 5),
+    ),
+    "pairs": Case(
+        stereo, lambda: list(pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames()), (0, 5, 6, 9)
+    ),
+    "pairs, lost": Case(stereo, blurred, (12,), LOST),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", RESUMED.values(), ids=RESUMED)
+def test_a_checkpoint_after_any_frame_goes_on_with_the_same_bytes(case, tmp_path):
+    system, whole, frames = case.make(), [], case.frames()
+    for t, frame in enumerate(frames):
+        whole.append(system.take(frame))
+        assert whole[-1].values.keys() == {column.name for column in system.columns}
+        assert whole[-1].observed.keys() == {ragged.name for ragged in system.observed}
+        if t in case.after:
+            system.save(tmp_path / f"{t}.npz", {"of the caller": np.array(t)})
+    assert {each.state for each in whole} >= case.states
+    for t in case.after:
+        again = case.make()
+        assert again.load(tmp_path / f"{t}.npz")["of the caller"] == t
+        for frame, theirs in zip(frames[t + 1 :], whole[t + 1 :], strict=True):
+            mine = again.take(frame)
+            assert mine.pose.tobytes() == theirs.pose.tobytes() and mine.cov.tobytes() == theirs.cov.tobytes()
+            assert (mine.state, mine.messages) == (theirs.state, theirs.messages)
+            assert (mine.revision is None) == (theirs.revision is None)
+            np.testing.assert_equal(mine.observed, theirs.observed)
+            for name in mine.values.keys() - {name for name in mine.values if name.startswith("seconds")}:
+                np.testing.assert_equal(mine.values[name], theirs.values[name])
+        assert same(content(again.filter), content(system.filter)) and same(again.arrays(), system.arrays())
+        np.testing.assert_equal(vars(again.map()), vars(system.map()))
+
+
+def image(bad: object) -> Callable[[ImageFrame], ImageFrame]:
+    return lambda frame: replace(frame, image=bad)
+
+
+BAD_IMAGES = {
+    "none": (image(None), "there is no image"),
+    "black": (image(DARK), "the image shows nothing"),
+    "smaller": (image(DARK[:100, :100]), "expected 320x240"),
+    "colour": (image(np.zeros((240, 320, 3), dtype=np.uint8)), "expected 320x240"),
+    "empty": (image(DARK[:0]), "expected 320x240"),
+    "no number": (image(DARK * np.nan), "expected 320x240"),
+    "no array": (image("image"), "expected 320x240"),
+}
+BAD_PAIRS = {
+    "missing": (missing, "the right image is missing"),
+    "black": (flat, "it shows 0 features"),
+    "wrong size": (lambda f: replace(f, image=f.image[:100], right=f.right[:100]), "the camera takes 320x240 px"),
+    "two sizes": (lambda f: replace(f, image=f.image[:100]), "must be of one size"),
+    "wrong type": (lambda f: replace(f, image=f.image.astype(float)), "float64"),
+    "colour": (lambda f: replace(f, image=np.dstack([f.image] * 3)), "(240, 320, 3)"),
+    "same stamp": (lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_666), "it has the stamp of the last one"),
+}
+SURVIVED = {
+    "known points": (lambda: mono(KNOWN), sequence, BAD_IMAGES, "found"),
+    "nothing known": (mono, sequence, BAD_IMAGES, "found"),
+    "pairs": pytest.param((stereo, pairs, BAD_PAIRS, "agreeing"), marks=pytest.mark.slow),
+}
+
+
+@pytest.mark.parametrize("case", SURVIVED.values(), ids=SURVIVED)
+def test_bad_frames_are_survived_and_said(case):
+    """One of each kind, two good ones between them: a bad one keeps a predicted pose, and what follows is as ever."""
+    make, recorded, kinds, used = case
+    bad, system, told = dict(zip(range(4, 4 + 3 * len(kinds), 3), kinds.items(), strict=True)), make(), []
+    for t, frame in enumerate(recorded(max(bad) + 3).frames()):
+        told.append(system.take(bad[t][1][0](frame) if t in bad else frame))
+    spread = [np.trace(each.cov) for each in told]
+    for t, each in enumerate(told):
+        if t in bad:
+            kind, (_, words) = bad[t]
+            assert each.state is TrackingState.PREDICTED and not each.values[used]
+            assert len(each.messages) == 1 and words in each.messages[0]
+            assert spread[t + 2] < 10.0 * spread[t - 1]
+            assert recorded is sequence or kind == "same stamp" or spread[t] > 50.0 * spread[t - 1]
+        else:
+            assert each.state in (TrackingState.TRACKED, TrackingState.INITIALISING) and not each.messages
+            assert t == 0 or each.values[used] > 10
+    if recorded is pairs:
+        assert errors_m(np.array([each.pose for each in told]), pairs(len(told)))[:-3].max() < 0.01
+
+
+@pytest.mark.parametrize("case", [SURVIVED["known points"], (stereo, pairs)], ids=["images", "pairs"])
+def test_a_stamp_before_the_last_one_changes_nothing(case):
+    make, recorded, *_ = case
+    system, frames = make(), list(recorded(5).frames())
+    for frame in frames[:3]:
+        system.take(frame)
+    before = content(system.filter), {name: np.copy(array) for name, array in system.arrays().items()}
+    with pytest.raises(InputError, match="time runs backwards"):
+        system.take(replace(frames[3], stamp_ns=frames[1].stamp_ns))
+    assert same(content(system.filter), before[0]) and same(system.arrays(), before[1])
+    assert system.take(frames[3]).state is TrackingState.TRACKED
