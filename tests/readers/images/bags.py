@@ -113,16 +113,16 @@ def write_bag(path, stamps=STAMPS_NS, prepare=lambda writer: writer, **camera):
     return path
 
 
-def write_pair(path, names=("/left", "/right"), image="image_rect", baseline=0.12, skipped=(), **camera):
-    """Three pairs, all right images after all left ones, but for some of the right ones."""
+def write_pair(path, names=("/left", "/right"), image="image_rect", baseline=0.12, **camera):
+    """Three pairs, all right images after all left ones; the topic's last part is one name, or one for each side."""
+    left, right = (image, image) if isinstance(image, str) else image
     with recorded(path) as bag:
         for side, name in enumerate(names):
             shift = -K[0] * baseline * side
             p = (*K[:3], shift, *K[3:6], 0.0, *K[6:], 0.0)
             bag.info(f"{name}/camera_info", p=p, **camera)
             for i, stamp in enumerate(STAMPS_NS):
-                if not (side and i in skipped):
-                    bag.image(f"{name}/{image}", stamp, grey(10 + 100 * side + 10 * i, SIZE))
+                bag.image(f"{name}/{right if side else left}", stamp, grey(10 + 100 * side + 10 * i, SIZE))
     return path
 
 

@@ -42,36 +42,30 @@ def test_sixteen_bits_are_scaled_to_eight(tmp_path):
     assert only_frame(tmp_path).image[0, :4].tolist() == [0, 1, 128, 255]
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".pgm"])
-def test_an_image_that_ends_too_early_is_not_half_of_one(tmp_path, suffix):
-    noise = np.random.default_rng(1).integers(0, 255, SIZE, dtype=np.uint8)
-    write_plain(tmp_path, [])
-    for name in ("0", "1", "2"):
-        write_image(tmp_path / f"{name}{suffix}", noise)
-    cut = tmp_path / f"1{suffix}"
-    cut.write_bytes(cut.read_bytes()[:-150])
-    frames = list(open_images(tmp_path).frames())
-    assert [frame.image is None for frame in frames] == [False, True, False]
-    assert frames[1].problem == f"{cut}: the file is damaged, incomplete or no image."
-    assert frames[0].problem is None and frames[2].problem is None
+def encoded(image, suffix=".png", cut=0):
+    data = cv2.imencode(suffix, image)[1].tobytes()
+    return data[: len(data) - cut]
 
 
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        (None, "no such file"),
-        (b"", "the file is empty, expected an image"),
-        (b"\x89PNG\r\n\x1a\n", "the file is damaged, incomplete or no image"),
-        (b"some text", "the file is damaged, incomplete or no image"),
-    ],
-)
-def test_a_run_survives_an_image_that_is_missing_or_none(tmp_path, content, problem):
-    write_plain(tmp_path)
-    sequence = open_images(tmp_path)
+NOISE = np.random.default_rng(1).integers(0, 255, SIZE, dtype=np.uint8)
+DAMAGED = "the file is damaged, incomplete or no image."
+LOST = [
+    (None, "no such file."),
+    (b"", "the file is empty, expected an image."),
+    (b"\x89PNG\r\n\x1a\n", DAMAGED),
+    *((encoded(NOISE, suffix, 150), DAMAGED) for suffix in (".png", ".jpg", ".tiff", ".pgm")),
+    (encoded(grey(20, (HEIGHT, WIDTH + 2))), "expected 24x16 px as in the camera file, found 26x16 px"),
+    (encoded(np.ones(SIZE, np.float32), ".tiff"), "expected 8 or 16 bits per channel, found float32"),
+]
+
+
+@pytest.mark.parametrize(("content", "problem"), LOST)
+def test_an_image_that_cannot_be_read_is_a_lost_frame_that_says_why(tmp_path, content, problem):
+    sequence = open_images(write_plain(tmp_path))
     (tmp_path / "1.png").unlink() if content is None else (tmp_path / "1.png").write_bytes(content)
-    lost = list(sequence.frames())[1]
     assert levels(sequence) == [10, None, 30]
-    assert lost.problem == f"{tmp_path / '1.png'}: {problem}."
+    lost = list(sequence.frames())[1]
+    assert lost.problem.startswith(f"{tmp_path / '1.png'}: ") and problem in lost.problem
     assert lost.stamp_ns == sequence.stamps_ns[1]
 
 
@@ -105,20 +99,6 @@ def test_pipes_and_devices_are_no_files(tmp_path):
             read_plain_yaml(path)
     with pytest.raises(InputError, match="not a complete archive"):
         load_arrays(tmp_path / "pipe.npz")
-
-
-def test_an_image_of_another_size_is_lost(tmp_path):
-    write_plain(tmp_path)
-    write_image(tmp_path / "1.png", grey(20, (HEIGHT, WIDTH + 2)))
-    frames = list(open_images(tmp_path).frames())
-    assert [frame.image is None for frame in frames] == [False, True, False]
-    assert "expected 24x16 px as in the camera file, found 26x16 px" in frames[1].problem
-
-
-def test_floating_point_images_are_refused(tmp_path):
-    write_plain(tmp_path, ["0.png"])
-    write_image(tmp_path / "1.tiff", np.ones(SIZE, np.float32))
-    assert "expected 8 or 16 bits per channel, found float32" in list(open_images(tmp_path).frames())[1].problem
 
 
 def test_the_first_image_that_can_be_read_tells_the_size(tmp_path):
