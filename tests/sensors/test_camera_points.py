@@ -67,7 +67,8 @@ def test_at_infinity_only_rotation_counts(camera):
 def test_behind_the_camera_is_finite_and_far_outside(camera, point):
     identity, point = SE3.identity(), np.array(point)
     ray, anchor = np.array([0.1, -0.1, 0.5]), SE3.exp(np.array([0.0, np.pi, 0.0, *point]))
-    for model, landmark, const in ((CameraPoint(camera), point, None), (CameraRay(camera), ray, anchor)):
+    models = (CameraPoint(camera), point, None), (CameraRay(camera), ray, anchor), (EpipolarRay(camera), ray, anchor)
+    for model, landmark, const in models:
         jacobians = known(model.jacobians(identity, landmark, const))
         for part in (model.predict(identity, landmark, const), jacobians.state, jacobians.landmark):
             assert np.isfinite(known(part)).all()

@@ -38,11 +38,9 @@ class TestFeatureLog:
         exact = replace(good, cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
         assert log(exact).frames == [exact]
 
-    def test_no_frame(self):
+    def test_no_frame_and_frames_out_of_order(self):
         with refused("walk holds no frame, expected at least one image"):
             log()
-
-    def test_out_of_order(self):
         with refused("frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"):
             log(frame(0, 1), frame(5, 1), frame(4, 1))
 
@@ -51,12 +49,10 @@ class TestFeatureLog:
         [
             ({"stamp_ns": 1.5}, "stamp_ns must be a whole number of nanoseconds, got 1.5"),
             ({"landmarks": np.array([1.0, 2.0])}, "landmarks must be (K,) int64, got (2,) float64"),
-            ({"landmarks": [1, 2]}, "landmarks must be (K,) int64, got a list"),
             ({"landmarks": np.array([7, 7])}, "landmark 7 comes twice, keep one of the two"),
             ({"landmarks": np.array([1, 2, 3])}, "z must be (3, 2) float64, got (2, 2) float64"),
             ({"z": np.array([[1.0, 2.0], [np.nan, 4.0]])}, "z must be finite, entry (1, 0) is nan"),
             ({"cov_z": np.stack([np.eye(2), np.diag([1.0, -1.0])])}, "cov_z is no covariance: "),
-            ({"cov_z": np.stack([np.eye(2), np.array([[1.0, 0.5], [0.0, 1.0]])])}, "cov_z is no covariance: "),
         ],
     )
     def test_a_wrong_frame_is_named(self, wrong, message):
@@ -86,7 +82,6 @@ class TestKnownPoints:
         [
             ({"names": np.array([4, 4])}, "landmark 4 comes twice, keep one of the two"),
             ({"positions": np.zeros((2, 2))}, "positions must be (2, 3) float64, got (2, 2) float64"),
-            ({"positions": np.full((2, 3), np.inf)}, "positions must be finite, entry (0, 0) is inf"),
             ({"cov": np.tile(-np.eye(3), (2, 1, 1))}, "cov is no covariance: "),
         ],
     )
@@ -105,7 +100,6 @@ class TestCameraTruth:
             ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "stamps_ns must be (T,) int64, got (3,) float64"),
             ({"stamps_ns": np.array([0, 1])}, "world_from_camera must be (2, 7) float64, got (3, 7) float64"),
             ({"stamps_ns": np.array([0, 5, 4])}, "stamp 2 is before the one it follows, sort the poses by time"),
-            ({"world_from_camera": poses * np.nan}, "world_from_camera must be finite, entry (0, 0) is nan"),
             (
                 {"world_from_camera": poses * [1, 1, 1, 2, 1, 1, 1]},
                 "pose 0 has a quaternion of length 2, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion",
