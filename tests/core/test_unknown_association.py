@@ -12,7 +12,6 @@ from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, ids_of, seen
 from tests.core.worlds import MAX_RANGE, Recipe, Sightings, World, anonymous, drive, planar_world
@@ -109,28 +108,6 @@ def test_what_is_out_of_sight_is_not_missed(filter_):
     for _ in range(5):
         filter_.step(NOTHING)
     np.testing.assert_array_equal(filter_.belief().map.log_odds(np.array([0])), 0.0)
-
-
-def test_particles_with_different_maps_weigh_their_explanations(filter_):
-    """Who holds the landmark pays its predictive density, the others that of a new one."""
-    landmark_map = filter_.belief().map
-    (sensor,) = filter_.sensors
-    assert isinstance(sensor, AnonymousLandmarkSensor)
-    seen = one_sighting()
-    records = sensor.model.initialise(filter_.particles.state, seen.z, seen.cov_z)
-    log_odds = np.array([[0.0], [0.0], [-np.inf], [-np.inf], [-np.inf]])
-    landmark_map.add_records(records, Point(2), log_odds)
-    report = filter_.step(seen)
-    assert ids_of(report)[:, 0].tolist() == [0, 0, NEW, NEW, NEW]
-    innovation = 2 * seen.cov_z[0]
-    density = -0.5 * np.log(np.linalg.det(2 * np.pi * innovation))
-    expected = np.array([density, density, *[sensor.gates.log_new] * 3])
-    expected -= np.logaddexp.reduce(expected)
-    np.testing.assert_allclose(filter_.particles.log_weights, expected, atol=1e-6)
-    assert landmark_map.ids.tolist() == [0, 1]
-    np.testing.assert_array_equal(
-        np.isneginf(landmark_map.log_odds(landmark_map.ids)), [[0, 1], [0, 1], [1, 0], [1, 0], [1, 0]]
-    )
 
 
 class Fixed(Resampler):

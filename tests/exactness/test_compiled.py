@@ -1,4 +1,4 @@
-"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, both passes."""
+"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, both passes, measurements in any order."""
 
 from dataclasses import replace
 
@@ -74,6 +74,10 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
     zero = np.zeros((PARTICLES, space.dim))
     one_density, other_density = (held.correct(scene.state, zero, [group]) for held in maps)
     np.testing.assert_allclose(one_density.all, other_density.all, rtol=TOLERANCE, atol=TOLERANCE)
+    order = rng.permutation(5)
+    shuffled = replace(group, z=group.z[order], cov=group.cov[order], ids=known(group.ids)[..., order])
+    in_order = scene.map().correct(scene.state, zero, [shuffled])
+    np.testing.assert_allclose(in_order.all, one_density.all, rtol=TOLERANCE, atol=TOLERANCE)
     one_map, other_map = (held.read(held.ids) for held in maps)
     np.testing.assert_allclose(one_map.mean, other_map.mean, rtol=TOLERANCE, atol=TOLERANCE)
     np.testing.assert_allclose(one_map.cov, other_map.cov, rtol=TOLERANCE, atol=TOLERANCE)

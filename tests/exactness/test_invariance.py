@@ -1,4 +1,4 @@
-"""The order of observations and of particles changes nothing but rounding."""
+"""The order of particles changes nothing but rounding."""
 
 from typing import Any
 
@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.likelihoods import GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
-from rbpf.lie import SE2, SE3
+from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from tests.exactness.models import Frame, Scripted
-from tests.exactness.scenes import random_covs, sensors
+from tests.exactness.scenes import sensors
 
 PARTICLES = 40
 TOLERANCE = 1e-9
@@ -35,51 +34,6 @@ def generator(order: np.ndarray) -> Reordered:
     rng = Reordered(np.random.PCG64(21))
     rng.order = order
     return rng
-
-
-def run(space, likelihood, compiled: bool, orders: np.random.Generator | None) -> Filter:
-    """Six steps with two sensors in one frame, some landmarks seen by both; `orders` shuffles all of it."""
-    rng = np.random.default_rng(55)
-    dim = 2 if space is SE2 else 3
-    landmarks = rng.normal(scale=4.0, size=(7, dim)) + 5.0
-    models, noise = sensors(space, rng), random_covs(rng, (7,), dim, 0.08)
-    increment, cov = space.exp(0.15 * np.ones(space.dim)), 0.004 * np.eye(space.dim)
-    held = LandmarkMap(space, compiled=compiled)
-    trigger, generator = EssTriggered(Systematic(), 0.7), np.random.default_rng(4)
-    filter_ = Filter(OdometryMotion(space), Scripted(), held, None, trigger, PARTICLES, generator)
-    truth = space.identity()
-    for step in range(6):
-        truth = space.compose(truth, increment)
-        groups = []
-        for model, seen in zip(models, (np.arange(5), np.arange(3, 7)), strict=True):
-            z = model.predict(truth, landmarks[seen]) + rng.multivariate_normal(np.zeros(dim), noise[0], seen.size)
-            z[1] += 0.8 * (step == 3)
-            order = np.arange(seen.size) if orders is None else orders.permutation(seen.size)
-            groups.append(Observations(z[order], noise[seen][order], model, likelihood, seen[order]))
-        if step == 0:
-            z = models[1].predict(truth, landmarks) + rng.multivariate_normal(np.zeros(dim), noise[0], 7)
-            filter_.step(Frame((), [NewLandmarks(z, noise, models[1], Point(dim))]), Odometry(increment, cov))
-            continue
-        filter_.step(Frame(groups if orders is None else groups[::-1]), Odometry(increment, cov))
-    return filter_
-
-
-@compiled_or_not
-@pytest.mark.parametrize(
-    ("space", "likelihood"),
-    [(SE2, TruncatedMahalanobis()), (SE3, GaussianWithOutliers(0.1, 100.0))],
-    ids=["truncated", "outliers"],
-)
-def test_the_order_of_observations_does_not_matter(space, likelihood, compiled):
-    plain = run(space, likelihood, compiled, None)
-    shuffled = run(space, likelihood, compiled, np.random.default_rng(2))
-    assert plain.lineage.generation == shuffled.lineage.generation > 0
-    np.testing.assert_allclose(shuffled.particles.state, plain.particles.state, atol=TOLERANCE)
-    np.testing.assert_allclose(shuffled.particles.log_weights, plain.particles.log_weights, atol=1e-7)
-    np.testing.assert_allclose(shuffled.log_evidence, plain.log_evidence, rtol=TOLERANCE)
-    for field in ("mean", "cov"):
-        one, other = (getattr(f.belief().read(np.arange(7)), field) for f in (plain, shuffled))
-        np.testing.assert_allclose(other, one, atol=TOLERANCE)
 
 
 @compiled_or_not

@@ -158,17 +158,6 @@ def test_covariance_of_the_frame_is_turned_into_the_poses_chart(space):
 
 
 @every_space
-def test_moving_a_particles_world_changes_nothing(space):
-    anchored, state, _, log_weights = draw(space, 5, 0.1)
-    worlds = space.exp(np.random.default_rng(2).normal(size=(5, space.dim)))
-    moved = Anchored(space.compose(worlds, anchored.mean), anchored.factor)
-    one = relative_estimate(space, anchored, state, log_weights)
-    other = relative_estimate(space, moved, space.compose(worlds, state), log_weights)
-    np.testing.assert_allclose(other.mean, one.mean, atol=1e-12)
-    np.testing.assert_allclose(other.cov, one.cov, atol=1e-12)
-
-
-@every_space
 def test_another_name_for_the_frame(space):
     """The covariance is in the right chart at the pose and stays."""
     anchored, state, _, log_weights = draw(space, 5, 0.1)

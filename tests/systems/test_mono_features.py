@@ -26,7 +26,6 @@ from tests.systems.mono_logs import SMALL, changed, desk, errors, nees, rows, wi
 
 LOG, FIRST = desk(2, frames=10), desk()
 every_mode = pytest.mark.parametrize("mode", ["frame", "points"])
-every_constraint = pytest.mark.parametrize("constrain", ["epipolar", "marginal", "off"])
 SETTINGS = [
     SMALL,
     replace(SMALL, known="points"),
@@ -96,19 +95,6 @@ def test_how_rays_are_used():
     assert epipolar[2] == marginal[2] == {(EpipolarRay, state)}
     # Without known points the prior of depth holds the scale: the marginal, where it counts.
     assert groups_of("marginal", without_known(LOG))[1] == {(CameraRay, state)}
-
-
-@every_constraint
-def test_a_camera_at_rest_learns_no_depth(constrain):
-    """The same image again and again."""
-    frames = [replace(LOG.frames[0], stamp_ns=LOG.frames[0].stamp_ns + t * 10**8) for t in range(8)]
-    still = VelocityConfig(walk_rad_s=1e-3, walk_m_s=1e-3, start_rad_s=1e-3, start_m_s=1e-3)
-    config = replace(SMALL, inverse_depth=InverseDepthConfig(constrain, from_scene_depth=False), velocity=still)
-    done = run(replace(LOG, frames=frames, truth=None), config)
-    held = done.system.filter.belief().map
-    rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
-    assert len(rays) == len(LOG.frames[0].landmarks) - 4
-    np.testing.assert_array_equal(held.read(np.array(rays)).cov[..., 2, 2], InverseDepthConfig().std_per_m ** 2)
 
 
 def still_log(seed: int, frames: int) -> FeatureLog:
