@@ -74,7 +74,7 @@ APART = StereoConfig(particles=60, odometry=OdometryConfig(split="apart"), likel
 
 
 def test_stereo_configurations_are_compared_on_what_odometry_has_not_used():
-    log = simulate_features(DeskWorld(frames=12), Measuring(), STEREO, 0)
+    log = simulate_features(DeskWorld(frames=20), Measuring(), STEREO, 0)
     shaken = replace(APART, proposal=ProposalConfig("prior"), map=replace(APART.map, used=False))
     found = compare_evidence(APART, APART, log, range(3))
     assert abs(found.difference) <= 1e-9 and np.isfinite(found.log_evidence_a)
