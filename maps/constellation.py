@@ -129,7 +129,7 @@ class UncertainConstellation(Landmark):
         from rbpf.kernels.rigid_fit import rigid_fit
 
         world, given = self.in_world(records), np.asarray(self.points)
-        n, start = world.shape[0], _closed_fit(given, world.mean(axis=0)[None])
+        n, start = world.shape[0], SE3.closest(given, world.mean(axis=0)[None])
         frame, slope = np.empty((n, 7)), np.empty((n, 6, self.dim))
         cov_fit, cov = np.empty((n, 6, 6)), np.empty((n, 6, 6))
         held = (np.ascontiguousarray(part) for part in (world, records.cov[:, 0]))
@@ -141,16 +141,3 @@ class UncertainConstellation(Landmark):
 def by_frame(local: np.ndarray) -> np.ndarray:
     """∂(T⁻¹p)/∂ξ = [[q]× | −I] (…, 3, 6) at q = T⁻¹p, for T Exp(ξ); with a minus and turned by R that of T q."""
     return np.concatenate([skew(local), np.broadcast_to(-np.eye(3), (*local.shape, 3))], axis=-1)
-
-
-def _closed_fit(given: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """Poses (N, 7) that fit points (M, 3) to points (N, M, 3) by least squares (S. Umeyama, 1991)."""
-    centre, middle = given.mean(axis=0), world.mean(axis=1)
-    u, _, vt = np.linalg.svd(np.swapaxes(world - middle[:, None], -1, -2) @ (given - centre))
-    sign = np.ones((len(world), 3))
-    sign[:, 2] = np.sign(np.linalg.det(u @ vt))
-    rotation = (u * sign[:, None]) @ vt
-    matrix = np.zeros((len(world), 4, 4))
-    matrix[:, :3, :3], matrix[:, 3, 3] = rotation, 1.0
-    matrix[:, :3, 3] = middle - rotation @ centre
-    return SE3.from_matrix(matrix)

@@ -146,3 +146,16 @@ def test_agrees_with_gtsam(rng):
         np.testing.assert_allclose(SE2.matrix(x), flat.matrix(), atol=1e-14)
         np.testing.assert_allclose(SE2.log(x)[order], gtsam.Pose2.Logmap(flat), atol=1e-14)
         np.testing.assert_allclose(SE2.adjoint(x)[np.ix_(order, order)], flat.AdjointMap(), atol=1e-14)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_pose_that_brings_points_closest_is_scipys(rng, weighted):
+    given, world = rng.normal(size=(5, 3)), rng.normal(size=(4, 5, 3))
+    weights = rng.dirichlet(np.ones(5)) if weighted else None
+    found = SE3.closest(given, world, weights)
+    about = np.full(5, 0.2) if weights is None else weights
+    for pose, points in zip(found, world, strict=True):
+        middle = about @ points
+        turn, _ = Rotation.align_vectors(points - middle, given - about @ given, about)
+        np.testing.assert_allclose(SE3.matrix(pose)[:3, :3], turn.as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(pose[4:], middle - turn.apply(about @ given), atol=1e-12)

@@ -115,6 +115,28 @@ class SE3Group(LieGroup):
         roll = np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2])
         return yaw, pitch, roll
 
+    def closest(self, given: ArrayLike, world: ArrayLike, weights: ArrayLike | None = None) -> Array:
+        """Poses (…, 7) that bring points (M, 3) closest to points (…, M, 3), by least squares (S. Umeyama, 1991).
+
+        `weights` (M,) sum to one; by default all count alike.
+        """
+        given, world = np.asarray(given, dtype=float), np.asarray(world, dtype=float)
+        if weights is None:
+            centre, middle = given.mean(axis=0), world.mean(axis=-2)
+            apart = given - centre
+        else:
+            weights = np.asarray(weights, dtype=float)
+            centre, middle = weights @ given, weights @ world
+            apart = weights[:, None] * (given - centre)
+        u, _, vt = np.linalg.svd(np.swapaxes(world - middle[..., None, :], -1, -2) @ apart)
+        sign = np.ones(middle.shape)
+        sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+        rotation = (u * sign[..., None, :]) @ vt
+        matrix = np.zeros((*middle.shape[:-1], 4, 4))
+        matrix[..., :3, :3], matrix[..., 3, 3] = rotation, 1.0
+        matrix[..., :3, 3] = middle - rotation @ centre
+        return self.from_matrix(matrix)
+
 
 def _one(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:
     """A function of rows, (..., size) -> (..., *out_shape)."""

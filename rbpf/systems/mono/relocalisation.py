@@ -296,7 +296,7 @@ class Relocaliser:
         """A pose (7,) of the heaviest particle's world in each particle's own (N, 7).
 
         It is where the landmarks in view are around the camera as they are in the heaviest one: the closest rigid motion
-        of each particle's, near ones counting more, by S. Umeyama (1991). What a map is bent elsewhere does not matter.
+        of each particle's, near ones counting more. What a map is bent elsewhere does not matter.
         """
         rows, points = self.known_landmarks(belief)
         seen = SE3.inverse_transform(pose, points)
@@ -310,7 +310,9 @@ class Relocaliser:
             ahead = places[:, 3] > 0.0
             poses[i] = pose
             if ahead.sum() >= MIN_FITTED:
-                poses[i] = _closest(seen[which[ahead]], places[ahead, :3] / places[ahead, 3:])
+                given = seen[which[ahead]]
+                weights = 1.0 / np.square(given).sum(axis=1)
+                poses[i] = SE3.closest(given, places[ahead, :3] / places[ahead, 3:], weights / weights.sum())
         return poses
 
     def describe_landmarks(self, candidates: Candidates, near: np.ndarray) -> np.ndarray:
@@ -432,18 +434,6 @@ class LastView:
         alike = matches.score >= VIEW_CORRELATION
         px = np.where(alike[:, None], matches.px, sights.px)
         return replace(sights, px=px, std_px=np.where(alike, VIEW_PX, CORNER_PX))
-
-
-def _closest(seen: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """world_from_camera (7,) that brings points (K, 3) of the camera's frame closest to the world's (K, 3)."""
-    weight = 1.0 / np.square(seen).sum(axis=1)
-    weight /= weight.sum()
-    centre, centre_world = weight @ seen, weight @ world
-    u, _, vt = np.linalg.svd((weight[:, None] * (world - centre_world)).T @ (seen - centre))
-    matrix = np.eye(4)
-    matrix[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    matrix[:3, 3] = centre_world - matrix[:3, :3] @ centre
-    return SE3.from_matrix(matrix)
 
 
 def is_convincing(found: Resected, px: np.ndarray, width: int, config: RelocalisationConfig) -> bool:
