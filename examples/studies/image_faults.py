@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rbpf.sensors.readers.images.part import Chosen
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
+from rbpf.sensors.readers.part import Chosen
 
 Fault = Callable[[ImageSequence], ImageSequence]
 Paint = Callable[[int, np.ndarray, bool], np.ndarray]

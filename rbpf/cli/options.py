@@ -11,8 +11,8 @@ from rbpf.ranges import MOST, Count, CountOrNone, Fraction, NotNegative, Range, 
 
 if TYPE_CHECKING:
     from rbpf.sensors.calibration import Board, MarkerBoard
-    from rbpf.sensors.readers.images.part import Part
     from rbpf.sensors.readers.images.sequence import Topics
+    from rbpf.sensors.readers.part import Part
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
@@ -223,7 +223,7 @@ def given_topics(options: ImageRunOptions) -> "Topics":
 
 def given_part(options: PartOptions) -> "Part":
     """The part of `--start`, `--end`, `--every` and, of images, `--resize`."""
-    from rbpf.sensors.readers.images.part import Part
+    from rbpf.sensors.readers.part import Part
 
     resize = options.resize if isinstance(options, ImageRunOptions) else None
     return Part(options.start, options.end, options.every, resize)

@@ -29,9 +29,9 @@ from rbpf.sensors.readers import (
     open_stereo,
     read_known_points,
 )
-from rbpf.sensors.readers.images.part import WHOLE
 from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
+from rbpf.sensors.readers.part import WHOLE
 from rbpf.sensors.readers.robot_log import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageScreen

@@ -5,9 +5,9 @@ from whatever function here reads it.
 """
 
 from rbpf.sensors.readers.formats import open_images, open_log, open_stereo
-from rbpf.sensors.readers.images.part import Part
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Topics
 from rbpf.sensors.readers.known_points import KnownPixels, read_known_points
+from rbpf.sensors.readers.part import Part
 from rbpf.sensors.readers.robot_log import Frame, LogNoise, RobotLog, Truth
 
 __all__ = [

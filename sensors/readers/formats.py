@@ -8,11 +8,11 @@ from rbpf.sensors.readers.images.bag import RosBag
 from rbpf.sensors.readers.images.euroc import Euroc
 from rbpf.sensors.readers.images.folders import Folder, Photos, SevenScenes, Tum
 from rbpf.sensors.readers.images.kitti import Kitti
-from rbpf.sensors.readers.images.part import WHOLE, Part
 from rbpf.sensors.readers.images.sequence import TOLERANCE_S, UNNAMED, ImageFormat, ImageSequence, ReadOptions, Topics
 from rbpf.sensors.readers.images.video import Video
 from rbpf.sensors.readers.mrclam import Mrclam
 from rbpf.sensors.readers.mrpt import Mrpt
+from rbpf.sensors.readers.part import WHOLE, Part
 from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat
 from rbpf.sensors.readers.text import quoted, read_bytes
 from rbpf.sensors.readers.victoria_park import VictoriaPark
