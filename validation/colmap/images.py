@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import ExifTags, Image
 
 from rbpf.runs.files import prepare_folder
 from rbpf.sensors.readers import ImageSequence, Part, Topics, open_images, open_stereo
 from rbpf.sensors.readers.images.decoding import FileImages
-from rbpf.sensors.readers.images.part import Chosen
 from rbpf.sensors.readers.images.sequence import Source
+from rbpf.sensors.readers.part import Chosen
 from rbpf.validation.colmap.model import LEFT, RIGHT, image_name
 
 OVER_IMAGES = "mono", "stereo"
@@ -18,8 +18,8 @@ OVER_IMAGES = "mono", "stereo"
 Names = dict[tuple[int, int], str]
 """Names of images by frame and side."""
 
-_ORIENTATION, _UPRIGHT = 0x0112, 1
-"""Tag of a photo that says how it is turned, and its value where it is not."""
+_UPRIGHT = 1
+"""What a photo's tag of its orientation says where it is not turned."""
 
 
 def recorded_images(config: Mapping[str, Any]) -> ImageSequence:
@@ -81,7 +81,7 @@ def _files(source: Source, size: tuple[int, int]) -> list[list[Path | None]] | N
     for files in cameras:
         try:
             with Image.open(next(path for path in files if path is not None)) as first:
-                upright = first.getexif().get(_ORIENTATION, _UPRIGHT) == _UPRIGHT
+                upright = first.getexif().get(ExifTags.Base.Orientation, _UPRIGHT) == _UPRIGHT
                 # An image made smaller is no file.
                 if first.size != size or not upright:
                     return None
