@@ -113,10 +113,13 @@ def test_anywhere_in_the_map(settled):
 def test_a_thing_that_moves_does_not_take_it_along(fraction, texture_seed):
     """For some pairs most matches are on the thing. Nothing on it becomes a landmark that weighs.
 
-    Seeds 0 to 7 end 4 to 11 mm off where it covers half of the view, and 2 to 5 mm where a third.
+    Where it covers half of the view, seeds 0 to 7 end 4 to 11 mm off, 7 in the median.
     """
-    run = filtered(cover_view(fraction, 6, 8, seed=texture_seed)(pairs(14)), CONFIG)
-    said = [message for message in run.messages if "something in the view moves" in message]
-    many = [message for message in said if int(message.split()[2]) < 0.5 * int(message.split()[4])]
-    assert len(said) >= 4 and len(many) >= 2
-    assert off_m(run, 14).max() < 1.5 * RIGHT_M
+    worst = []
+    for seed in range(5):
+        run = filtered(cover_view(fraction, 6, 8, seed=texture_seed)(pairs(14)), replace(CONFIG, seed=seed))
+        said = [message for message in run.messages if "something in the view moves" in message]
+        many = [message for message in said if int(message.split()[2]) < 0.5 * int(message.split()[4])]
+        assert len(said) >= 4 and len(many) >= 2
+        worst.append(off_m(run, 14).max())
+    assert np.median(worst) < RIGHT_M
