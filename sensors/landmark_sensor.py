@@ -31,7 +31,7 @@ class NamedLandmarkSensor(Sensor):
         self.model = model
         self.landmark = landmark
         self.likelihood = likelihood
-        self.alone: set[int] = set()
+        self.observed_once: set[int] = set()
         """Landmarks that were observed once, by a likelihood that knows outliers."""
         self._contradicted = np.zeros(0, dtype=np.int64)
 
@@ -45,13 +45,13 @@ class NamedLandmarkSensor(Sensor):
         if not known.any():
             return []
         ids = frame.landmarks[known]
-        second = np.flatnonzero(known & np.isin(frame.landmarks, list(self.alone)))
+        second = np.flatnonzero(known & np.isin(frame.landmarks, list(self.observed_once)))
         if second.size:
             predicted, cov = belief.project(self.model, frame.landmarks[second])
             nu = self.model.residual(frame.z[second], predicted)
             assert self.likelihood is not None
             agrees = self.likelihood.inlier(nu, cov + frame.cov_z[second])
-            self.alone -= set(frame.landmarks[second].tolist())
+            self.observed_once -= set(frame.landmarks[second].tolist())
             self._contradicted = np.unique(frame.landmarks[second[~agrees]])
         return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids)]
 
@@ -68,7 +68,7 @@ class NamedLandmarkSensor(Sensor):
             return []
         ids = frame.landmarks[new]
         if isinstance(self.likelihood, GaussianWithOutliers):
-            self.alone |= set(ids.tolist())
+            self.observed_once |= set(ids.tolist())
         return [NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, ids=ids)]
 
 

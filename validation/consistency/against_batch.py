@@ -28,9 +28,9 @@ from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
 from rbpf.validation.gtsam.batch_problem import (
     Fit,
+    OnIteration,
     Optimum,
     Problem,
-    Told,
     fit_of,
     floats_in_scale,
     name_of,
@@ -190,7 +190,7 @@ def compare(
     )
 
 
-def solve_run(record: RunFolder, most: int | None = None, on_iteration: Told | None = None) -> Optimum:
+def solve_run(record: RunFolder, most: int | None = None, on_iteration: OnIteration | None = None) -> Optimum:
     """The batch optimum of a run's measurements: with Huber's loss for matches in images, which hold false ones.
 
     `most` and `on_iteration` as of `solve_problem`.

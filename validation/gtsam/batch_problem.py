@@ -30,8 +30,8 @@ from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
 
-Told = Callable[[int, float], None]
-"""Told the number of an iteration and the error before it."""
+OnIteration = Callable[[int, float], None]
+"""Called with the number of an iteration and the error before it."""
 LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
 EXACT = 1e-4
@@ -101,7 +101,7 @@ def solve_problem(
     start: Array,
     robust: float | None = None,
     most: int | None = None,
-    on_iteration: Told | None = None,
+    on_iteration: OnIteration | None = None,
     marginals: bool = True,
     twice: bool = True,
 ) -> Optimum:
@@ -112,7 +112,7 @@ def solve_problem(
         start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
         robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
         most: iterations of a camera's adjustment, after which it is given up; by default as many as `WORK` allows.
-        on_iteration: told how far a camera's adjustment is.
+        on_iteration: called with how far a camera's adjustment is.
         marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
         twice: start a camera's adjustment from its known points alone, too, and take the better optimum, so that it does
             not hang on where the filter went; not needed near the optimum.
@@ -154,7 +154,7 @@ def _solve_camera(
     path: Array,
     robust: float | None,
     most: int | None,
-    told: Told | None,
+    on_iteration: OnIteration | None,
     marginals: bool,
     twice: bool,
 ) -> Optimum:
@@ -168,8 +168,8 @@ def _solve_camera(
 
     def watch(error: float) -> None:
         done = next(iterations)
-        if told is not None:
-            told(done, error)
+        if on_iteration is not None:
+            on_iteration(done, error)
         if done > limit:
             raise InputError(
                 f"the batch adjustment was given up after {limit} iterations: allow more with --batch-limit"

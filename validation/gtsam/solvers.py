@@ -124,7 +124,7 @@ def levenberg_marquardt(
         values: where to start.
         tolerance: it ends when a step gains less than this fraction of the error.
         iterations: most of them.
-        on_iteration: told the error before each iteration; what it raises ends the optimisation.
+        on_iteration: called with the error before each iteration; what it raises ends the optimisation.
     """
     error, damping = graph.error(values), _DAMPING
     for count in range(1, iterations + 1):

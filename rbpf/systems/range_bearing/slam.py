@@ -252,7 +252,7 @@ class RangeBearingSlam(System):
     def arrays(self) -> dict[str, np.ndarray]:
         kept = {"names": np.array(sorted(self._names), dtype=np.int64), "odometry": self._odometry}
         if isinstance(self.sensor, NamedLandmarkSensor):
-            kept["alone"] = np.array(sorted(self.sensor.alone), dtype=np.int64)
+            kept["observed_once"] = np.array(sorted(self.sensor.observed_once), dtype=np.int64)
         if self._associations is not None:
             kept |= self._associations.arrays()
         return kept if self.anchor is None else kept | self.anchor.arrays()
@@ -260,7 +260,7 @@ class RangeBearingSlam(System):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self._names = set(read_one(arrays, "names", integers("names")).tolist())
         if isinstance(self.sensor, NamedLandmarkSensor):
-            self.sensor.alone = set(read_one(arrays, "alone", integers("alone")).tolist())
+            self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
         if self._associations is not None:
             self._associations.restore(arrays)
