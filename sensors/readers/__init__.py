@@ -1,4 +1,4 @@
-"""Readers of recordings: robot logs, image sequences of one camera or two, known points.
+"""Readers of recordings: robot logs, laser scanners, image sequences of one camera or two, known points.
 
 What is missing, or not as the module of a format describes it, is an InputError that names file and line in one sentence,
 from whatever function here reads it.
@@ -7,6 +7,7 @@ from whatever function here reads it.
 from rbpf.sensors.readers.formats import open_images, open_log, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Topics
 from rbpf.sensors.readers.known_points import KnownPixels, read_known_points
+from rbpf.sensors.readers.laser import LaserOptions, read_laser_log
 from rbpf.sensors.readers.part import Part
 from rbpf.sensors.readers.robot_log import Frame, LogNoise, RobotLog, Truth
 
@@ -15,6 +16,7 @@ __all__ = [
     "ImageFrame",
     "ImageSequence",
     "KnownPixels",
+    "LaserOptions",
     "LogNoise",
     "Part",
     "RobotLog",
@@ -24,4 +26,5 @@ __all__ = [
     "open_log",
     "open_stereo",
     "read_known_points",
+    "read_laser_log",
 ]

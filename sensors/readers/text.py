@@ -5,6 +5,7 @@ every product that a reader forms far from overflow.
 """
 
 import re
+import zlib
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -63,13 +64,29 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
         raise InputError(f"{path}: cannot be read ({error}).") from None
 
 
+def _unpacked(path: Path, data: bytes) -> bytes:
+    """What a file holds that may be packed by gzip; no more than `MOST_BYTES` of it."""
+    if not data.startswith(b"\x1f\x8b"):
+        return data
+    unpacking = zlib.decompressobj(wbits=31)
+    try:
+        text = unpacking.decompress(data, MOST_BYTES)
+    except zlib.error as error:
+        raise InputError(f"{path}: it is packed by gzip and damaged ({error}); copy it again.") from None
+    if unpacking.unconsumed_tail:
+        raise InputError(f"{path}: the file is larger than {MOST_BYTES >> 20} MiB once it is unpacked.")
+    if not unpacking.eof:
+        raise InputError(f"{path}: it is packed by gzip and cut off; copy it again.")
+    return text
+
+
 def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
-    """Text of a file without a byte-order mark.
+    """Text of a file, which may be packed by gzip, without a byte-order mark.
 
     Raises:
         InputError: as `read_bytes`, or the file is empty, but for a byte-order mark, or not UTF-8.
     """
-    data = read_bytes(path, hint, most)
+    data = _unpacked(path, read_bytes(path, hint, most))
     if not data.removeprefix(BOM_UTF8).strip():
         raise InputError(f"{path}: the file is empty{hint and '; expected ' + hint}.")
     try:
@@ -214,6 +231,16 @@ def parse_number(path: Path, line: int, column: str, field: str) -> float:
     return value
 
 
+def parse_time(path: Path, line: int, text: str) -> int:
+    """Time in seconds in a line, counted from 1, as nanoseconds; digits beyond these are dropped."""
+    whole = text.partition(".")[0]
+    long = whole.isdigit() and len(whole) > _DIGITS_OF_SECONDS
+    if long or abs(parse_number(path, line, "the time", text)) > LATEST_S:
+        problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
+        raise line_error(path, line, problem)
+    return int(Decimal(text).scaleb(9))
+
+
 @dataclass(frozen=True)
 class StampedLines:
     """Lines of a file that begin with a time, in order of time; equal times are allowed.
@@ -258,12 +285,7 @@ def read_stamped(path: Path, hint: str, separator: str | None = None, nanosecond
                 problem = f"expected a time in whole nanoseconds, found {quoted(text)}"
                 raise line_error(path, line, problem)
             return int(text)
-        whole = text.partition(".")[0]
-        long = whole.isdigit() and len(whole) > _DIGITS_OF_SECONDS
-        if long or abs(parse_number(path, line, "the time", text)) > LATEST_S:
-            problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
-            raise line_error(path, line, problem)
-        return int(Decimal(text).scaleb(9))
+        return parse_time(path, line, text)
 
     numbered = [(i, line.strip()) for i, line in enumerate(read_lines(path, hint), 1)]
     kept = [(i, line.split(separator, 1)) for i, line in numbered if line and not line.startswith("#")]

@@ -18,6 +18,7 @@ from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log, read_measurements, write_measurements
 from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, read_known_points, text
+from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.properties.mutations import damaged, read_or_refused
@@ -127,6 +128,9 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "MRCLAM": (lambda f: small.write(f, small.MRCLAM), open_log, "*.dat"),
     "MRPT": (lambda f: simulate_robot(RobotWorld(4, 5), f, 0), open_log, "*.*"),
     "Victoria Park": (lambda f: small.write(f, small.GRAPH), open_log, "graph.txt"),
+    "CARMEN": (lambda f: small.write(f, small.CARMEN), lambda f: read_laser_log(f / "robot.clf"), "robot.clf"),
+    "laser, ROS 1": (lambda f: bags.write_scans(f / "walk.bag"), lambda f: read_laser_log(f / "walk.bag"), "*"),
+    "laser, ROS 2": (lambda f: bags.write_scans(f / "walk_db3"), lambda f: read_laser_log(f / "walk_db3"), "**/*.*"),
     "stereo tracks": (lambda f: small.write(f, small.TRACKS), read_stereo_tracks, "*.txt"),
     "wheel odometry": (lambda f: small.write(f, small.WHEELS), read_wheel_odometry, "odometry.*"),
     "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),

@@ -60,6 +60,13 @@ GRAPH = {
     "LANDMARK 3 2 9 1 0.5 0 0.5\n"
 }
 
+CARMEN = {
+    "robot.clf": "# message, values\nPARAM robot_frontlaser_offset 0.5\nODOM 0 0 0 0.5 0 0 10.0 robot 0.0\n"
+    "FLASER 5 1.0 0.0 81.83 2.5 nan 0.5 0 0 0 0 0 10.1 robot 0.1\n"
+    f"FLASER 5 1.5 2.0 3.0 4.0 5.0 1 0.5 {QUARTER!r} 1 0 {QUARTER!r} 10.3 robot 0.3\n"
+    "SYNC something else\nFLASER 5 1 2 3 4 5 1.5 0 0 1 0 0 10.4 robot 0.4\n"
+}
+
 SECOND = SE3.exp(np.array([0.1, -0.2, 0.05, 1.0, 2.0, 3.0]))
 
 

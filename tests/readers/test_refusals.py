@@ -1,5 +1,6 @@
 """What every reader of tables refuses: a bad line, a missing file, an incomplete one; and what is of no format at all."""
 
+import gzip
 import re
 from pathlib import Path
 
@@ -8,14 +9,16 @@ import pytest
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.sensors.readers import open_images, open_log, read_known_points
+from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from tests.readers.small import GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, TRACKS, WHEELS, write
+from tests.readers.small import CARMEN, GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, TRACKS, WHEELS, write
 
 FORMATS = {
     "MRCLAM": (MRCLAM, open_log),
     "MRPT": (MRPT, open_log),
     "space": (MRPT_IN_SPACE, open_log),
     "graph": (GRAPH, lambda folder: open_log(folder / "graph.txt")),
+    "CARMEN": (CARMEN, lambda folder: read_laser_log(folder / "robot.clf")),
     "tracks": (TRACKS, read_stereo_tracks),
     "wheels": (WHEELS, read_wheel_odometry),
     "known": (KNOWN, lambda folder: read_known_points(folder / "known_points.csv")),
@@ -55,6 +58,18 @@ graph | graph.txt | 2 | LANDMARK 1 3 3 -4 0.5 0.1 0.25 | expected landmark to be
 graph | graph.txt | 5 | LANDMARK 1 2 7 8 0.5 0 0.5 | landmark 2 comes a second time in pose 1
 graph | graph.txt | 3 | ODOMETRY 2 3 1 0 0 1 0 0 0 0 1 | expected odometry from pose 1, where the one before ends, fou
 graph | graph.txt | 3 | ODOMETRY 1 0 1 0 0 1 0 0 0 0 1 | expected a path without loops, found a return to pose 0
+CARMEN | robot.clf | 2 | PARAM robot_frontlaser_offset far | expected robot_frontlaser_offset to be a finite number
+CARMEN | robot.clf | 3 | ODOM 0 0 0 | expected x, y, theta, 3 more numbers and a time, found 4 words
+CARMEN | robot.clf | 4 | FLASER | expected the number of readings, found the end of the line
+CARMEN | robot.clf | 4 | FLASER 0 0 0 0 0 0 0 10.1 | expected readings, found none
+CARMEN | robot.clf | 4 | FLASER 9 1 2 3 4 5 0 0 0 0 0 0 10.1 | expected odometry's x, found the end of the line
+CARMEN | robot.clf | 4 | FLASER 3 1 2 3 4 5 0 0 0 0 0 0 10.1 robot 0.1 | expected a time, a host and a time after 11 words
+CARMEN | robot.clf | 4 | FLASER 99 1 2 3 4 5 0 0 0 0 0 0 10.1 | expected 99 readings and what follows them, found 12 words
+CARMEN | robot.clf | 4 | FLASER 5 1 2 x 4 5 0 0 0 0 0 0 10.1 | expected readings to be a finite number, found 'x'
+CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 nan 0 10.1 | expected odometry's y to be a finite number, found 'nan'
+CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 5e9 | expected the time in seconds, within 4e+09 of zero
+CARMEN | robot.clf | 7 | FLASER 4 1 2 3 4 0 0 0 0 0 0 10.5 | expected 5 readings as in line 4, found 4 readings
+CARMEN | robot.clf | 7 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 9.2 | the time runs backwards by 1.100 s, expected scans in order
 tracks | VO_calibration.txt | 1 | 700 710 0.1 600 180 0.5 | expected no skew
 tracks | VO_calibration.txt | 1 | 700 710 0 600 180 -0.5 | the stereo baseline must be positive
 tracks | VO_camera_poses.txt | 1 | 1 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1 | expected frame to be the line's number
@@ -84,6 +99,9 @@ FILES = [
     ("MRPT", {"sensor.yaml": "[" * 5000}, "sensor.yaml"),
     ("MRPT", {"sensor.yaml": '"\\UFFFFFFFF"'}, "sensor.yaml"),
     ("MRPT", {"sensor.yaml": f"%YAML {'1' * 5000}.1\n---\na: 1\n"}, "sensor.yaml"),
+    ("CARMEN", {"robot.clf": "ODOM 0 0 0 0 0 0 1\n"}, "robot.clf: expected a CARMEN log (a text file with lines FLASER"),
+    ("CARMEN", {"robot.clf": gzip.compress(CARMEN["robot.clf"].encode())[:-9]}, "packed by gzip and cut off"),
+    ("CARMEN", {"robot.clf": b"\x1f\x8b" + bytes(20)}, "robot.clf: it is packed by gzip and damaged"),
     ("tracks", {"VO_calibration.txt": 2 * TRACKS["VO_calibration.txt"]}, "VO_calibration.txt, line 2: expected one line"),
     ("tracks", {"VO_calibration2.txt": "1"}, "found VO_calibration.txt, VO_calibration2.txt"),
     ("wheels", {"odometry.csv": "# only\n"}, "odometry.csv: expected lines that begin with a time"),
@@ -98,6 +116,7 @@ MISSING = [
     ("MRCLAM", "Robot3_Measurement.dat", "expected an MRCLAM log"),
     *(("MRPT", name, "no such file; expected an MRPT log") for name in list(MRPT)[:3]),
     ("tracks", "VO_calibration.txt", "expected one file VO_calibration*.txt of stereo tracks, found none"),
+    ("CARMEN", "robot.clf", "no such file or folder; expected a ROS bag"),
     ("wheels", "odometry.csv", "no such file; expected the readings of a robot's wheels"),
     ("wheels", "odometry.yaml", "no such file"),
 ]

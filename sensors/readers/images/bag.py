@@ -87,6 +87,8 @@ _POSES = {
     "geometry_msgs/msg/TransformStamped": "transform",
 }
 """Where a message holds its pose."""
+_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
+"""A message of ROS 1 that the library does not bring along: its definition and its name."""
 _log = logging.getLogger(__name__)
 
 
@@ -121,11 +123,17 @@ class Bag:
         """Topics of some types, in alphabetical order."""
         return sorted(topic for topic, kind in self.topics.items() if kind in types)
 
-    def messages(self, topic: str) -> Iterator[RawMessage]:
-        """Messages of a topic in the order of the bag; those too short or too wrong to have a time are left out."""
+    def messages(self, topic: str, headed: bool = True) -> Iterator[RawMessage]:
+        """Messages of a topic in the order of the bag; those too short or too wrong to have a time are left out.
+
+        Those that do not begin with a header (`headed` is False) have the time of the bag.
+        """
         chosen = [c for c in self._reader.connections if c.topic == topic]
         with _refusing(self.path), closing(self._reader.messages(connections=chosen)) as found:
-            for connection, _, data in found:
+            for connection, received_ns, data in found:
+                if not headed:
+                    yield RawMessage(connection.msgtype, data, received_ns)
+                    continue
                 layout = _LITTLE if self._ros1 or data[1:2] == b"\x01" else _BIG
                 if len(data) < layout.size:
                     continue
@@ -145,7 +153,7 @@ def opened(path: Path) -> Iterator[Bag]:
     """A bag, closed at the end."""
     try:
         from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         problem = "a ROS bag is read with the package rosbags, which is not installed"
         raise InputError(f"{path}: {problem}: pip install 'rbpf[bags]'") from None
@@ -160,7 +168,10 @@ def opened(path: Path) -> Iterator[Bag]:
                 if chunk.datasize > MOST_BYTES:
                     raise InputError(f"{path}: a chunk claims to be larger than {MOST_BYTES >> 20} MiB.")
                 reader.chunks[place] = chunk._replace(decompressor=partial(_unpacked, chunk.decompressor))
-        yield Bag(path, reader, get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST))
+        types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
+        if ros1:
+            types.register(get_types_from_msg(*_TRANSFORMS))
+        yield Bag(path, reader, types)
     finally:
         reader.close()
 

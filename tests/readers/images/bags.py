@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2.enums import StoragePlugin
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tests.readers.images.folders import grey
 
@@ -69,6 +69,27 @@ class Recorder:
             distortion_model=given["model"], binning_x=given["binning"], binning_y=given["binning"], **matrices,
         )  # fmt: skip
 
+    def scan(self, topic, stamp, ranges, start=-1.0, step=0.5, reach=(0.1, 20.0)):
+        """Ranges of a scanner in the frame `laser`."""
+        self.add(
+            topic, stamp, "sensor_msgs/msg/LaserScan", frame="laser", angle_min=start, angle_max=1.0,
+            angle_increment=step, time_increment=0.0, scan_time=0.1, range_min=reach[0], range_max=reach[1],
+            ranges=np.array(ranges, np.float32), intensities=np.zeros(0, np.float32),
+        )  # fmt: skip
+
+    def transform(self, topic, stamp, parent, child, pose):
+        """A pose (7,) in the tree of transforms."""
+        qx, qy, qz, qw, x, y, z = map(float, pose)
+        turn = self.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
+        place = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        transform = self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
+        one = self.make(
+            "geometry_msgs/msg/TransformStamped", header=self.header(stamp, parent), child_frame_id=child,
+            transform=transform,
+        )  # fmt: skip
+        kind = "tf2_msgs/msg/TFMessage"
+        self.add_raw(topic, stamp, kind, self.bytes(self.make(kind, transforms=[one]), kind))
+
     def pose(self, topic, stamp, pose, kind="geometry_msgs/msg/PoseStamped", child="cam", received=None):
         """A pose (7,), by any of the messages that hold one."""
         qx, qy, qz, qw, x, y, z = map(float, pose)
@@ -100,7 +121,11 @@ def recorded(path, prepare=lambda writer: writer):
         plugin = StoragePlugin.MCAP if path.name.endswith("mcap") else StoragePlugin.SQLITE3
         writer, store = rosbag2.Writer(path, version=9, storage_plugin=plugin), Stores.LATEST
     with prepare(writer):
-        yield Recorder(writer, get_typestore(store), path.suffix == ".bag")
+        types = get_typestore(store)
+        if path.suffix == ".bag":
+            definition = "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
+            types.register(get_types_from_msg(*definition))
+        yield Recorder(writer, types, path.suffix == ".bag")
 
 
 def write_bag(path, stamps=STAMPS_NS, prepare=lambda writer: writer, **camera):
@@ -149,3 +174,18 @@ def film_pairs(bag, sequence, image="image_raw"):
     frames = list(sequence.frames())
     film(bag, "/left", camera, [{"stamp": f.stamp_ns, "image": f.image} for f in frames], 0.0, image)
     film(bag, "/right", camera, [{"stamp": f.stamp_ns, "image": f.right} for f in frames], shift, image)
+
+
+def write_scans(path, turned=(0.0, 0.0, 0.0, 1.0), by_topic=False, **scanner):
+    """Three scans, the odometry a little beside them, and a scanner 0.2 m ahead of the robot's middle."""
+    with recorded(path) as bag:
+        bag.transform("/tf_static", STAMPS_NS[0], "base", "laser", (*turned, 0.2, 0.0, 0.3))
+        for i, stamp in enumerate((STAMPS_NS[0] - 50_000_000, *STAMPS_NS)):
+            pose = [0.0, 0.0, np.sin(0.05 * i), np.cos(0.05 * i), float(i), 0.0, 0.0]
+            if by_topic:
+                bag.pose("/odom", stamp + 50_000_000, pose, "nav_msgs/msg/Odometry", child="base")
+            else:
+                bag.transform("/tf", stamp + 50_000_000, "odom", "base", pose)
+        for stamp in STAMPS_NS:
+            bag.scan("/scan", stamp, [1.0, 0.05, np.nan, np.inf, 25.0], **scanner)
+    return path
