@@ -59,6 +59,8 @@ class Run(Generic[SystemT]):
 
     def __post_init__(self) -> None:
         self.log = FrameLog.of(self.system)
+        if self.expected is not None:
+            self.system.keep_paths(self.expected)
 
     @property
     def name(self) -> str:

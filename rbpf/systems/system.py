@@ -21,12 +21,16 @@ from rbpf.arrays import Float, Int
 from rbpf.core.checkpoint import fitting
 from rbpf.core.filter import Filter
 from rbpf.lie import SE2Group, SE3Group
+from rbpf.ranges import require_memory
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 
 MAP_IDS = "map/ids"
 """Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds."""
+
+LAG = 150
+"""Frames of the particles' paths that are kept where neither the settings nor a recording's length say how many."""
 
 Gauge = Literal["none", "first frame", "rigid", "similarity"]
 """What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
@@ -146,6 +150,28 @@ class System(ABC):
     gauge: Gauge = "first frame"  #: what its world has in common with the ground truth's.
     config: Any  #: all settings.
     filter: Filter  #: the particle filter as it is now.
+    recorded: bool = False  #: whether the frames have a known end, see `keep_paths`.
+
+    @property
+    def lag(self) -> int | None:
+        """Frames of the particles' paths that are kept, None for all: in bounded memory, unless a recording has an end."""
+        lag: int | None = self.config.lag
+        return LAG if lag is None and not self.recorded else lag
+
+    def keep_paths(self, frames: int) -> None:
+        """So many frames will be taken, of which the particles' whole paths are kept, unless the settings have a lag.
+
+        Raises InputError: they would not fit into the machine's memory.
+        """
+        kept = frames if self.config.lag is None else min(frames, self.config.lag)
+        if self.filter.consolidation is None:
+            state, what = (
+                self.filter.particles.state,
+                f"the paths of {self.filter.n} particles over {kept} {self.frame_word}s",
+            )
+            require_memory(float(kept * state.nbytes), f"{what} (lag keeps fewer)")
+            self.recorded = True
+            self.filter.history.lag = self.lag
 
     @abstractmethod
     def take(self, frame: Any) -> Tracked:

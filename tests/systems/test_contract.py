@@ -1,19 +1,24 @@
 """What every system that takes frames promises: to go on from any checkpoint, to survive bad frames, to refuse the past."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import count, cycle
 
 import numpy as np
 import pytest
 
 from examples.studies.image_faults import blur_motion
+from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
-from rbpf.sensors.readers import ImageFrame
+from rbpf.lie import SE2
+from rbpf.sensors.readers import Frame, ImageFrame
 from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.slam import MonoSlam
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
-from rbpf.systems.system import System, TrackingState
+from rbpf.systems.system import LAG, System, TrackingState
 from tests.core.worlds import content, same
 from tests.systems.mono_logs import SMALL, desk, without_known
 from tests.systems.plane_sequences import CAMERA, known_points, path, sequence, texture, view
@@ -73,6 +78,53 @@ RESUMED = {
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
 }
+
+
+def robot(config: RangeBearingConfig | None = None) -> tuple[System, Iterator[object]]:
+    """It stands still among three landmarks."""
+    rng, cov, still = np.random.default_rng(0), np.tile(np.diag([0.01, 0.0004]), (3, 1, 1)), SE2.identity()
+    z = np.array([[2.0, 0.3], [3.0, -0.5], [4.0, 1.0]])
+    noise = [0.1, 0.02]
+    frames = (
+        Frame(t, still if t else None, 1e-4 * np.eye(3), np.arange(3), z + rng.normal(size=(3, 2)) * noise, cov)
+        for t in count()
+    )
+    return RangeBearingSlam(config or RangeBearingConfig(particles=10)), frames
+
+
+def camera(config: MonoConfig = SMALL) -> tuple[System, Iterator[object]]:
+    """It moves to and fro before the same features."""
+    there_and_back = cycle(LOG.frames + LOG.frames[-2:0:-1])
+    frames = (replace(frame, stamp_ns=33_333_333 * t) for t, frame in enumerate(there_and_back))
+    return MonoSlam(LOG.camera, config, LOG.known), frames
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("live", [robot, camera])
+def test_memory_does_not_grow_by_default(live):
+    system, frames = live()
+    held = {}
+    for t in range(1000):
+        system.take(next(frames))
+        held[t] = held_bytes(system.filter) if t in (199, 999) else 0
+    assert held[999] < 1.25 * held[199]
+    assert system.filter.history.stamps_ns.size == LAG
+
+
+@pytest.mark.parametrize("live", [robot, camera])
+def test_a_recordings_whole_paths_are_kept_where_they_fit(live):
+    system, frames = live()
+    system.keep_paths(LAG + 10)
+    for _ in range(LAG + 10):
+        system.take(next(frames))
+    assert system.filter.history.stamps_ns.size == LAG + 10
+    with pytest.raises(
+        InputError, match=r"the paths of \d+ particles over 10{12} (frames|steps) \(lag keeps fewer\) would take"
+    ):
+        system.keep_paths(10**12)
+    few, _ = live(replace(system.config, lag=5))
+    few.keep_paths(10**12)
+    assert few.filter.history.lag == 5
 
 
 @pytest.mark.slow

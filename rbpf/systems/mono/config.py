@@ -212,7 +212,8 @@ class MonoConfig(Ranged):
     #: place each particle samples in the first frame (E06).
     known: Literal["frame", "points"] = "frame"
     max_new_per_frame: CountOrNone = 1000  #: landmarks started in one frame at most.
-    lag: Count | None = None  #: frames of the particles' paths that are kept, None keeps all.
+    #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
+    lag: Count | None = None
     checkpoint_every: Count = 500  #: frames between checkpoints.
     velocity: VelocityConfig = field(default_factory=VelocityConfig)  #: how the camera moves.
     #: features whose depth is not known yet.

@@ -412,7 +412,7 @@ class MonoSlam(System):
         parts: list[Conditional] = [landmark_map]
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
-        return Filter(motion, sensor, parts, proposal, resampling, config.particles, rng, lag=config.lag)
+        return Filter(motion, sensor, parts, proposal, resampling, config.particles, rng, lag=self.lag)
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""

@@ -54,7 +54,9 @@ class RangeBearingConfig:
     #: falls below the threshold of resampling, which does not take place.
     window: Count = 5
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
-    lag: Count | None = None  #: steps of trajectory kept for smoothing, None keeps all; with a joint map one.
+    #: steps of trajectory kept for smoothing; None keeps all of a log, and the last 150 where no end is known. With a joint
+    #: map one.
+    lag: Count | None = None
     checkpoint_every: Count = 500  #: steps between checkpoints.
     #: steps between re-estimations of where the known start lies in each particle's world; 0 never. A joint map needs
     #: none: it knows its frame's place.

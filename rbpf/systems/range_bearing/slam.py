@@ -93,7 +93,7 @@ class RangeBearingSlam(System):
             config.resampling.build(),
             config.particles,
             np.random.default_rng(config.seed),
-            lag=1 if self.joint else config.lag,
+            lag=1 if self.joint else self.lag,
             consolidation=Consolidation(config.window, config.resampling.ess_threshold) if self.joint else None,
         )
         anchored = config.anchor_every and self.joint is None

@@ -126,7 +126,8 @@ class StereoConfig(Ranged):
     #: degrees of freedom of the camera: 6, or 3 for one that moves in its x–z plane and turns about y.
     dof: Literal[3, 6] = 6
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
-    lag: Count | None = None  #: updates of the particles' paths that are kept, None keeps all.
+    #: updates of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
+    lag: Count | None = None
     checkpoint_every: Count = 500  #: pairs between checkpoints.
     sift: SiftConfig = field(default_factory=SiftConfig)  #: keypoints of the images.
     pair: PairConfig = field(default_factory=PairConfig)  #: matching of the two images of a pair.

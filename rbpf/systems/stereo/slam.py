@@ -67,7 +67,7 @@ _STEREO = {
 class StereoSlam(System):
     """A rectified stereo camera; its first pair is the world.
 
-    What it keeps grows with the map alone, but for the particles' paths: a finite `config.lag` bounds these.
+    What it keeps grows with the map alone; of the particles' paths it keeps `lag` updates.
 
     Args:
         rig: the two cameras.
@@ -148,7 +148,7 @@ class StereoSlam(System):
             config.resampling.build(),
             config.particles,
             np.random.default_rng(config.seed),
-            lag=config.lag,
+            lag=self.lag,
         )
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
