@@ -13,6 +13,7 @@ T. Bailey 2008 (HybridSLAM), E. Eade and T. Drummond 2007 (coalesced observation
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, final
 
 import numpy as np
@@ -21,6 +22,7 @@ from scipy.linalg import solve_triangular
 from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
+from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import (
     NEW,
@@ -28,6 +30,7 @@ from rbpf.core.models import (
     Belief,
     Jacobians,
     Landmark,
+    Likelihood,
     LogDensities,
     Map,
     NewLandmarks,
@@ -45,21 +48,35 @@ from rbpf.maps.point import Point
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
+GAUSSIAN = Gaussian()
+TINY = float(np.finfo(float).tiny)
+
+
+class _Group(NamedTuple):
+    """Observations of a step that are weighed alike: their rows (K, p) among all, and the log-odds (K,) of an inlier."""
+
+    likelihood: Likelihood
+    rows: np.ndarray
+    log_odds: np.ndarray
 
 
 class _Rows(NamedTuple):
-    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S = L Lᵀ."""
+    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S (R, R)."""
 
     nu: np.ndarray
     by_state: np.ndarray
     by_marginal: np.ndarray
     columns: np.ndarray
-    chol: np.ndarray
+    cov: np.ndarray
+    groups: list[_Group]
     log_factor: float
 
-    @property
-    def log_det(self) -> float:
-        return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(np.log(2.0 * np.pi))
+    def inliers(self) -> np.ndarray:
+        """The rows that update, those of the surest observations first."""
+        if all(group.likelihood.kernel_id == 0 for group in self.groups):
+            return np.arange(self.nu.shape[1])
+        found = [(-odds, *rows) for _, *part in self.groups for rows, odds in zip(*part, strict=True) if odds >= 0.0]
+        return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
 
 _NAMED = {"ids": checkpoint.integers("landmarks", least=0), "next": checkpoint.integers(1, least=0)}
@@ -71,7 +88,8 @@ class JointMap(Map):
 
     The motion, and what is observed of landmarks, must not change when the whole world is moved, as it is with odometry and
     sensors on the robot. An observation of the state alone, as a position fix, is of its pose in the world. Landmarks are
-    associated alike in all particles, likelihoods are Gaussian, and all observations update state and landmarks.
+    associated alike in all particles, all observations update state and landmarks, and what a likelihood other than the
+    Gaussian takes for an outlier is one in all particles: it updates nothing, and weighs each by its own innovation.
 
     Args:
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
@@ -147,25 +165,42 @@ class JointMap(Map):
         factor = gaussian.psd_factor(increment)[None]
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
+    def decided(self, groups: Sequence[Observations], belief: Belief) -> Sequence[Observations]:
+        """Which observations are outliers: the most probable choice, given all particles, Mathematics (joint-outliers)."""
+        if all(group.likelihood is None or group.likelihood.kernel_id == 0 for group in groups):
+            return groups
+        prior, weights = belief.prior, belief.weights
+        rows = self._seen_through(belief.state, groups, prior)
+        spread = np.einsum("n,nra->ra", weights, rows.by_state @ prior.spread(prior.mean))
+        nu = weights @ rows.nu
+        apart = rows.nu - nu
+        chosen = iter(_log_odds(nu, rows.cov + spread @ spread.T + (weights[:, None] * apart).T @ apart, rows.groups))
+        decided = []
+        for group in groups:
+            log_odds = np.full(len(group.z), np.inf)
+            log_odds[slice(None) if group.ids is None else group.ids >= 0] = next(chosen)
+            decided.append(replace(group, log_odds=log_odds))
+        return decided
+
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        increment = None if self._gain is None else self.space.local(prior.base, state)
-        mean, cov = self._given(increment)
-        rows = self._rows(state, mean, cov, groups)
-        by_state = rows.by_state
-        if increment is not None and self._gain is not None:
-            slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
-            by_state = by_state + rows.by_marginal @ slope
-        n, count, d = by_state.shape
-        white = _whitened(rows.chol, np.concatenate([rows.nu[..., None], by_state], axis=2))
+        rows = self._seen_through(state, groups, prior)
+        inside = rows.inliers()
+        chol = gaussian.cholesky(rows.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
+        white = _whitened(chol, np.concatenate([rows.nu[..., None], rows.by_state], axis=2)[:, inside])
         nu, by_state = white[..., 0], white[..., 1:]
         turned = np.swapaxes(by_state, 1, 2)
-        total = Information.zeros(n, d)
+        total = Information.zeros(*by_state.shape[::2])
         total.info += turned @ by_state
         total.vector += (turned @ nu[..., None])[..., 0]
         total.quad += np.square(nu).sum(axis=1)
-        total.log_det += rows.log_det
         total.log_factor += rows.log_factor
-        total.rows += count
+        total.rows += inside.size
+        is_density = np.ones(rows.nu.shape[1], dtype=bool)
+        for likelihood, own, log_odds in rows.groups:
+            count = int((log_odds >= 0.0).sum())
+            total.log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
+            is_density[own] = likelihood.normalised
+        total.log_det += _log_det(chol[np.ix_(kept := is_density[inside], kept)])
         return total
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -175,10 +210,13 @@ class JointMap(Map):
         if not groups:
             return LogDensities(np.zeros(self.n), np.zeros(self.n))
         rows = self._rows(state, self.mean, self.cov, groups)
-        nu = _whitened(rows.chol, rows.nu[..., None])[..., 0]
-        total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + rows.log_det)
-        slope = rows.by_marginal @ self.cov[rows.columns]
-        half = solve_triangular(rows.chol, slope, lower=True, check_finite=False)
+        inside = rows.inliers()
+        chol = gaussian.cholesky(rows.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
+        nu = _whitened(chol, rows.nu[:, inside, None])[..., 0]
+        total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + _log_det(chol))
+        total += _beyond_gaussian(rows, inside, chol, nu)
+        slope = rows.by_marginal[inside] @ self.cov[rows.columns]
+        half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
         self.mean = self.mean + nu @ half
         self.cov = gaussian.symmetrise(self.cov - half.T @ half)
         return LogDensities(total, np.zeros_like(total))
@@ -256,18 +294,29 @@ class JointMap(Map):
             return self.mean, self.cov
         return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
 
+    def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> _Rows:
+        """The rows at predicted states; what has been seen through the increment of a substate moves with the state."""
+        increment = None if self._gain is None else self.space.local(prior.base, state)
+        rows = self._rows(state, *self._given(increment), groups)
+        if increment is None or self._gain is None:
+            return rows
+        slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
+        return rows._replace(by_state=rows.by_state + rows.by_marginal @ slope)
+
     def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> _Rows:
         """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
         d, n = self.space.dim, mean.shape[1]
         nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
         by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
+        parts = list[_Group]()
         for group in groups:
             model, z, noise, ids = group.model, group.z, group.cov, self._checked_ids(group)
+            log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
             at, landmarks, substate = state[:, None], None, None
             columns = np.zeros((z.shape[0], 0), dtype=np.int64)
             if ids is not None:
                 log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
-                z, noise, ids = z[ids >= 0], noise[ids >= 0], ids[ids >= 0]
+                z, noise, log_odds, ids = z[ids >= 0], noise[ids >= 0], log_odds[ids >= 0], ids[ids >= 0]
                 columns = self._columns(ids)
                 landmarks = mean[:, columns]
             if Part.SUBSTATE in model.reads:
@@ -295,6 +344,8 @@ class JointMap(Map):
             nus.append(np.broadcast_to(nu, (self.n, count, p)).reshape(self.n, -1))
             by_states.append(np.broadcast_to(by_state, (self.n, count, p, d)).reshape(self.n, -1, d))
             by_marginal.append(block.reshape(-1, n))
+            first = sum(len(each) for each in noises)
+            parts.append(_Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
             noises.extend(noise)
         slope = np.concatenate(by_marginal)
         used = np.flatnonzero(slope.any(axis=0))
@@ -304,14 +355,12 @@ class JointMap(Map):
         for noise in noises:
             rows = slice(end, end := end + noise.shape[0])
             innovation[rows, rows] += noise
-        chol = gaussian.cholesky(innovation) if end else innovation
-        return _Rows(np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1), slope, used, chol, log_factor)
+        nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
+        return _Rows(nu, by_state, slope, used, innovation, parts, log_factor)
 
     def _checked_ids(self, group: Observations) -> np.ndarray | None:
         """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
         name, ids = type(group.model).__name__, group.ids
-        if group.likelihood is not None and group.likelihood.kernel_id != 0:
-            raise InputError(f"a joint map takes Gaussian likelihoods, {name} has {type(group.likelihood).__name__}")
         if group.updates != frozenset({Part.STATE, Part.LANDMARK}):
             raise InputError(f"a joint map's observations update state and landmarks, {name}'s do not")
         if Part.LANDMARK not in group.model.reads:
@@ -457,12 +506,75 @@ class JointMap(Map):
         return isinstance(landmark, Point) and landmark.dim == self.point.dim
 
 
+def _log_det(chol: np.ndarray) -> float:
+    """Log |2πS| of S = L Lᵀ."""
+    return 2.0 * float(np.log(np.diagonal(chol)).sum()) + len(chol) * float(np.log(2.0 * np.pi))
+
+
+def _blocks(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The blocks (K, p, p) on the diagonal that belong to rows (K, p)."""
+    return matrix[rows[:, :, None], rows[:, None, :]]
+
+
+def _log_odds(nu: np.ndarray, cov: np.ndarray, groups: list[_Group]) -> list[np.ndarray]:
+    """Log-odds (K,) of every group's observations, each given all others that are inliers, of which no change of one adds.
+
+    Begins with those that are inliers when seen alone; then the one that is most at odds with its place changes it.
+    """
+    alone = [likelihood.log_odds(nu[rows], _blocks(cov, rows)) for likelihood, rows, _ in groups]
+    taken = [odds >= 0.0 for odds in alone]
+    for _ in range(2 * sum(len(each) for each in taken) + 1):
+        inside = np.concatenate([rows[took].ravel() for (_, rows, _), took in zip(groups, taken, strict=True)])
+        info = np.linalg.inv(cov[np.ix_(inside, inside)])
+        place = np.zeros(len(nu), dtype=np.int64)
+        place[inside] = np.arange(inside.size)
+        pull, gain = info @ nu[inside], cov[:, inside] @ info
+        outer_nu, outer_cov = nu - gain @ nu[inside], cov - gain @ cov[inside]
+        found = []
+        for (likelihood, rows, _), took in zip(groups, taken, strict=True):
+            # An inlier is left out of what it is judged by: ν = Π⁻¹ (S⁻¹ν) with covariance Π⁻¹, Π its block of S⁻¹.
+            given, spread = outer_nu[rows], _blocks(outer_cov, rows)
+            spread[took] = np.linalg.inv(_blocks(info, place[rows[took]]))
+            given[took] = (spread[took] @ pull[place[rows[took]]][..., None])[..., 0]
+            found.append(likelihood.log_odds(given, gaussian.symmetrise(spread)))
+        amiss = [np.where(took, -odds, odds) for took, odds in zip(taken, found, strict=True)]
+        worst = max(range(len(groups)), key=lambda g: amiss[g].max(initial=-np.inf))
+        if not amiss[worst].max(initial=-np.inf) > 0.0:
+            break
+        taken[worst][amiss[worst].argmax()] ^= True
+    return [
+        np.where(took, np.maximum(odds, 0.0), np.minimum(odds, -TINY)) for took, odds in zip(taken, found, strict=True)
+    ]
+
+
+def _beyond_gaussian(rows: _Rows, inside: np.ndarray, chol: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """What likelihoods other than the Gaussian add to log N (N,) of the inliers, Mathematics (joint-outliers).
+
+    Each inlier's own log-density in place of the Gaussian, given the inliers before it; and each outlier's, given all inliers.
+    """
+    total, place = np.zeros(len(white)), np.empty(rows.nu.shape[1], dtype=np.int64)
+    place[inside] = np.arange(inside.size)
+    for likelihood, own, log_odds in rows.groups:
+        if likelihood.kernel_id == 0:
+            continue
+        at = place[own[log_odds >= 0.0]]
+        lower = _blocks(chol, at)
+        nu, cov = (lower @ white[:, at][..., None])[..., 0], gaussian.gram(lower)
+        total += (likelihood.log_density(nu, cov) - gaussian.log_density(nu, cov)).sum(axis=1)
+        out = own[log_odds < 0.0]
+        half = _whitened(chol, rows.cov[np.ix_(inside, out.ravel())][None])[0]
+        nu = (rows.nu[:, out.ravel()] - white @ half).reshape(len(white), *out.shape)
+        explained = _blocks(half.T @ half, np.arange(out.size).reshape(out.shape))
+        total += likelihood.log_density(nu, _blocks(rows.cov, out) - explained).sum(axis=1)
+    return total
+
+
 def _whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """L⁻¹ of rows (N, R, k), with one L (R, R) for all."""
     n, count, k = rows.shape
-    flat = rows.transpose(1, 0, 2).reshape(count, -1)
-    if not count:
+    if not rows.size:
         return rows
+    flat = rows.transpose(1, 0, 2).reshape(count, -1)
     solved = solve_triangular(chol, flat, lower=True, check_finite=False)
     return np.asarray(solved).reshape(count, n, k).transpose(1, 0, 2)
 

@@ -5,7 +5,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from rbpf.core.likelihoods import ExistenceModel, Gates, GaussianWithOutliers, associate
+from rbpf.core.likelihoods import ExistenceModel, Gates, associate
 from rbpf.core.models import NEW, Belief, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.errors import InputError
 
@@ -23,7 +23,7 @@ class NamedLandmarkSensor(Sensor):
     """Known association: each observation carries the landmark's number, which is its id in the map.
 
     A number that the map does not hold starts a landmark. Names that are text have to be numbered by the caller. Without a
-    likelihood that of the innovation is Gaussian. With one that knows outliers, a landmark whose second observation
+    likelihood that of the innovation is Gaussian. With one that `rejects` outliers, a landmark whose second observation
     contradicts the first is begun anew with it: either may be the wrong one.
     """
 
@@ -32,7 +32,7 @@ class NamedLandmarkSensor(Sensor):
         self.landmark = landmark
         self.likelihood = likelihood
         self.observed_once: set[int] = set()
-        """Landmarks that were observed once, by a likelihood that knows outliers."""
+        """Landmarks that were observed once, by a likelihood that rejects outliers."""
         self._contradicted = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
@@ -67,7 +67,7 @@ class NamedLandmarkSensor(Sensor):
         if not new.any():
             return []
         ids = frame.landmarks[new]
-        if isinstance(self.likelihood, GaussianWithOutliers):
+        if self.likelihood is not None and self.likelihood.rejects:
             self.observed_once |= set(ids.tolist())
         return [NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, ids=ids)]
 

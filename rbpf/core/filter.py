@@ -378,7 +378,7 @@ class Filter:
     def _observe(self, frame: object, belief: Belief) -> list[Observations]:
         observed = [[checked_observations(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
         self._ends = list(accumulate(len(groups) for groups in observed))
-        return [group for groups in observed for group in groups]
+        return self.marginals.decided([group for groups in observed for group in groups], belief)
 
     def _consolidate(self) -> None:
         self.particles = self.marginals.consolidate(self.particles)

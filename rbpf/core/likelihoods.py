@@ -43,6 +43,7 @@ class TruncatedMahalanobis(Likelihood):
     """
 
     normalised = False
+    rejects = True
     kernel_id = 1
 
     def __init__(self, limit: float = 4.0, update_limit: float | None = None) -> None:
@@ -61,6 +62,9 @@ class TruncatedMahalanobis(Likelihood):
 
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
         return squared_mahalanobis(nu, cov) <= self.params[1]
+
+    def log_odds(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+        return 0.5 * (self.params[1] - squared_mahalanobis(nu, cov))
 
     def predicted_inlier(self, nu: np.ndarray, cov: np.ndarray, predictive: np.ndarray) -> np.ndarray:
         """Within the limit for updates; for the look-ahead, as probable as an outlier."""
@@ -88,6 +92,7 @@ class GaussianWithOutliers(Likelihood):
         volume: V, of the measurement space in which outliers are uniform, in the measurement's units.
     """
 
+    rejects = True
     kernel_id = 2
 
     def __init__(self, rate: float, volume: float) -> None:
@@ -101,6 +106,9 @@ class GaussianWithOutliers(Likelihood):
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
         """More probable as an inlier than as an outlier."""
         return gaussian.log_density(nu, cov) + self.params[0] >= self.params[1]
+
+    def log_odds(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+        return gaussian.log_density(nu, cov) + self.params[0] - self.params[1]
 
     def log_inlier(self) -> float:
         return float(self.params[0])

@@ -12,7 +12,7 @@ from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, linearise, stacked
-from rbpf.core.models import NEW, NULL, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
+from rbpf.core.models import NEW, NULL, Belief, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
 from rbpf.core.particles import Information, Particles, Prior, take
 from rbpf.errors import InputError
 from rbpf.kernels.increment import conditioned
@@ -227,6 +227,13 @@ class Marginals(Conditional):
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
         driver = self._holder.get(Part.SUBSTATE, self._holder[Part.STATE])
         return driver.predict(transition, space)
+
+    def decided(self, groups: Sequence[Observations], belief: Belief) -> list[Observations]:
+        """By the part that each group goes to, in the groups' order."""
+        found = dict[int, Observations]()
+        for supplies, routed in self._routed(groups).items():
+            found |= zip(map(id, routed), self.parts[supplies].decided(routed, belief), strict=True)
+        return [found[id(group)] for group in groups]
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
         total: Information | None = None

@@ -118,6 +118,9 @@ class Observations:
     ids: Int[np.ndarray, "... K"] | None = None
     log_new: float = 0.0  #: log-density, in inverse measurement units, that a particle pays for a NEW observation.
     log_clutter: float = 0.0  #: the same for a NULL one.
+    #: log-odds (K,) that each is an inlier, where what is marginalised decides so once for all particles
+    #: (`Conditional.decided`); None leaves it to the likelihood in every particle.
+    log_odds: Float[np.ndarray, " K"] | None = None
     #: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share a
     #: measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     updates: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
@@ -259,6 +262,8 @@ class Likelihood(ABC):
     """Log-density of an innovation ν with covariance S; `normalised` says whether it integrates to one."""
 
     normalised: bool = True
+    rejects: bool = False
+    """Whether some observations are taken for outliers, as of another thing than they are said to be of."""
     kernel_id: int = -1
     """Number of the compiled twin in `rbpf.kernels.gate`, called with `params`; −1 has none."""
     params: np.ndarray = np.zeros(1)
@@ -270,6 +275,10 @@ class Likelihood(ABC):
     def inlier(self, nu: Measured, cov: Covariances) -> Bool[np.ndarray, "*batch"]:
         """Whether the observation may move the state and the landmark, (…) bool; by default always."""
         return np.ones(nu.shape[:-1], dtype=bool)
+
+    def log_odds(self, nu: Measured, cov: Covariances) -> Float[np.ndarray, "*batch"]:
+        """By how much an inlier is more probable than an outlier, (…), at least 0 where `inlier` holds."""
+        return np.where(self.inlier(nu, cov), np.inf, -np.inf)
 
     def predicted_inlier(self, nu: Measured, cov: Covariances, predictive: Covariances) -> Bool[np.ndarray, "*batch"]:
         """`inlier` before the state is sampled, whose spread makes S the `predictive` covariance S + H Q Hᵀ."""
@@ -331,6 +340,10 @@ class Conditional(ABC):
         if transition.coupling is not None and transition.coupling.shape[-1]:
             raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
         return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
+
+    def decided(self, groups: Sequence[Observations], belief: "Belief") -> Sequence[Observations]:
+        """The groups with what is decided once for all particles, given all of them; by default nothing is."""
+        return groups
 
     @abstractmethod
     def information(self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: Prior) -> Information:

@@ -8,7 +8,6 @@ from scipy.linalg import block_diag
 
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
-from rbpf.core.likelihoods import TruncatedMahalanobis
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Records
 from rbpf.core.particles import Particles, Prior, balanced
 from rbpf.core.proposals import PriorProposal
@@ -295,7 +294,6 @@ def test_what_a_joint_map_does_not_take(world):
     group = Observations(z, covs, Relative(), ids=one)
     first = Frame([], [NewLandmarks(z, covs, Relative(), Point(2))])
     refused = {
-        "takes Gaussian likelihoods": replace(group, likelihood=TruncatedMahalanobis()),
         "one association for all particles": replace(group, ids=np.zeros((12, 1), dtype=np.int64)),
         "update state and landmarks": replace(group, updates=frozenset({Part.STATE})),
         "holds no landmark 7": replace(group, ids=one + 7),

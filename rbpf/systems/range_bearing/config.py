@@ -65,17 +65,17 @@ class RangeBearingConfig:
     proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
     #: of an innovation; by default Gaussian. Of a log whose readings may be misread (MRCLAM) with outliers, if the log's
-    #: names are used and map=particles: particles that differ in what no reading tells, as the heading after a blind
-    #: turn, are else chosen among by the first wrong one.
+    #: names are used: particles that differ in what no reading tells, as the heading after a blind turn, are else
+    #: chosen among by the first wrong one.
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
     unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.map == "joint" and (self.association != "known" or self.likelihood.kind not in (None, "gaussian")):
-            raise InputError("map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all")
+        if self.map == "joint" and self.association != "known":
+            raise InputError("map=joint takes association=known: map=particles takes both")
 
     def of_innovations(self, misread: bool) -> Likelihood:
         """The likelihood of an innovation, where readings may be misread or not."""
-        robust = misread and self.likelihood.kind is None and self.association == "known" and self.map == "particles"
+        robust = misread and self.likelihood.kind is None and self.association == "known"
         return (replace(self.likelihood, kind="outliers") if robust else self.likelihood).build()
