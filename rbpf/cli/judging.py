@@ -24,18 +24,25 @@ class ValidateOptions(Printed):
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
     #: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
     against: Literal["groundtruth", "gtsam", "colmap"] = "groundtruth"
+    #: in their place, a file of relations between poses (t1 t2 x y z roll pitch yaw) that are known; by default none.
+    relations: Where = None
+    path: Where = None  #: in their place, another path of the same recording, in TUM format; by default none.
     out: Where = None  #: a further folder for the JSON, which is always written into the run's own; by default none.
 
 
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
-    """Compare a run with the truth or an optimum: JSON, pictures, and the two lights on top of its report."""
+    """Compare a run with the truth, an optimum or another path: JSON, pictures, and the lights on top of its report."""
     from rbpf.validation.consistency.comparison import read_comparisons
     from rbpf.validation.report.validate import validate as compare
 
-    with waiting(f"comparing with {options.against} …"):
-        verdict = compare(options.run, options.against, options.out)
+    if options.relations is not None and options.path is not None:
+        raise InputError("a run is compared with one thing at a time: leave out --relations or --path")
+    file = options.relations or options.path
+    against = options.against if file is None else "path" if options.relations is None else "relations"
+    with waiting(f"comparing with {file or against} …"):
+        verdict = compare(options.run, against, options.out, file)
     # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
-    asked = [c.accuracy for c in read_comparisons(options.run) if c.against == options.against]
+    asked = [c.accuracy for c in read_comparisons(options.run) if c.against == against]
     _answer(verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence))
 
 

@@ -99,8 +99,10 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
     if "groundtruth" in by_name:
         accuracy, figures = by_name["groundtruth"].accuracy, by_name["groundtruth"].figures
     elif by_name:
-        best = by_name.get("gtsam", next(iter(by_name.values())))
-        accuracy = f"{best.accuracy} How far it is from the truth is not known."
+        best = by_name.get("relations", by_name.get("gtsam", next(iter(by_name.values()))))
+        accuracy = best.accuracy
+        if best.against != "relations":
+            accuracy += " How far it is from the truth is not known."
         figures, key = best.figures, "filter_minus_batch_rmse_m"
     try:
         lost, frames = tracking_losses(record)

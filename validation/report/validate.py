@@ -1,6 +1,7 @@
 """Compares a finished run with the truth, the batch optimum or a reconstruction, and puts the result on its page.
 
-A new comparison is one function from a run to a `Comparison`, entered into `COMPARISONS`.
+A new comparison is one function from a run to a `Comparison`, entered into `COMPARISONS`; one that needs a file besides
+takes its path, too, and is entered into `WITH_A_FILE`.
 """
 
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
+from rbpf.runs.folder import write_summary
 from rbpf.runs.plots import World
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.truth import TRUTH
@@ -66,6 +68,36 @@ def _camera_colmap(record: RunFolder) -> Comparison:
     return Comparison("colmap", accuracy, figures, pictures=pictures)
 
 
+def _relations(record: RunFolder, file: Path) -> Comparison:
+    """A run's paths by the relations of a file; the figures go into its summary.json, too."""
+    from rbpf.validation.metrics.relations import read_relations, score_relations
+
+    relations = read_relations(file)
+    scores = score_relations(record, relations)
+    figures = {prefix + name: value for prefix, errors in scores.items() for name, value in errors.entries().items()}
+    write_summary(record.folder, dict(record.summary) | figures)
+    said = scores.get("final_", scores[""]).sentence(len(relations.stamps_ns))
+    return Comparison("relations", said, figures)
+
+
+def _path(record: RunFolder, file: Path) -> Comparison:
+    """A run beside another path of the same recording, rigidly aligned."""
+    from rbpf.runs.trajectory import associate, read_tum
+    from rbpf.validation.metrics.accuracy import ate, rpe
+
+    estimate, reference = associate(record.trajectory, read_tum(file))
+    apart, moved = ate(estimate, reference, "rigid"), rpe(estimate, reference)
+    figures = {
+        "path_minus_other_rmse_m": apart.rmse,
+        "path_minus_other_max_m": apart.max,
+        "rpe_translation_rmse_m": moved.translation_rmse,
+        "rpe_rotation_rmse_deg": moved.rotation_rmse_deg,
+        "steps_compared": len(reference),
+    }
+    said = f"The path is {apart.rmse:.3g} m (rms, after a rigid alignment) from that of {file.name}."
+    return Comparison("path", said, figures)
+
+
 ANY = "*"
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "groundtruth": {ANY: _groundtruth},
@@ -73,31 +105,37 @@ COMPARISONS: dict[str, dict[str, Compare]] = {
     "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
 """By what a run is compared with, then by the run's system."""
+WITH_A_FILE: dict[str, Callable[[RunFolder, Path], Comparison]] = {"relations": _relations, "path": _path}
+"""By what a file holds that a run of any system is compared with."""
 
 
-def validate(folder: Path, against: str, out: Path | None = None) -> Verdict:
+def validate(folder: Path, against: str, out: Path | None = None, file: Path | None = None) -> Verdict:
     """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again; returns the verdict.
 
     Args:
         folder: of the run.
-        against: a name in `COMPARISONS`.
+        against: a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`.
         out: a further folder for the JSON.
+        file: what the run is compared with.
 
     Raises:
         InputError: the comparison is not possible; the report is written all the same, and says why.
     """
     record = RunFolder.open(folder)
     try:
-        known = COMPARISONS.get(against)
-        if known is None:
-            raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
-        compare = known.get(record.system, known.get(ANY))
-        if compare is None:
-            able = ", ".join(sorted(known)) or "no system yet"
-            raise InputError(
-                f"a run of the system {record.system!r} cannot be compared with {against} (possible: {able})"
-            )
-        comparison = compare(record)
+        if file is not None:
+            comparison = WITH_A_FILE[against](record, file)
+        else:
+            known = COMPARISONS.get(against)
+            if known is None:
+                raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
+            compare = known.get(record.system, known.get(ANY))
+            if compare is None:
+                able = ", ".join(sorted(known)) or "no system yet"
+                raise InputError(
+                    f"a run of the system {record.system!r} cannot be compared with {against} (possible: {able})"
+                )
+            comparison = compare(record)
     except InputError as error:
         write_report(folder, [f"Not compared with {against}: {error}."])
         raise

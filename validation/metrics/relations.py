@@ -1,0 +1,112 @@
+"""Error of a path by relations between pairs of its poses that people have checked, where no other truth is to be had.
+
+R. Kümmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27, 2009: the error of a relation is
+relation⁻¹ · (pose at t1)⁻¹ (pose at t2), of which the length of the translation and the angle of the rotation count. No
+alignment is needed, and a bend of the path counts where it is, once.
+
+A file of relations is a table, blank-separated, `#` starting a comment:
+
+    t1 t2 x y z roll pitch yaw
+
+with the pose at t2 seen from that at t1 (Unix seconds, metres, radians). A path has a pose at every time within it: between
+two, the position follows the line and the rotation the shortest turn.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.trajectory import MAX_DIFFERENCE_NS, Trajectory, read_tum
+from rbpf.sensors.readers.text import parse_time, read_columns
+from rbpf.validation.metrics.scores import ODOMETRY
+
+_COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
+FILTERED, FINAL = "trajectory.tum", "posterior.tum"
+
+
+@dataclass(frozen=True)
+class Relations:
+    """R relations."""
+
+    stamps_ns: NDArray[np.int64]  #: (R, 2) times of both ends.
+    first_from_second: Array  #: (R, 7) pose at the second time, seen from that at the first.
+
+
+@dataclass(frozen=True)
+class RelationErrors:
+    """Errors of the relations whose times lie within a path."""
+
+    translations: Array  #: (S,) [m].
+    rotations_deg: Array  #: (S,) in [0, 180].
+
+    def entries(self) -> dict[str, float]:
+        """Number, means and standard deviations, by names for summary.json."""
+        return {
+            "relations": len(self.translations),
+            "relations_translation_mean_m": float(self.translations.mean()),
+            "relations_translation_std_m": float(self.translations.std()),
+            "relations_rotation_mean_deg": float(self.rotations_deg.mean()),
+            "relations_rotation_std_deg": float(self.rotations_deg.std()),
+        }
+
+    def sentence(self, total: int) -> str:
+        """What was found, of so many relations in the file."""
+        found = self.entries()
+        part = "" if found["relations"] == total else f" of {total} (the others end outside of its time)"
+        metres = f"{found['relations_translation_mean_m']:.3f} ± {found['relations_translation_std_m']:.3f} m"
+        degrees = f"{found['relations_rotation_mean_deg']:.1f} ± {found['relations_rotation_std_deg']:.1f} degrees"
+        return f"The path misses {found['relations']} relations{part} by {metres} and {degrees} (mean ± standard deviation)."
+
+
+def read_relations(path: Path) -> Relations:
+    """Relations of a file. An InputError names file and line."""
+    table = read_columns(path, _COLUMNS, "a table of relations, " + " ".join(_COLUMNS))
+    ends = [
+        [parse_time(path, line, word) for word in row.split()[:2]]
+        for line, row in zip(table.lines, table.rows, strict=True)
+    ]
+    poses = SE3.from_ypr(table.block("x", "z"), table["yaw"], table["pitch"], table["roll"])
+    return Relations(np.array(ends, dtype=np.int64), poses)
+
+
+def relation_errors(estimate: Trajectory, relations: Relations) -> RelationErrors:
+    """Errors of a path by relations.
+
+    Raises:
+        InputError: no relation has both ends within the path.
+    """
+    if not len(estimate):
+        raise InputError("Expected a path with poses to score by relations, found an empty one.")
+    first, last = estimate.stamps_ns[[0, -1]] + [-MAX_DIFFERENCE_NS, MAX_DIFFERENCE_NS]
+    inside = ((relations.stamps_ns >= first) & (relations.stamps_ns <= last)).all(axis=1)
+    if not inside.any():
+        raise InputError("None of the relations has both ends within the path; expected times of the same clock.")
+    ends = [_at(estimate, column) for column in relations.stamps_ns[inside].T]
+    error = SE3.between(relations.first_from_second[inside], SE3.between(*ends))
+    turned = np.linalg.norm(SE3.log(error)[:, :3], axis=1)
+    return RelationErrors(np.linalg.norm(SE3.translation(error), axis=1), np.degrees(turned))
+
+
+def _at(path: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
+    """Poses (S, 7) at times within a path."""
+    after = np.searchsorted(path.stamps_ns, stamps_ns, side="right").clip(1, max(len(path) - 1, 1))
+    before, after = after - 1, after.clip(max=len(path) - 1)
+    gap = np.maximum(path.stamps_ns[after] - path.stamps_ns[before], 1)
+    fraction = ((stamps_ns - path.stamps_ns[before]) / gap).clip(0.0, 1.0)
+    a, b = path.world_from_body[before], path.world_from_body[after]
+    turning = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    at = SE3.interpolate(a * turning, b * turning, fraction)
+    at[:, 4:] = a[:, 4:] + fraction[:, None] * (b - a)[:, 4:]
+    return at
+
+
+def score_relations(found: RunFolder, relations: Relations) -> dict[str, RelationErrors]:
+    """Errors of each of a run's paths, by prefix: "" of the filter, "final_" of its last particles, "odometry_" without it."""
+    paths = {"": FILTERED, "final_": FINAL, "odometry_": ODOMETRY}
+    there = {prefix: found.folder / name for prefix, name in paths.items() if (found.folder / name).is_file()}
+    return {prefix: relation_errors(read_tum(path), relations) for prefix, path in there.items()}
