@@ -8,6 +8,9 @@ from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 
+MIN_RHO = 0.02
+"""Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m."""
+
 
 @final
 class InverseDepth(Landmark):
@@ -18,15 +21,19 @@ class InverseDepth(Landmark):
 
     Args:
         ready_ratio: it is ready to become a point when the standard deviation of q is below this fraction of q.
+        least_parallax: a change of q by its standard deviation that moves the measurement by less than this, in its units,
+            leaves q as it is in a joint map, which counts with its uncertainty all the same; 0 always measures depth.
     """
 
     dim = 3
     constants = 7
+    anchored = True
 
-    def __init__(self, ready_ratio: float = 0.1) -> None:
+    def __init__(self, ready_ratio: float = 0.1, least_parallax: float = 0.0) -> None:
         if not ready_ratio > 0.0:
             raise InputError(f"ready_ratio must be positive, got {ready_ratio}")
         self.ready_ratio = ready_ratio
+        self.least_parallax = least_parallax
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """(R (u, v, 1) + q t, q): no division, so that q may be 0."""
@@ -35,6 +42,23 @@ class InverseDepth(Landmark):
         turned = SE3.transform(const, ray) - SE3.translation(const)
         rho = mean[..., 2:]
         return np.concatenate([turned + rho * SE3.translation(const), rho], axis=-1)
+
+    def point(self, mean: np.ndarray, const: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """With q kept away from 0."""
+        assert const is not None
+        u, v, q = np.moveaxis(mean, -1, 0)
+        q = np.maximum(q, MIN_RHO)
+        direction = np.stack([u, v, np.ones_like(q)], axis=-1)
+        jac = np.zeros((*q.shape, 3, 3))
+        jac[..., 0, 0] = jac[..., 1, 1] = 1.0 / q
+        jac[..., :, 2] = -direction / np.square(q)[..., None]
+        return SE3.transform(const, direction / q[..., None]), SE3.matrix(const)[..., :3, :3] @ jac
+
+    def considered(self, slope: np.ndarray, cov: np.ndarray) -> np.ndarray:
+        """Of q, where there is not enough parallax: what is measured then says more of the pose than of depth."""
+        found = np.zeros((len(slope), 3), dtype=bool)
+        found[:, 2] = np.linalg.norm(slope[..., 2], axis=1) * np.sqrt(cov[:, 2, 2]) < self.least_parallax
+        return found
 
     def ready(self, records: Records) -> np.ndarray:
         """Whether q is positive and well known, (N, K): then depth is nearly Gaussian too (Fig. 2)."""

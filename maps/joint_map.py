@@ -10,6 +10,9 @@ with the substate s (a velocity, where there is one) and the landmarks in F. Eac
 covariance is the same for all, for it depends on the path in the second order only. `consolidate` ends a window: F moves to
 the robot, and what the particles differ by becomes a part of P, Mathematics (consolidation). Lineage: C. Brooks and
 T. Bailey 2008 (HybridSLAM), E. Eade and T. Drummond 2007 (coalesced observations).
+
+What is anchored, as a ray of unknown depth, stays in the frame of the pose that first saw it. That pose is a member of the
+Gaussian, too: a *clone*, C = K Exp(δ) in F, which moves with F as landmarks do (A. Mourikis and S. Roumeliotis 2007).
 """
 
 from collections.abc import Sequence
@@ -61,7 +64,10 @@ class _Group(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S (R, R)."""
+    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S (R, R).
+
+    `considered` are columns that the rows count with, but do not change.
+    """
 
     nu: np.ndarray
     by_state: np.ndarray
@@ -70,6 +76,7 @@ class _Rows(NamedTuple):
     cov: np.ndarray
     groups: list[_Group]
     log_factor: float
+    considered: np.ndarray
 
     def inliers(self) -> np.ndarray:
         """The rows that update, those of the surest observations first."""
@@ -79,13 +86,30 @@ class _Rows(NamedTuple):
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
 
-_NAMED = {"ids": checkpoint.integers("landmarks", least=0), "next": checkpoint.integers(1, least=0)}
+class _Table(NamedTuple):
+    """What is held of landmarks (M,): names, kinds by number, first columns, and rows of the clones they are anchored at."""
+
+    ids: np.ndarray
+    kind: np.ndarray
+    first: np.ndarray
+    clone: np.ndarray  #: −1 where they are not.
+
+
+class _Kind(NamedTuple):
+    """Landmarks of one kind, K of them, as rows of the table (K,)."""
+
+    landmark: Landmark
+    rows: np.ndarray
+    columns: np.ndarray  #: (K, D) of their means.
+    clones: np.ndarray  #: (K, d) columns of what they are anchored at; (K, 0) where they are not.
+    by_clone: np.ndarray  #: (K,) which clones these are.
 
 
 @final
 class JointMap(Map):
-    """Points, the frame's pose and a substate as one Gaussian; give the filter a `Consolidation` with it.
+    """Landmarks, the frame's pose and a substate as one Gaussian; give the filter a `Consolidation` with it.
 
+    It takes points, what is anchored at a pose, and any `Landmark` that overrides `seen_from`.
     The motion, and what is observed of landmarks, must not change when the whole world is moved, as it is with odometry and
     sensors on the robot. An observation of the state alone, as a position fix, is of its pose in the world. Landmarks are
     associated alike in all particles, all observations update state and landmarks, and what a likelihood other than the
@@ -98,9 +122,10 @@ class JointMap(Map):
         compiled: use the models' fused kernels where they have one.
 
     Attributes:
-        mean: (N, d + m + M D) of ξ, s and the landmarks.
-        cov: (d + m + M D, …), common to all particles.
+        mean: (N, n) of ξ, s, and the landmarks and clones as they came.
+        cov: (n, n), common to all particles.
         origin: (E,) G.
+        clones: (C, E) K of the clones.
     """
 
     evidence = False
@@ -114,6 +139,7 @@ class JointMap(Map):
         self.space = space
         self.compiled = compiled
         self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
+        self._kinds: list[Landmark] = [self.point]
         mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
@@ -129,7 +155,9 @@ class JointMap(Map):
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
-        self._places = dict[int, int]()
+        none = np.zeros(0, dtype=np.int64)
+        self.clones, self._clone_first = np.zeros((0, self.space.size)), none
+        self._hold(_Table(none, none, none, none))
         self._next_id = 0
         self._gain: np.ndarray | None = None
 
@@ -217,8 +245,14 @@ class JointMap(Map):
         total += _beyond_gaussian(rows, inside, chol, nu)
         slope = rows.by_marginal[inside] @ self.cov[rows.columns]
         half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        self.mean = self.mean + nu @ half
-        self.cov = gaussian.symmetrise(self.cov - half.T @ half)
+        moves, cov = nu @ half, gaussian.symmetrise(self.cov - half.T @ half)
+        fixed = rows.considered
+        if fixed.size:
+            # Their mean over the particles stays, and so does their covariance, Mathematics (considered).
+            moves[:, fixed] -= moves[:, fixed].mean(axis=0)
+            at = np.ix_(fixed, fixed)
+            cov[at] = self.cov[at] - _spread(moves[:, fixed], np.full(self.n, 1.0 / self.n))
+        self.mean, self.cov = self.mean + moves, cov
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
@@ -229,7 +263,7 @@ class JointMap(Map):
 
     def consolidate(self, particles: Particles) -> Particles:
         """Ends the window: the frame moves to the robot; what the particles differ by enters the common covariance."""
-        self.origin, mean, self.cov = self._consolidated(particles)
+        self.origin, self.clones, mean, self.cov = self._consolidated(particles)
         self.mean = np.repeat(mean[None], self.n, axis=0)
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
 
@@ -243,44 +277,62 @@ class JointMap(Map):
 
     def in_world(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
         """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`."""
-        origin, mean, cov = self._consolidated(particles)
+        origin, clones, mean, cov = self._consolidated(particles)
         d, dim = self.space.dim, self.point.dim
-        points, M = mean[self._first :].reshape(-1, dim), len(self._places)
-        # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
-        slope = np.concatenate([self._by_turn(points), np.broadcast_to(np.eye(dim), (M, dim, dim))], axis=-1)
-        own = self._first + np.arange(M * dim).reshape(M, dim)
-        columns = np.concatenate([np.broadcast_to(np.arange(d), (M, d)), own], axis=1)
-        blocks = cov[columns[:, :, None], columns[:, None, :]]
-        by_both = np.concatenate([slope, np.broadcast_to(np.eye(dim), (M, dim, dim))], axis=-1)
-        by_both = self.space.rotation(origin) @ by_both
-        covs = gaussian.symmetrise(by_both @ blocks @ np.swapaxes(by_both, -1, -2))
-        return self.space.transform(origin, points), covs
+        means, covs = np.empty((self._table.ids.size, dim)), np.empty((self._table.ids.size, dim, dim))
+        turn = self.space.rotation(origin)
+        for kind in self._by_kind():
+            points, slope = self._points(kind, mean, clones)
+            # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
+            by_frame = np.concatenate(
+                [self._by_turn(points), np.broadcast_to(np.eye(dim), (*points.shape, dim))], axis=-1
+            )
+            columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
+            blocks = _blocks(cov, np.concatenate(columns, axis=1))
+            by_all = turn @ np.concatenate([by_frame, slope], axis=-1)
+            means[kind.rows] = self.space.transform(origin, points)
+            covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
+        return means, covs
 
     def world(self, state: np.ndarray) -> np.ndarray:
         """World_from_robot (N, E) of the particles, without what is uncertain about each one's frame."""
         frame = self.space.retract(self.origin, self.mean[:, : self.space.dim])
         return self.space.compose(frame, state)
 
-    def _consolidated(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """World_from_frame, mean and covariance of the Gaussian in a frame at the robot, Mathematics (consolidation)."""
+    def _consolidated(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """World_from_frame, clones, mean and covariance in a frame at the robot, Mathematics (consolidation)."""
         space, weights, state = self.space, particles.weights, particles.state
-        d, dim, n = space.dim, self.point.dim, self.mean.shape[1]
+        d = space.dim
         world = self.world(state)
-        origin = space.mean(world, weights)
-        # Every particle's means as seen from its own robot.
-        points = self.mean[:, self._first :].reshape(self.n, -1, dim)
-        seen = space.inverse_transform(state[:, None], points).reshape(self.n, -1)
-        moved = np.concatenate([space.local(origin, world), self.mean[:, d : self._first], seen], axis=1)
+        origin, centre = space.mean(world, weights), space.mean(state, weights)
+        # Every particle's means as seen from its own robot, and T, by which the covariance turns with their mean.
+        before = weights @ self.mean
+        moved = self.mean.copy()
+        moved[:, :d] = space.local(origin, world)
+        slopes = [(np.arange(d), self._turn(particles))]
+        for kind in self._by_kind():
+            if not kind.landmark.anchored:
+                moved[:, kind.columns] = kind.landmark.seen_from(space, state[:, None], self.mean[:, kind.columns])[0]
+                slopes.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
+        clones = self.clones
+        if len(clones):
+            # Mathematics (clone), with K' what the mean of the particles sees.
+            at = self._clone_columns(np.arange(len(clones)))
+            clones = space.between(centre, space.retract(clones, before[at]))
+            moved[:, at] = space.local(clones, space.between(state[:, None], self._poses(self.mean, at, self.clones)))
         mean = weights @ moved
+        if len(clones):
+            slopes.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
         mean[:d] = 0.0  # the mean of all worlds is the origin
-        # The covariance that they had, turned with the mean: T P Tᵀ with T = diag(Ad J_r, I, Rᵀ, Rᵀ, …).
-        turn, back = self._turn(particles), space.rotation(space.mean(state, weights)).T
 
         def turned(rows: np.ndarray) -> np.ndarray:
-            seen = back @ rows[self._first :].reshape(-1, dim, n)
-            return np.concatenate([turn @ rows[:d], rows[d : self._first], seen.reshape(-1, n)])
+            out = rows.copy()
+            for columns, slope in slopes:
+                out[columns] = slope @ rows[columns]
+            return out
 
-        return origin, mean, gaussian.symmetrise(turned(turned(self.cov).T) + _spread(moved, weights))
+        cov = turned(turned(self.cov).T) + _spread(moved, weights)
+        return origin, clones, mean, gaussian.symmetrise(cov)
 
     def _turn(self, particles: Particles) -> np.ndarray:
         """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
@@ -308,17 +360,18 @@ class JointMap(Map):
         d, n = self.space.dim, mean.shape[1]
         nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
         by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
-        parts = list[_Group]()
+        considered, parts = [np.zeros(0, dtype=np.int64)], list[_Group]()
         for group in groups:
             model, z, noise, ids = group.model, group.z, group.cov, self._checked_ids(group)
             log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
-            at, landmarks, substate = state[:, None], None, None
-            columns = np.zeros((z.shape[0], 0), dtype=np.int64)
+            at, kind, landmarks, anchors, substate = state[:, None], None, None, None, None
             if ids is not None:
                 log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
                 z, noise, log_odds, ids = z[ids >= 0], noise[ids >= 0], log_odds[ids >= 0], ids[ids >= 0]
-                columns = self._columns(ids)
-                landmarks = mean[:, columns]
+                kind = self._kind_of(ids)
+                landmarks = mean[:, kind.columns]
+                if kind.landmark.anchored:
+                    anchors = self._poses(mean, kind.clones, self.clones[kind.by_clone])
             if Part.SUBSTATE in model.reads:
                 substate = mean[:, None, d : self._first]
             in_world = model.reads == frozenset({Part.STATE})
@@ -326,14 +379,22 @@ class JointMap(Map):
                 frame = self.space.retract(self.origin, mean[:, :d])
                 at = self.space.compose(frame, state)[:, None]
             if landmarks is None or substate is not None or not self.compiled:
-                nu, jac = linearise(model, self.space, z, at, landmarks, None, substate)
+                nu, jac = linearise(model, self.space, z, at, landmarks, anchors, substate)
             else:
-                nu, *found = linearised(model, self.space, z, state, landmarks, None, True)
+                nu, *found = linearised(model, self.space, z, state, landmarks, anchors, True)
                 jac = Jacobians(*found)
             count, p = z.shape
             block = np.zeros((count, p, n))
-            if jac.landmark is not None:
-                np.put_along_axis(block, np.repeat(columns[:, None], p, axis=1), jac.landmark.mean(axis=0), axis=2)
+            if kind is not None and jac.landmark is not None:
+                slope = jac.landmark.mean(axis=0)
+                np.put_along_axis(block, np.repeat(kind.columns[:, None], p, axis=1), slope, axis=2)
+                considered.append(kind.columns[kind.landmark.considered(slope, _blocks(cov, kind.columns))])
+            if kind is not None and anchors is not None and jac.state is not None:
+                # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
+                turn = self.space.adjoint(self.space.between(state[:, None], anchors))
+                turn = turn @ self.space.right_jacobian(mean[:, kind.clones])
+                by_clone = -(jac.state @ turn).mean(axis=0)
+                np.put_along_axis(block, np.repeat(kind.clones[:, None], p, axis=1), by_clone, axis=2)
             if jac.substate is not None:
                 block[..., d : self._first] = jac.substate.mean(axis=0)
             if in_world and jac.state is not None:
@@ -356,7 +417,7 @@ class JointMap(Map):
             rows = slice(end, end := end + noise.shape[0])
             innovation[rows, rows] += noise
         nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
-        return _Rows(nu, by_state, slope, used, innovation, parts, log_factor)
+        return _Rows(nu, by_state, slope, used, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
 
     def _checked_ids(self, group: Observations) -> np.ndarray | None:
         """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
@@ -373,39 +434,86 @@ class JointMap(Map):
             )
         return ids
 
-    def _columns(self, ids: np.ndarray) -> np.ndarray:
-        """Places (K, D) of landmarks in the means. Raises InputError: the map does not hold one of them."""
-        places = self._places
+    def _hold(self, table: _Table) -> None:
+        self._table = table
+        self._row_of = {landmark: row for row, landmark in enumerate(table.ids.tolist())}
+
+    def _rows_of(self, ids: np.ndarray) -> np.ndarray:
+        """Rows (K,) of landmarks in the table. Raises InputError: the map does not hold one of them."""
         try:
-            rows = np.array([places[landmark] for landmark in np.asarray(ids).tolist()], dtype=np.int64)
+            return np.array([self._row_of[landmark] for landmark in np.asarray(ids).tolist()], dtype=np.int64)
         except KeyError as error:
             raise InputError(f"the map holds no landmark {error.args[0]}") from error
-        return self._first + rows[:, None] * self.point.dim + np.arange(self.point.dim)
+
+    def _kind_of(self, ids: np.ndarray) -> _Kind:
+        """Landmarks (K,) of one kind, in their order. Raises InputError: the map does not hold one, or their kinds differ."""
+        rows = self._rows_of(ids)
+        kinds = np.unique(self._table.kind[rows])
+        if kinds.size > 1:
+            raise InputError("a joint map is asked for landmarks of one parametrisation at a time: see `landmark_of`")
+        return self._of_kind(int(kinds[0]) if kinds.size else 0, rows)
+
+    def _by_kind(self) -> list[_Kind]:
+        """All landmarks."""
+        numbers = np.unique(self._table.kind).tolist()
+        return [self._of_kind(number, np.flatnonzero(self._table.kind == number)) for number in numbers]
+
+    def _of_kind(self, number: int, rows: np.ndarray) -> _Kind:
+        landmark, clones = self._kinds[number], self._table.clone[rows]
+        columns = self._table.first[rows, None] + np.arange(landmark.dim)
+        at = self._clone_columns(clones) if landmark.anchored else np.zeros((rows.size, 0), dtype=np.int64)
+        return _Kind(landmark, rows, columns, at, clones)
+
+    def _clone_columns(self, clones: np.ndarray) -> np.ndarray:
+        """Columns (K, d) of clones (K,)."""
+        return self._clone_first[clones, None] + np.arange(self.space.dim)
+
+    def _poses(self, mean: np.ndarray, columns: np.ndarray, clones: np.ndarray) -> np.ndarray:
+        """Clones (…, K, E) in the frame, of means (…, n), by their columns (K, d) and origins (K, E)."""
+        return self.space.retract(clones, mean[..., columns])
+
+    def _points(self, kind: _Kind, mean: np.ndarray, clones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Landmarks as points (…, M, dim) in the frame, of means (…, n), and how they move by their columns and clones."""
+        landmark, space = kind.landmark, self.space
+        if not landmark.anchored:
+            return landmark.point(mean[..., kind.columns])
+        anchor = self._poses(mean, kind.clones, clones[kind.by_clone])
+        points, slope = landmark.point(mean[..., kind.columns], anchor)
+        # p = K Exp(δ) l: ∂p/∂δ = R [l's turn | I] J_r.
+        near = space.inverse_transform(anchor, points)
+        by_pose = np.concatenate([self._by_turn(near), np.broadcast_to(np.eye(self.point.dim), slope.shape)], axis=-1)
+        by_clone = space.rotation(anchor) @ by_pose @ space.right_jacobian(mean[..., kind.clones])
+        return points, np.concatenate([slope, by_clone], axis=-1)
 
     @property
     def ids(self) -> np.ndarray:
-        return np.array(list(self._places), dtype=np.int64)
+        return self._table.ids.copy()
 
     @property
     def stored_fraction(self) -> float:
-        size = len(self._places) * self.point.dim * (self.point.dim + 3) // 2
-        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * size, 1)
+        sizes = np.array([kind.dim * (kind.dim + 3) // 2 for kind in self._kinds])
+        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * int(sizes[self._table.kind].sum()), 1)
 
     def holds(self, ids: np.ndarray) -> np.ndarray:
-        return np.array([landmark in self._places for landmark in np.asarray(ids).tolist()], dtype=bool)
+        return np.array([landmark in self._row_of for landmark in np.asarray(ids).tolist()], dtype=bool)
 
     def landmark_of(self, landmark_id: int) -> Landmark:
-        self._columns(np.array([landmark_id]))
-        return self.point
+        return self._kinds[self._table.kind[self._rows_of(np.array([landmark_id]))[0]]]
 
     def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
-        return self.holds(ids) & self._is_point(landmark)
+        held, number = self.holds(ids), self._number(landmark)
+        held[held] = self._table.kind[self._rows_of(np.asarray(ids)[held])] == number
+        return held
 
     def read(self, ids: np.ndarray, particles: np.ndarray | slice = slice(None)) -> Records:
-        columns = self._columns(np.asarray(ids))
-        mean = self.mean[particles][:, columns]
-        blocks = self.cov[columns[:, :, None], columns[:, None, :]]
-        return Records(mean, np.broadcast_to(blocks, (*mean.shape, mean.shape[-1])))
+        """Means and covariances in the frame; of what is anchored those in the anchor's, whose clone is the constant."""
+        kind = self._kind_of(np.asarray(ids))
+        own = self.mean[particles]
+        mean, blocks = own[:, kind.columns], _blocks(self.cov, kind.columns)
+        const = None
+        if kind.landmark.anchored:
+            const = self._poses(own, kind.clones, self.clones[kind.by_clone])
+        return Records(mean, np.broadcast_to(blocks, (*mean.shape, mean.shape[-1])), const)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         if new_landmarks.mask is not None and not new_landmarks.mask.all():
@@ -416,41 +524,107 @@ class JointMap(Map):
     def add_records(
         self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> np.ndarray:
-        if log_odds is not None or not self._is_point(landmark):
-            raise InputError(
-                f"a joint map of {self.space} holds Point({self.point.dim}) in all particles, "
-                f"not {type(landmark).__name__}"
-            )
+        """As `Map.add_records`; the poses that the constants of anchored landmarks are become clones."""
+        if log_odds is not None:
+            raise InputError("a joint map's landmarks are in all particles")
+        self.register(landmark)
         if not (np.isfinite(records.mean).all() and np.isfinite(records.cov).all()):
             raise InputError("a new landmark has a mean or covariance that is not finite")
-        count, size = records.mean.shape[1], self.mean.shape[1]
+        count, size, dim, d = records.mean.shape[1], self.mean.shape[1], landmark.dim, self.space.dim
         ids = checked_new_ids(ids, count, self._next_id, self.holds)
-        if size + count * self.point.dim > LARGEST:
+        # Given the path, what is new owes its error to its own measurement alone, and a clone of the path has none.
+        mean = np.broadcast_to(records.mean, (self.n, count, dim)).reshape(self.n, -1)
+        clone, origins, places = np.full(count, -1), np.zeros((0, self.space.size)), np.zeros((self.n, 0, d))
+        if landmark.anchored:
+            assert records.const is not None
+            anchors = np.broadcast_to(records.const, (self.n, count, self.space.size))
+            _, which, clone = np.unique(anchors, axis=1, return_index=True, return_inverse=True)
+            clone = clone.reshape(-1)
+            origins = anchors[0, which]
+            places = self.space.local(origins, anchors[:, which])
+        grown = size + places.shape[1] * d + mean.shape[1]
+        if grown > LARGEST:
             most = (LARGEST - self._first) // self.point.dim
             raise InputError(
                 f"a joint map holds at most {most} landmarks: keep maps of the particles' own (map=particles)"
             )
-        # Given the path, what is new owes its error to its own measurement alone.
-        mean = np.broadcast_to(records.mean, (self.n, count, self.point.dim)).reshape(self.n, -1)
-        self.mean = np.concatenate([self.mean, mean], axis=1)
-        cov = np.zeros((self.mean.shape[1],) * 2)
+        self.mean = np.concatenate([self.mean, places.reshape(self.n, -1), mean], axis=1)
+        cov = np.zeros((grown, grown))
         cov[:size, :size] = self.cov
-        self._places |= {landmark: len(self._places) + k for k, landmark in enumerate(ids.tolist())}
-        self._next_id = max(self._next_id, int(ids.max(initial=-1)) + 1)
-        columns = self._columns(ids)
+        self._clone_first = np.append(self._clone_first, size + d * np.arange(len(origins)))
+        first = size + places.shape[1] * d + dim * np.arange(count)
+        columns = first[:, None] + np.arange(dim)
         cov[columns[:, :, None], columns[:, None, :]] = records.cov.mean(axis=0)
         self.cov = cov
+        clone = np.where(clone < 0, -1, clone + len(self.clones))
+        self.clones = np.concatenate([self.clones, origins])
+        new = _Table(ids, np.full(count, self._number(landmark)), first, clone)
+        self._hold(_Table(*(np.concatenate(pair) for pair in zip(self._table, new, strict=True))))
+        self._next_id = max(self._next_id, int(ids.max(initial=-1)) + 1)
         return ids
 
+    def register(self, landmark: Landmark) -> None:
+        """Names a parametrisation before it is first used, so that a checkpoint can be read back.
+
+        The filter that saves and the one that loads name the same ones in the same order. Raises InputError: it has
+        components, constants that are no anchor, or does not say how it moves with the frame.
+        """
+        if self._number(landmark) >= 0:
+            return
+        space, anchor = self.space, self.space.identity() if landmark.anchored else None
+        fits = landmark.components == 1 and landmark.constants == (0 if anchor is None else space.size)
+        if not fits or landmark.point(np.zeros(landmark.dim), anchor)[0].shape != (self.point.dim,):
+            raise InputError(
+                f"a joint map of {space} holds Point({self.point.dim}), or what is anchored at a pose, in all particles, "
+                f"not {type(landmark).__name__}"
+            )
+        landmark.seen_from(space, space.identity(), np.zeros(landmark.dim))
+        self._kinds.append(landmark)
+
+    def _number(self, landmark: Landmark) -> int:
+        """Of a parametrisation; −1 for one that the map does not know."""
+        for number, held in enumerate(self._kinds):
+            if type(held) is type(landmark) and vars(held) == vars(landmark):
+                return number
+        return -1
+
     def remove(self, ids: np.ndarray) -> None:
-        gone = self._columns(ids).ravel()
-        self.mean = np.delete(self.mean, gone, axis=1)
-        self.cov = np.delete(np.delete(self.cov, gone, axis=0), gone, axis=1)
-        kept = [landmark for landmark in self._places if landmark not in set(np.asarray(ids).tolist())]
-        self._places = {landmark: row for row, landmark in enumerate(kept)}
+        rows = self._rows_of(ids)
+        gone = [kind.columns[np.isin(kind.rows, rows)].ravel() for kind in self._by_kind()]
+        self._hold(_Table(*(np.delete(column, rows) for column in self._table)))
+        self._drop(gone)
+
+    def _drop(self, gone: list[np.ndarray]) -> None:
+        """Removes columns, and clones at which nothing is anchored any more."""
+        used = np.isin(np.arange(len(self.clones)), self._table.clone)
+        kept = np.ones(self.mean.shape[1], dtype=bool)
+        kept[np.concatenate([*gone, self._clone_columns(np.flatnonzero(~used)).ravel()])] = False
+        self.mean, self.cov = self.mean[:, kept], self.cov[np.ix_(kept, kept)]
+        place, number = np.cumsum(kept) - 1, np.append(np.cumsum(used) - 1, -1)
+        self.clones, self._clone_first = self.clones[used], place[self._clone_first[used]]
+        table = self._table
+        self._hold(table._replace(first=place[table.first], clone=number[table.clone]))
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
-        raise InputError("a joint map's landmarks are single Gaussian points already")
+        """Turns anchored landmarks into points of the frame, to first order: with all that they are correlated with."""
+        ids = np.asarray(ids, dtype=np.int64)
+        if not ids.size:
+            return
+        kind = self._kind_of(ids)
+        if not kind.landmark.anchored or self._number(to or self.point) != 0 or kind.landmark.dim != self.point.dim:
+            raise InputError(f"a joint map turns what is anchored into Point({self.point.dim})")
+        points, slopes = self._points(kind, self.mean, self.clones)
+        slope, columns = slopes.mean(axis=0), np.concatenate([kind.columns, kind.clones], axis=1)
+        # P' = T P Tᵀ, where T has the slope in the rows of each landmark.
+        for _ in range(2):
+            self.cov[kind.columns] = slope @ self.cov[columns]
+            self.cov = self.cov.T
+        self.cov = gaussian.symmetrise(self.cov)
+        self.mean[:, kind.columns] = points
+        kinds, clones = self._table.kind.copy(), self._table.clone.copy()
+        kinds[kind.rows], clones[kind.rows] = 0, -1
+        self._hold(self._table._replace(kind=kinds, clone=clones))
+        self._drop([])
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         return np.zeros((self.n, ids.size))
@@ -462,7 +636,8 @@ class JointMap(Map):
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
         records = self.read(ids, slice(particle, particle + 1))
-        nu, jac = linearise(model, self.space, z, state[None], records.mean[0])
+        const = None if records.const is None else records.const[0]
+        nu, jac = linearise(model, self.space, z, state[None], records.mean[0], const)
         return nu, jac, records
 
     def predictions(
@@ -475,35 +650,44 @@ class JointMap(Map):
         return projected(model, self.read(ids), belief)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "ids": self.ids}
-        return {f"joint/{name}": array for name, array in named.items()} | {"joint/next": np.array([self._next_id])}
+        named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}
+        named |= {"clones": self.clones, "clone_first": self._clone_first, **self._table._asdict()}
+        return {f"joint/{name}": array for name, array in named.items()}
 
     def options(self) -> dict[str, object]:
-        return {"joint substate": self._first - self.space.dim}
+        kinds = [type(kind).__name__ for kind in self._kinds]
+        return {"joint substate": self._first - self.space.dim, "joint kinds": kinds}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        found = checkpoint.read(arrays, _NAMED, "joint/")
-        ids, self._next_id = found["ids"], int(found["next"][0])
-        if np.unique(ids).size < ids.size or ids.max(initial=-1) >= self._next_id:
-            raise InputError("the array joint/ids names a landmark twice, or one that was never started")
-        self._places = {landmark: row for row, landmark in enumerate(ids.tolist())}
-        size = self._first + ids.size * self.point.dim
-        held = {
-            "mean": checkpoint.numbers("n", "size"),
-            "cov": checkpoint.numbers("size", "size"),
+        rows, kinds = checkpoint.integers("landmarks", least=0), len(self._kinds)
+        schema = {
+            "ids": rows, "first": rows, "kind": checkpoint.integers("landmarks", least=0, below=kinds),
+            "clones": checkpoint.elements(self.space, "clones"), "clone_first": checkpoint.integers("clones", least=0),
+            "clone": checkpoint.integers("landmarks", least=-1, below="clones"), "next": checkpoint.integers(1, least=0),
+            "mean": checkpoint.numbers("n", "size"), "cov": checkpoint.numbers("size", "size"),
             "origin": checkpoint.elements(self.space),
-        }
-        self.mean, self.cov, self.origin = checkpoint.read(arrays, held, "joint/", n=self.n, size=size).values()
+        }  # fmt: skip
+        found = checkpoint.read(arrays, schema, "joint/", n=self.n)
+        table, self._next_id = _Table(*(found[name] for name in _Table._fields)), int(found["next"][0])
+        if np.unique(table.ids).size < table.ids.size or table.ids.max(initial=-1) >= self._next_id:
+            raise InputError("the array joint/ids names a landmark twice, or one that was never started")
+        anchored = np.array([kind.anchored for kind in self._kinds])[table.kind]
+        if ((table.clone >= 0) != anchored).any():
+            raise InputError("the array joint/clone does not fit the landmarks' kinds")
+        self._hold(table)
+        self.mean, self.cov, self.origin = found["mean"], found["cov"], found["origin"]
+        self.clones, self._clone_first = found["clones"], found["clone_first"]
+        own = [kind.columns.ravel() for kind in self._by_kind()]
+        own.append(self._clone_columns(np.arange(len(self.clones))).ravel())
+        if not np.array_equal(np.sort(np.concatenate(own)), np.arange(self._first, self.mean.shape[1])):
+            raise InputError("the arrays joint/first and joint/clone_first do not share the columns of joint/mean out")
 
     def _by_turn(self, points: np.ndarray) -> np.ndarray:
         """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""
         if isinstance(self.space, SE3Group):
             return -skew(points)
-        columns = np.stack([-points[:, 1:2], points[:, :1]], axis=1)
-        return columns if isinstance(self.space, SE2Group) else columns[..., :0]
-
-    def _is_point(self, landmark: Landmark) -> bool:
-        return isinstance(landmark, Point) and landmark.dim == self.point.dim
+        columns = np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
+        return columns if isinstance(self.space, SE2Group) else np.zeros((*points.shape, 0))
 
 
 def _log_det(chol: np.ndarray) -> float:
@@ -512,7 +696,7 @@ def _log_det(chol: np.ndarray) -> float:
 
 
 def _blocks(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The blocks (K, p, p) on the diagonal that belong to rows (K, p)."""
+    """The blocks (K, p, p) on the diagonal that belong to rows and columns (K, p)."""
     return matrix[rows[:, :, None], rows[:, None, :]]
 
 

@@ -5,7 +5,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.models import Landmark, Records
+from rbpf.core.models import Landmark, Records, RigidSpace
 from rbpf.lie import SE2Group, SE3Group
 
 
@@ -19,10 +19,19 @@ class Point(Landmark):
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         return np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
 
+    def point(self, mean: np.ndarray, const: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        return mean, np.broadcast_to(np.eye(self.dim), (*mean.shape, self.dim))
+
+    def seen_from(self, space: RigidSpace, pose: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """R(pose)ᵀ (p − t)."""
+        return space.inverse_transform(pose, mean), np.swapaxes(space.rotation(pose), -1, -2)
+
 
 @final
 class AnchoredPoint(Landmark):
     """A point in the frame of an anchor in SE2 or SE3, which is the record's constant: world_from_anchor (E,)."""
+
+    anchored = True
 
     def __init__(self, space: SE2Group | SE3Group) -> None:
         self.space = space

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -24,7 +24,7 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.particles import Information, Particles, Prior, Proposed
 from rbpf.errors import InputError
 from rbpf.kernels.signature import ObservationKernel
-from rbpf.lie import LieGroup
+from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 
 STEP = float(np.finfo(float).eps) ** (1 / 3)
 """Step of central differences, where truncation and rounding errors balance."""
@@ -34,6 +34,8 @@ Control = TypeVar("Control", contravariant=True)
 Frame = TypeVar("Frame", contravariant=True)
 """What a sensor takes, as an image."""
 
+RigidSpace = SE2Group | SE3Group | Euclidean
+"""Poses that points are seen from; of Euclidean(n), places."""
 States = Float[np.ndarray, "*#batch E"]
 Means = Float[np.ndarray, "*#batch D"] | None
 Constants = Float[np.ndarray, "*#batch A"] | None
@@ -224,12 +226,39 @@ class Landmark(ABC):
     dim: int
     constants: int = 0
     components: int = 1
+    anchored: bool = False
+    """Whether the estimate is in a frame of its own, world_from_anchor (E,), which its constants are; else in the world."""
 
     @abstractmethod
     def homogeneous(
         self, mean: Float[np.ndarray, "*#batch D"], const: Float[np.ndarray, "*#batch A"] | None = None
     ) -> Float[np.ndarray, "*batch h"]:
         """World point of (…, D) and (…, A): (…, 4), (…, 3) in the plane; its last entry may be 0, at infinity."""
+
+    def point(
+        self, mean: Float[np.ndarray, "*#batch D"], const: Float[np.ndarray, "*#batch A"] | None = None
+    ) -> tuple[Float[np.ndarray, "*batch w"], Float[np.ndarray, "*batch w D"]]:
+        """World point (…, 3), (…, 2) in the plane, and its derivative (…, 3, D) by the mean; by default a numeric one."""
+        at, steps = partial(self._dehomogenised, const=const), STEP * np.eye(self.dim)
+        return at(mean), np.stack([(at(mean + step) - at(mean - step)) / (2 * STEP) for step in steps], axis=-1)
+
+    def seen_from(
+        self, space: RigidSpace, pose: States, mean: Float[np.ndarray, "*#batch D"]
+    ) -> tuple[Float[np.ndarray, "*batch D"], Float[np.ndarray, "*#batch D D"]]:
+        """The mean (…, D) in the frame of a pose (…, E), and its derivative (…, D, D); asked by a map whose frame moves.
+
+        What is anchored stays as it is in its anchor's frame. Raises InputError: the parametrisation does not say it.
+        """
+        if not self.anchored:
+            raise InputError(f"{type(self).__name__} does not say how it moves with the frame: override seen_from")
+        return mean, np.eye(self.dim)
+
+    def considered(self, slope: Float[np.ndarray, "K p D"], cov: Float[np.ndarray, "K D D"]) -> Bool[np.ndarray, "K D"]:
+        """Coordinates that a measurement of these slopes should count with, but not change (S. Schmidt 1966); by default none.
+
+        Asked by a map that holds landmarks jointly, of K landmarks of covariances (K, D, D).
+        """
+        return np.zeros((len(slope), self.dim), dtype=bool)
 
     def ready(self, records: Records) -> Bool[np.ndarray, "N K"]:
         """Whether an estimate is Gaussian enough to be promoted, (N, K) bool; by default never."""
@@ -244,11 +273,8 @@ class Landmark(ABC):
         if const is not None and self.components > 1:
             const = const[:, :, None, :]
 
-        def point(mean: np.ndarray) -> np.ndarray:
-            world = self.homogeneous(mean, const)
-            return world[..., :-1] / world[..., -1:]
-
-        mean, cov = gaussian.unscented_transform(point, records.mean, records.cov)
+        at = partial(self._dehomogenised, const=const)
+        mean, cov = gaussian.unscented_transform(at, records.mean, records.cov)
         if records.log_weights is None:
             return Records(mean, cov)
         weights = np.exp(records.log_weights)[..., None]
@@ -256,6 +282,10 @@ class Landmark(ABC):
         spread = mean - centre[:, :, None]
         total = (weights[..., None] * (cov + spread[..., :, None] * spread[..., None, :])).sum(axis=2)
         return Records(centre, total)
+
+    def _dehomogenised(self, mean: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+        world = self.homogeneous(mean, const)
+        return world[..., :-1] / world[..., -1:]
 
 
 class Likelihood(ABC):

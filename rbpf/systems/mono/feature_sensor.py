@@ -31,9 +31,6 @@ WIDENED = 3.0
 """Times the standard deviation that the prior of depth has, which a young ray's image is given along its line on top: the
 same prior comes again in every frame, so that in a frame it counts a tenth."""
 
-MIN_RHO = 0.02
-"""Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m."""
-
 _STATE, _MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
 _BOTH = _STATE | _MAP
 
@@ -75,9 +72,10 @@ class UnknownDepth(ABC):
         Their last entry is not below `min_weight`; 0 is at infinity.
         """
 
-    @abstractmethod
     def as_points(self, records: Records) -> Records:
-        """The features as Gaussian world points (N, K, 3), however roughly, for reports."""
+        """The features as Gaussian world points (N, K, 3), to first order, for reports."""
+        points, slope = self.landmark.point(records.mean, records.const)
+        return Records(points, gaussian.symmetrise(slope @ records.cov @ np.swapaxes(slope, -1, -2)))
 
 
 @final
@@ -164,19 +162,6 @@ class InverseDepthRays(UnknownDepth):
         spread = sigmas * np.sqrt(records.cov[..., 2, 2])
         mean[..., 2] = np.maximum(mean[..., 2] + np.stack([spread, -spread], axis=-1), min_weight)
         return self.landmark.homogeneous(mean, records.const[..., None, :])
-
-    def as_points(self, records: Records) -> Records:
-        """To first order in (u, v, ρ), with ρ kept away from 0."""
-        assert records.const is not None
-        u, v, q = np.moveaxis(records.mean, -1, 0)
-        q = np.maximum(q, MIN_RHO)
-        direction = np.stack([u, v, np.ones_like(q)], axis=-1)
-        jac = np.zeros((*q.shape, 3, 3))
-        jac[..., 0, 0] = jac[..., 1, 1] = 1.0 / q
-        jac[..., :, 2] = -direction / np.square(q)[..., None]
-        turned = SE3.matrix(records.const)[..., :3, :3] @ jac
-        cov = gaussian.symmetrise(turned @ records.cov @ np.swapaxes(turned, -1, -2))
-        return Records(SE3.transform(records.const, direction / q[..., None]), cov)
 
 
 @final

@@ -16,13 +16,14 @@ from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.inverse_depth import MIN_RHO
 from rbpf.sensors.calibration import spread_rows
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
 from rbpf.sensors.feature_log import KnownPoints
 from rbpf.systems.anchoring import Anchored
 from rbpf.systems.map_estimate import MapEstimate, mixture_moments, relative_points
-from rbpf.systems.mono.feature_sensor import MIN_RHO, FeatureSensor
+from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import PATCH_PX, FeatureTable
 from rbpf.systems.system import Gauge
 

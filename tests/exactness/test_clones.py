@@ -1,0 +1,306 @@
+"""Landmarks anchored at clones of the path in a joint map: linear worlds have exact answers, curved ones numeric ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.core.filter import Filter
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Landmark, Observations, Records
+from rbpf.core.particles import Particles
+from rbpf.core.resampling import Consolidation
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.joint_map import JointMap
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point
+from rbpf.motion.odometry import OdometryMotion
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import CameraPoint, CameraRay
+from rbpf.sensors.range_bearing import RelativePosition
+from tests.exactness.models import Frame, Kalman, Scripted
+from tests.exactness.slam import ALONG, NOISE, STEP, TURNED, Q, turned
+from tests.exactness.test_joint_map import assert_same, told
+
+CAMERA = Pinhole(640, 480, 400.0, 380.0, 319.5, 239.5)
+
+
+class FromAnchor(RelativePosition):
+    """Where a landmark in its anchor's frame is seen; one is started where it is seen, with the robot as its anchor."""
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return super().predict(state, SE2.transform(const, landmark))
+
+    def jacobians(self, state, landmark=None, const=None, substate=None):
+        return None
+
+    def initialise(self, state, z, cov):
+        n, k = len(state), len(z)
+        anchor = np.broadcast_to(state[:, None], (n, k, 3))
+        return Records(np.broadcast_to(z, (n, k, 2)), np.broadcast_to(cov, (n, k, 2, 2)), anchor)
+
+    def kernel(self):
+        return None
+
+
+class Careful(Landmark):
+    """An `AnchoredPoint` in the plane whose second coordinate measurements do not change."""
+
+    dim, constants, anchored = 2, 3, True
+
+    def homogeneous(self, mean, const=None):
+        return AnchoredPoint(SE2).homogeneous(mean, const)
+
+    def considered(self, slope, cov):
+        return np.tile([False, True], (len(slope), 1))
+
+
+def filtered(world, landmark: Landmark) -> Filter:
+    """A robot of known heading among anchored landmarks, consolidated in every step."""
+    options = {"n": 12, "start": TURNED, "lag": 1, "consolidation": Consolidation(1), "rng": np.random.default_rng(0)}
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), JointMap(SE2), **options)
+    for frame in world.frames(FromAnchor(SE2)):
+        born = [replace(new, landmark=landmark) for new in frame.new_landmarks]
+        filter_.step(replace(frame, new_landmarks=born), ALONG)
+    return filter_
+
+
+def test_anchored_at_clones_it_is_the_kalman_filter():
+    world = turned()
+    filter_ = filtered(world, AnchoredPoint(SE2))
+    assert_same(filter_, world.kalman)
+    assert len(filter_.belief().map.clones) == 2  # two landmarks are new in the first step, one in the third
+
+
+def test_what_is_considered_is_as_schmidt_has_it():
+    """The dense filter of (position, clone, landmark, clone, landmark …) whose gain leaves second coordinates out."""
+    world, turn, at = turned(), SE2.rotation(TURNED), dict[int, int]()
+    kalman = Kalman(TURNED[1:], np.zeros((2, 2)))
+    for seen, z in world.measured:
+        size = len(kalman.mean)
+        motion = np.zeros((size, size))
+        motion[:2, :2] = turn @ Q @ turn.T
+        kalman.predict(np.eye(size), motion, np.append(turn @ STEP, np.zeros(size - 2)))
+        old = [k for k, landmark in enumerate(seen) if landmark in at]
+        if old:
+            H = np.zeros((2 * len(old), size))
+            for row, k in enumerate(old):
+                first = at[seen[k]]
+                H[2 * row : 2 * row + 2, :2] = -turn.T
+                H[2 * row : 2 * row + 2, first - 2 : first + 2] = np.hstack([turn.T, np.eye(2)])
+            noise = np.kron(np.eye(len(old)), NOISE)
+            S = H @ kalman.cov @ H.T + noise
+            nu = z[old].ravel() - H @ kalman.mean
+            kalman.log_evidence -= 0.5 * (nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(2 * np.pi * S)[1])
+            gain = kalman.cov @ H.T @ np.linalg.inv(S)
+            gain[[at[seen[k]] + 1 for k in old]] = 0.0
+            closed = np.eye(size) - gain @ H
+            kalman.mean = kalman.mean + gain @ nu
+            kalman.cov = closed @ kalman.cov @ closed.T + gain @ noise @ gain.T
+        for k, landmark in enumerate(seen):
+            if landmark not in at:
+                kalman.augment(np.zeros(2), np.eye(2, len(kalman.mean)), np.zeros((2, 2)))
+                at[landmark] = len(kalman.mean)
+                kalman.augment(z[k], np.zeros((2, len(kalman.mean))), NOISE)
+    # In the world a landmark is its clone + turn · (its mean).
+    T = np.zeros((8, len(kalman.mean)))
+    T[:2, :2] = np.eye(2)
+    for landmark, first in at.items():
+        T[2 + 2 * landmark : 4 + 2 * landmark, first - 2 : first + 2] = np.hstack([np.eye(2), turn])
+    world_told = Kalman(T @ kalman.mean, T @ kalman.cov @ T.T, kalman.log_evidence)
+    assert_same(filtered(world, Careful()), world_told)
+    assert not np.allclose(world_told.mean, world.kalman.mean, atol=1e-3)
+
+
+def rays(n: int, spread: float = 0.02, seed: int = 4) -> tuple[JointMap, Particles]:
+    """In the middle of a window, everything correlated: three points, four rays at one clone, two at another."""
+    rng = np.random.default_rng(seed)
+    joint = JointMap(SE3)
+    joint.begin(n, Lineage(n))
+    points = rng.normal(size=(3, 3)) + [0.0, 0.0, 4.0] + spread * rng.normal(size=(n, 3, 3))
+    joint.add_records(Records(points, np.broadcast_to(np.eye(3), (n, 3, 3, 3))), Point(3), ids=np.array([5, 2, 9]))
+    for first, count in ((20, 4), (10, 2)):
+        anchor = SE3.retract(SE3.exp(0.2 * rng.normal(size=6)), spread * rng.normal(size=(n, 6)))
+        mean = 0.3 * rng.normal(size=(count, 3)) + [0.0, 0.0, 0.7] + spread * rng.normal(size=(n, count, 3))
+        mean[..., 2] = np.maximum(mean[..., 2], 0.3)
+        const = np.broadcast_to(anchor[:, None], (n, count, 7))
+        records = Records(mean, np.broadcast_to(np.eye(3), (n, count, 3, 3)), const)
+        joint.add_records(records, InverseDepth(), ids=first + np.arange(count))
+    d = joint.mean.shape[1]
+    joint.mean[:, :6] = spread * rng.normal(size=(n, 6))
+    joint.mean[:, joint.mean[0] == 0.0] = spread * rng.normal(size=(n, 1))
+    root = spread * rng.normal(size=(d, d)) / np.sqrt(d)
+    joint.cov, joint.origin = root @ root.T, SE3.exp(rng.normal(size=6))
+    state = SE3.retract(SE3.exp(0.2 * rng.normal(size=6)), spread * rng.normal(size=(n, 6)))
+    weights = rng.uniform(0.5, 1.5, n)
+    return joint, Particles(state, np.log(weights / weights.sum()))
+
+
+def numeric(function, mean: np.ndarray, step: float = 1e-6) -> np.ndarray:
+    steps = step * np.eye(mean.size)
+    return np.array([function(mean + e) - function(mean - e) for e in steps]).T / (2 * step)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
+    """By everything held, and by the state."""
+    joint, particles = rays(1)
+    joint.compiled = compiled
+    ids = np.array([11, 20, 23])
+    z, cov = np.zeros((3, 2)), np.repeat(np.eye(2)[None], 3, axis=0)
+    groups = [
+        Observations(z, cov, CameraRay(CAMERA), ids=ids),
+        Observations(z[:2], cov[:2], CameraPoint(CAMERA), ids=np.array([9, 5])),
+    ]
+
+    def measured(mean: np.ndarray, state: np.ndarray = particles.state) -> np.ndarray:
+        return -joint._rows(state, mean[None], joint.cov, groups).nu[0]
+
+    rows = joint._rows(particles.state, joint.mean, joint.cov, groups)
+    by_mean = np.zeros((10, joint.mean.shape[1]))
+    by_mean[:, rows.columns] = rows.by_marginal
+    np.testing.assert_allclose(by_mean, numeric(measured, joint.mean[0]), atol=1e-4)
+    by_state = numeric(lambda xi: measured(joint.mean[0], SE3.retract(particles.state, xi)), np.zeros(6))
+    np.testing.assert_allclose(rows.by_state[0], by_state, atol=1e-4)
+
+
+def test_what_is_told_of_rays_is_the_gaussian_carried_over():
+    joint, particles = rays(1)
+
+    def carried(mean: np.ndarray) -> np.ndarray:
+        frame = SE3.retract(joint.origin, mean[:6])
+        points, start = [], 15  # ξ, three points, then a clone with its rays, and another
+        for clone, count in zip(joint.clones, (4, 2), strict=True):
+            anchor = SE3.compose(frame, SE3.retract(clone, mean[start : start + 6]))
+            b = mean[start + 6 : start + 6 + 3 * count].reshape(-1, 3)
+            points.append(SE3.transform(anchor, np.append(b[:, :2], np.ones((count, 1)), axis=1) / b[:, 2:]))
+            start += 6 + 3 * count
+        return np.concatenate([SE3.transform(frame, mean[6:15].reshape(-1, 3)), *points]).ravel()
+
+    points, covs = joint.in_world(particles)
+    np.testing.assert_allclose(points.ravel(), carried(joint.mean[0]), atol=1e-11)
+    jac = numeric(carried, joint.mean[0])
+    cov = jac @ joint.cov @ jac.T
+    for k, own in enumerate(covs):
+        np.testing.assert_allclose(own, cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-5, atol=1e-7)
+
+
+def test_consolidation_keeps_the_moments_of_draws():
+    """Of the mixture before, draw by draw seen from the robot: pose, points, clones and rays in one Gaussian."""
+    joint, particles = rays(60, spread=0.01)
+    rng, count = np.random.default_rng(1), 40000
+    which = rng.choice(60, count, p=particles.weights)
+    drawn = joint.mean[which] + rng.multivariate_normal(np.zeros(len(joint.cov)), joint.cov, count)
+    origin, clones, state = joint.origin, joint.clones, particles.state[which]
+    joint.consolidate(particles)
+    expected = drawn.copy()
+    world = SE3.compose(SE3.retract(origin, drawn[:, :6]), state)
+    expected[:, :6] = SE3.local(joint.origin, world)
+    expected[:, 6:15] = SE3.inverse_transform(state[:, None], drawn[:, 6:15].reshape(-1, 3, 3)).reshape(-1, 9)
+    for k, first in enumerate((15, 33)):
+        at = slice(first, first + 6)
+        expected[:, at] = SE3.local(joint.clones[k], SE3.between(state, SE3.retract(clones[k], drawn[:, at])))
+    sigma = np.sqrt(np.diag(joint.cov))
+    offset = (expected.mean(axis=0) - joint.mean[0]) / sigma
+    assert np.abs(offset).max() < 0.03
+    relative = (np.cov(expected.T) - joint.cov) / np.outer(sigma, sigma)
+    # Spread over 60 particles is 1/(1 − ΣW²) larger than that of draws from them.
+    assert np.abs(relative).max() < 0.05
+    assert (joint.mean == joint.mean[0]).all() and np.abs(joint.mean[:, 15:21]).max() < 1e-3
+
+
+def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
+    joint, particles = rays(1)
+    before, cov, mean = joint.in_world(particles), joint.cov.copy(), joint.mean[0].copy()
+    joint.promote(np.array([11]))
+    for first, second in zip(before, joint.in_world(particles), strict=True):
+        np.testing.assert_allclose(second, first, rtol=1e-9)
+    assert joint.are(joint.ids, Point(3)).tolist() == [True] * 3 + [False] * 4 + [False, True]
+    # Rows of the point: those of the clone and the ray, by numeric slopes.
+    clone = joint.clones[1]
+
+    def point(x: np.ndarray) -> np.ndarray:
+        return SE3.transform(SE3.retract(clone, x[:6]), np.append(x[6:8], 1.0) / x[8])
+
+    own = np.r_[33:39, 42:45]
+    rows = numeric(point, mean[own]) @ cov[own]
+    np.testing.assert_allclose(joint.cov[42:45, :42], rows[:, :42], rtol=1e-5, atol=1e-8)
+    joint.remove(np.array([10, 20]))  # the last ray of the second clone: the clone goes, too
+    np.testing.assert_array_equal(joint.ids, [5, 2, 9, 21, 22, 23, 11])
+    assert len(joint.clones) == 1 and joint.mean.shape[1] == 6 + 3 * 7 + 6
+    for whole, rest in zip(before, joint.in_world(particles), strict=True):
+        np.testing.assert_allclose(whole[[0, 1, 2, 4, 5, 6, 8]], rest, rtol=1e-9)
+
+
+def test_depth_without_parallax_is_considered():
+    joint, _ = rays(5)
+    ids, z = np.array([20, 21]), np.full((2, 2), 300.0)
+    joint._kinds[1] = InverseDepth(0.1, least_parallax=1e9)
+    state = SE3.retract(
+        joint._poses(joint.mean, joint._clone_columns(np.array([0])), joint.clones)[:, 0], np.full(6, 0.01)
+    )
+    depth = joint._kind_of(ids).columns[:, 2]
+    before = joint.mean.copy(), joint.cov.copy()
+    joint.correct(
+        state, np.zeros((5, 6)), [Observations(z, np.repeat(np.eye(2)[None], 2, axis=0), CameraRay(CAMERA), ids=ids)]
+    )
+    np.testing.assert_allclose(joint.mean[:, depth].mean(axis=0), before[0][:, depth].mean(axis=0), rtol=1e-12)
+    spread = np.cov((joint.mean - before[0])[:, depth].T)
+    np.testing.assert_allclose(joint.cov[np.ix_(depth, depth)] + spread, before[1][np.ix_(depth, depth)], rtol=1e-9)
+    assert np.trace(joint.cov) < np.trace(before[1])
+
+
+def test_a_checkpoint_with_clones(tmp_path):
+    frames = turned().frames(FromAnchor(SE2))
+    ends = []
+    for resumed in (False, True):
+        filter_ = filtered_part(frames, 2)
+        if resumed:
+            filter_.save(tmp_path / "half.npz")
+            filter_ = filtered_part(frames, 0)
+            filter_.load(tmp_path / "half.npz")
+        for frame in frames[2:]:
+            filter_.step(frame, ALONG)
+        ends.append((*told(filter_)[1], filter_.belief().map.mean))
+    for first, second in zip(*ends, strict=True):
+        assert first.tobytes() == second.tobytes()
+    joint = filter_.belief().map
+    arrays = joint.arrays()
+    for name, wrong in (("clone", arrays["joint/clone"] * 0 - 1), ("first", arrays["joint/first"] + 1)):
+        with pytest.raises(InputError, match=name):
+            joint.restore(arrays | {f"joint/{name}": wrong})
+
+
+def filtered_part(frames, count: int) -> Filter:
+    """As `filtered`, in the middle of a window; the kinds are named beforehand."""
+    joint = JointMap(SE2)
+    joint.register(AnchoredPoint(SE2))
+    options = {"n": 12, "start": TURNED, "lag": 1, "consolidation": Consolidation(3), "rng": np.random.default_rng(0)}
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), joint, **options)
+    for k, frame in enumerate(frames):
+        born = [replace(new, landmark=AnchoredPoint(SE2)) for new in frame.new_landmarks]
+        frames[k] = Frame(frame.groups, born)
+        if k < count:
+            filter_.step(frames[k], ALONG)
+    return filter_
+
+
+def test_kinds_that_a_joint_map_does_not_hold():
+    class Mute(Landmark):
+        dim = 2
+
+        def homogeneous(self, mean, const=None):
+            return Point(2).homogeneous(mean)
+
+    joint, _ = rays(2)
+    one = Records(np.zeros((2, 1, 3)), np.zeros((2, 1, 3, 3)))
+    for landmark in (MixturePoint(2, 3), Point(2), AnchoredPoint(SE2)):
+        with pytest.raises(InputError, match="anchored at a pose"):
+            joint.add_records(one, landmark)
+    with pytest.raises(InputError, match="override seen_from"):
+        JointMap(SE2).register(Mute())
+    with pytest.raises(InputError, match="one parametrisation at a time"):
+        joint.read(np.array([5, 20]))
+    with pytest.raises(InputError, match=r"into Point\(3\)"):
+        joint.promote(np.array([5]))
