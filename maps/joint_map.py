@@ -294,9 +294,9 @@ class JointMap(Map):
             covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
         return means, covs
 
-    def world(self, state: np.ndarray) -> np.ndarray:
-        """World_from_robot (N, E) of the particles, without what is uncertain about each one's frame."""
-        frame = self.space.retract(self.origin, self.mean[:, : self.space.dim])
+    def world(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """World_from_robot (n, E) of some particles, without what is uncertain about each one's frame."""
+        frame = self.space.retract(self.origin, self.mean[particles, : self.space.dim])
         return self.space.compose(frame, state)
 
     def _consolidated(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -429,6 +429,10 @@ class Map(Conditional):
     def stored_fraction(self) -> float:
         """Memory of the records, as a fraction of what separate copies for all particles would take."""
 
+    def world(self, state: States, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> States:
+        """World_from_robot (n, E) of states (n, E) of some particles; by default landmarks and states are in the world."""
+        return state
+
     @abstractmethod
     def holds(self, ids: Ids) -> Bool[np.ndarray, " K"]:
         """Which of some ids (K,) are those of landmarks held, (K,) bool."""

@@ -223,7 +223,7 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
 
     def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
         self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
-        self.landmarks: NamedLandmarks = NamedLandmarks(rig, config.likelihood.build())
+        self.landmarks: NamedLandmarks = NamedLandmarks(rig, config.map, config.likelihood.build())
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[NamedPixels], str]:
         pixels = NamedPixels(frame.z, frame.cov_z, frame.landmarks)

@@ -48,8 +48,8 @@ SIGMAS = 3.0
 
 _PLACES = {"place": numbers("landmarks", 3), "seen_from": numbers("landmarks", 3)}
 _NAMES = {
-    "filtered": integers("filtered", least=0, ascending=True, refers=MAP_IDS),
-    "proven": integers("proven", least=0, ascending=True, refers=MAP_IDS),
+    "held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
+    "observations": integers("landmarks", least=1),
 }
 
 
@@ -173,6 +173,17 @@ class Landmarks(Sensor, ABC, Generic[F]):
         """The inverse of `arrays`."""
 
 
+def surplus(held: np.ndarray, observations: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
+    """Landmarks that a joint map drops so that at most so many are left: of those not seen now, the least often seen.
+
+    To drop a landmark is to marginalise it: what is left stays exactly as uncertain as it is, and a place whose landmarks
+    were all dropped is a new one. Landmarks (M,), how often each was seen (M,), and those seen now (k,).
+    """
+    rows = np.flatnonzero(~np.isin(held, seen))
+    rows = rows[np.argsort(observations[rows], kind="stable")]
+    return held[rows[: max(held.size - most, 0)]]
+
+
 def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
     """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
 
@@ -220,7 +231,7 @@ class ParticleSubsample:
         rows = np.minimum(np.searchsorted(np.cumsum(weights), steps), weights.size - 1)
         rows = np.append(rows, belief.mode)
         prior = belief.prior.take(rows)
-        state = prior.predicted()
+        state = belief.map.world(prior.predicted(), rows)
         middle = SE3.mean(state[:-1], np.full(rows.size - 1, 1.0 / (rows.size - 1)))
         turns = SE3.local(middle, state[:-1])[:, :3]
         spread = prior.spread(prior.mean)[-1, :3]
@@ -358,6 +369,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         features = frame.features
         self.ids = self.associate(frame, belief) if frame.landmarks is None else frame.landmarks
         known = self.ids >= 0
+        if self.config.kind == "joint":
+            self.seconds = time.perf_counter() - started
+            return [Observations(features.z[known], features.cov[known], self.model, None, self.ids[known])]
         weighs = known
         if self.config.weigh != "all":
             # With this observation they are seen often enough.
@@ -383,13 +397,20 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         known = self.ids >= 0
         seen = self.ids[known]
         dropped = self.manager.observe(seen)
+        if self.config.kind == "joint":
+            more = surplus(self.manager.names, self.manager.observations, seen, self.config.active)
+            self.manager.remove(more)
+            dropped = np.concatenate([dropped, more])
         if dropped.size:
             belief.map.remove(dropped)
             self.store.remove(dropped)
             self.places.remove(dropped)
-        pose = belief.state[belief.mode]
+        # Places are in the world, the particles' states and landmarks perhaps not.
+        mode = belief.state[belief.mode]
+        pose = belief.map.world(mode[None], np.array([belief.mode]))[0]
         if seen.size:
-            self.places.put(seen, world_points(self.landmark, belief.read_mode(seen))[0], pose)
+            place = world_points(self.landmark, belief.read_mode(seen))[0]
+            self.places.put(seen, SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
         if frame.uncertain:
             return []
         # Those whose depth is known well enough for a Gaussian in space, and which the manager chooses.
@@ -522,11 +543,13 @@ def world_points(landmark: Landmark, records: Records) -> np.ndarray:
 class NamedLandmarks(Landmarks[NamedPixels]):
     """Landmarks by the names that the recording gives them: known association."""
 
-    def __init__(self, rig: RectifiedStereo, likelihood: Likelihood) -> None:
-        self.rig, self.model, self.landmark = rig, StereoPoint(rig), Point(3)
+    def __init__(self, rig: RectifiedStereo, config: MapConfig, likelihood: Likelihood) -> None:
+        self.rig, self.config, self.model, self.landmark = rig, config, StereoPoint(rig), Point(3)
         self.ids = np.zeros(0, dtype=np.int64)
-        self._sensor = NamedLandmarkSensor(self.model, self.landmark, likelihood)
-        self._observed = self._observed_again = np.zeros(0, dtype=np.int64)
+        joint = config.kind == "joint"
+        self._sensor = NamedLandmarkSensor(self.model, self.landmark, None if joint else likelihood)
+        # (M,) landmarks of the map, ascending, and how often each was seen.
+        self._held, self._observations = np.zeros((2, 0), dtype=np.int64)
 
     def observe(self, frame: View[NamedPixels], belief: Belief) -> Sequence[Observations]:
         self.ids = np.where(frame.free, frame.features.names, NULL)
@@ -535,18 +558,28 @@ class NamedLandmarks(Landmarks[NamedPixels]):
     def new_landmarks(
         self, frame: View[NamedPixels], belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        names = frame.features.names[frame.free]
-        self._observed_again = np.union1d(self._observed_again, np.intersect1d(self._observed, names))
-        self._observed = np.union1d(self._observed, names)
-        return self._sensor.new_landmarks(_free(frame), belief, observed)
+        names = np.unique(frame.features.names[frame.free])
+        self._observations[np.isin(self._held, names)] += 1
+        started = self._sensor.new_landmarks(_free(frame), belief, observed)
+        held = np.union1d(self._held, names)
+        observations = np.ones(held.size, dtype=np.int64)
+        observations[np.searchsorted(held, self._held)] = self._observations
+        if self.config.kind == "joint":
+            dropped = surplus(held, observations, names, self.config.active)
+            if dropped.size:
+                belief.map.remove(dropped)
+            kept = ~np.isin(held, dropped)
+            held, observations = held[kept], observations[kept]
+        self._held, self._observations = held, observations
+        return started
 
     def associate(self, view: View[NamedPixels], belief: Belief) -> np.ndarray:
         """By their names; where the view is uncertain, only those that were observed more than once."""
-        known = self._observed_again if view.uncertain else self._observed
+        known = self.seen_again() if view.uncertain else self._held
         return np.where(view.free & np.isin(view.features.names, known), view.features.names, NULL)
 
     def seen_again(self) -> np.ndarray:
-        return self._observed_again
+        return self._held[self._observations >= SEEN_AGAIN]
 
     def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return belief.project(self.model, ids)
@@ -555,10 +588,10 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         return np.full(self.ids.size, FeatureKind.LANDMARK)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {"names/filtered": self._observed, "names/proven": self._observed_again}
+        return {"names/held": self._held, "names/observations": self._observations}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._observed, self._observed_again = read(arrays, _NAMES, "names/").values()
+        self._held, self._observations = read(arrays, _NAMES, "names/").values()
 
 
 def _free(view: View[NamedPixels]) -> Any:

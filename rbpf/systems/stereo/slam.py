@@ -17,8 +17,10 @@ from rbpf.core.checkpoint import integers, numbers, poses, read, truths
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NULL, Landmark, Part, Proposal
 from rbpf.core.particles import Estimate
+from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
 from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry, pixel_gains
@@ -131,24 +133,28 @@ class StereoSlam(System):
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
-        refined = config.proposal.kind == "ekf" and config.map.weigh == "all"
-        if config.odometry.role == "proposal" and not refined:
+        self.joint = JointMap(SE3, compiled=config.compiled) if config.map.kind == "joint" else None
+        self._once = self.joint is not None or config.odometry.role == "proposal"
+        self._proposal = replace(config.proposal, kind="ekf") if self.joint else config.proposal
+        refined = self.joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
+        if self._once and not refined:
             raise InputError(
                 "odometry.role=proposal needs proposal.kind=ekf and map.weigh=all: the motion is then known by the landmarks "
                 "alone, candidates among them"
             )
-        landmark_map = LandmarkMap(SE3, compiled=config.compiled)
+        own = LandmarkMap(SE3, compiled=config.compiled)
         self.front_end = self._front_ends[0]
-        landmark_map.register(self.front_end.landmarks.landmark)
+        own.register(self.front_end.landmarks.landmark)
         self.filter = Filter(
             OdometryMotion(SE3, added, free),
             self.front_end.landmarks,
-            landmark_map,
-            config.proposal.build(),
+            self.joint or own,
+            self._proposal.build(),
             config.resampling.build(),
             config.particles,
             np.random.default_rng(config.seed),
-            lag=self.lag,
+            lag=1 if self.joint else self.lag,
+            consolidation=Consolidation(config.map.window, config.resampling.ess_threshold) if self.joint else None,
         )
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
@@ -224,11 +230,12 @@ class StereoSlam(System):
             if control is not None:
                 begun = time.perf_counter()
                 proposal = config.recovery.proposal.build() if uncertain else None
-                if config.odometry.role == "proposal" and self.filter.steps and not uncertain:
+                if self._once and self.filter.steps and not uncertain:
                     view, control, proposal = self._proposed(view, control)
                 report = self.filter.step(view, control if self.filter.steps else None, pair.stamp_ns, proposal)
                 self.reckoning, self._last_update = at.updated(), self.frames
-                self.at_update = Estimate(report.estimate.mean, report.estimate.cov)
+                found = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
+                self.at_update = Estimate(found.mean, found.cov)
                 seconds_filter = time.perf_counter() - begun - landmarks.seconds
         updated = report is not None
 
@@ -276,12 +283,15 @@ class StereoSlam(System):
 
     def map(self) -> MapEstimate:
         """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
-        found = estimate_map(self.filter)
+        if self.joint is None:
+            found = estimate_map(self.filter)
+        else:
+            found = MapEstimate(self.joint.ids, *self.joint.in_world(self.filter.particles))
         return replace(found, columns=self.front_end.landmarks.columns(found.ids))
 
     def particle_poses(self) -> np.ndarray:
         """(N, 7) world_from_camera of the particles at the last pair: between updates the odometry moves them."""
-        return SE3.compose(self.filter.particles.state, self.since_update)
+        return SE3.compose(self.filter.belief().map.world(self.filter.particles.state), self.since_update)
 
     def measurements(self, name: str, log: Recorded) -> FeatureLog:
         """Every pixel that odometry or map used, once, as tracks; of pixels with names all of them."""
@@ -429,7 +439,7 @@ class StereoSlam(System):
             return view, moved, None
         dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
         prior = self._constrained(self.visual_odometry.prior.increment(self.reckoning.velocity_at_update, dt))
-        return view, prior, self.config.proposal.build(SE3.local(prior.delta, moved.delta))
+        return view, prior, self._proposal.build(SE3.local(prior.delta, moved.delta))
 
     def _log_support(self, pair: Pair[Any], found: CandidateMotions) -> np.ndarray:
         """What the map says (M + 1,) of each candidate, and of the prior alone."""
