@@ -25,7 +25,9 @@ from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features, filter_robot_log
+from rbpf.runs.run import Run
 from rbpf.runs.truth import truth_at
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import RobotLog
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate
@@ -127,20 +129,24 @@ class DeskTrial:
     def __call__(self, seed: int) -> Trial:
         """Simulates and filters."""
         log = simulate_features(self.world, self.measuring, MONO, seed)
-        assert log.truth is not None
-        done = filter_features(log, replace(self.config, seed=seed))
-        path, true = done.log, log.truth.world_from_camera
-        errors = whitened_errors(SE3, path.poses, path.covs, true)
-        return Trial(
-            6,
-            np.linalg.norm(SE3.translation(path.poses) - SE3.translation(true), axis=1),
-            np.where(errors.ranks > 0, errors.nees, np.nan),
-            path["nis"],
-            path["nis_dof"],
-            _landmark_nees(done.system.map().points(), log.truth.landmarks),
-            3,
-            *_genealogy(done.system.filter),
-        )
+        return camera_trial(log, filter_features(log, replace(self.config, seed=seed)))
+
+
+def camera_trial(log: FeatureLog, done: Run) -> Trial:
+    """A filtered log whose truth begins where its run does."""
+    truth, path = done.truth, done.log
+    assert truth is not None
+    errors = whitened_errors(SE3, path.poses, path.covs, truth.poses)
+    return Trial(
+        6,
+        np.linalg.norm(SE3.translation(path.poses) - SE3.translation(truth.poses), axis=1),
+        np.where(errors.ranks > 0, errors.nees, np.nan),
+        path["nis"],
+        path["nis_dof"],
+        _landmark_nees(done.system.map().points(), truth.landmarks),
+        3,
+        *_genealogy(done.system.filter),
+    )
 
 
 def _landmark_nees(found: MapEstimate, truth: dict[int, np.ndarray]) -> np.ndarray:

@@ -3,25 +3,32 @@
 Simulated: a robot drives its loops among landmarks in the plane, and every filter sees the same logs. NEES per degree of
 freedom is 1 for an honest filter; a loop's error persists, so that one run is hardly more than one sample of it: what counts
 is the mean over the runs beside the EKF's, with its standard error. Recorded: logs with a truth, several seeds of the filter.
+Two cameras go round a room twice, beside the batch of the same pixels: landmarks are known, each pixel counts once.
 """
 
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from examples.studies.consistency_runs import Consistency, RobotTrial, Trial, run_trials
+from examples.studies.consistency_runs import Consistency, Mean, RobotTrial, Trial, camera_trial, run_trials
 from examples.studies.joint_ekf import joint_ekf
+from examples.studies.parallel import in_parallel
+from examples.studies.point_worlds import STEREO, Measuring, RoomWorld, simulate_features
+from rbpf.lie import SE3
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_robot_log
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers import RobotLog, open_log
-from rbpf.systems.filtering import LikelihoodConfig
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.metrics.scores import score_estimate
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
@@ -122,6 +129,71 @@ def recorded(folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]) -
     return rows
 
 
+_EVERY_PAIR = StereoConfig(trigger=TriggerConfig(0.0, 0.0), likelihood=LikelihoodConfig("gaussian"))
+STEREO_FILTERS = {
+    "joint, 50 particles": replace(_EVERY_PAIR, particles=50, map=MapConfig(kind="joint")),
+    "particles, 400": replace(
+        _EVERY_PAIR, proposal=ProposalConfig(), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
+    ),
+}
+"""Of the same likelihood, and with each pixel once."""
+
+
+class RoomRun(NamedTuple):
+    """One filter in one room; root mean square errors in metres, not aligned."""
+
+    trial: Trial
+    map_error: float
+    batch_path_error: float
+    batch_map_error: float
+    milliseconds: float  #: per pair.
+
+
+@dataclass(frozen=True)
+class RoomTrial:
+    """Stereo SLAM on the pixels of a room, 15 points of 0.5 px in a pair, and their batch; call it with a seed."""
+
+    world: RoomWorld
+    config: StereoConfig
+
+    def __call__(self, seed: int) -> RoomRun:
+        """Simulates, filters, and solves for the optimum."""
+        measuring = Measuring(
+            noise_px=0.5, measurements=15, known=0, new_per_frame=15, nearest_m=0.5, farthest_m=7.0, dropout=0.0,
+            turnover=0.0, occlusion=False,
+        )  # fmt: skip
+        log = simulate_features(self.world, measuring, STEREO, seed)
+        begun = time.process_time()
+        done = filter_features(log, replace(self.config, seed=seed))
+        seconds, truth = time.process_time() - begun, done.truth
+        assert truth is not None
+        batch = solve_features(log, CameraEstimate(done.log.poses, {}), marginals=False)
+        path = SE3.between(batch.world_from_camera[0], batch.world_from_camera)
+        off = np.linalg.norm(SE3.translation(path) - SE3.translation(truth.poses), axis=1)
+        maps = [
+            [np.linalg.norm(point - truth.landmarks[name]) for name, point in landmarks.items()]
+            for landmarks in (done.system.map().named(), batch.landmarks)
+        ]
+        ours, theirs, batch_path = (float(np.sqrt(np.square(errors).mean())) for errors in (*maps, off))
+        return RoomRun(camera_trial(log, done), ours, batch_path, theirs, 1e3 * seconds / len(log.frames))
+
+
+def rooms(world: RoomWorld, runs: int, workers: int) -> list[list[str | int | float]]:
+    """A line per filter: means over the runs."""
+    rows = list[list[str | int | float]]()
+    for name, config in STEREO_FILTERS.items():
+        found = in_parallel(RoomTrial(world, config), range(runs), workers)
+        consistency = Consistency([run.trial for run in found])
+        inside, ratio = consistency.coverage(0.95), Mean.of([run.map_error / run.batch_map_error for run in found])
+        rows.append([
+            name, runs, consistency.pose_nees.value, consistency.pose_nees.error, 100.0 * inside.value,
+            100.0 * inside.error, consistency.landmark_nees.value, consistency.position_rmse.value,
+            float(np.mean([run.batch_path_error for run in found])), float(np.mean([run.map_error for run in found])),
+            ratio.value, ratio.error, min(run.milliseconds for run in found),
+        ])  # fmt: skip
+    return rows
+
+
 def draw(found: dict[str, Consistency], out: Path) -> None:
     """The mean NEES over time, of all filters."""
     figure = Figure(figsize=(9.0, 5.0), layout="constrained")
@@ -144,26 +216,43 @@ def main(
     windows: tuple[int, ...] = (1, 5),
     recordings: Path | None = None,
     seeds: int = 3,
+    room_runs: int = 10,
+    frames: int = 600,
     workers: int = 1,
     out: Path = Path("demo/joint_map"),
     quick: bool = False,
 ) -> dict[str, float]:
-    """Prints the tables, with the mean NEES of every filter's poses as the result.
+    """Prints the tables, with the mean NEES of every filter's poses as the result, and how its map errs beside the batch's.
 
     Args:
-        runs: simulated logs, seeds 0, 1, ….
+        runs: simulated logs of a robot, seeds 0, 1, …; none by 0.
         steps: of each.
         particles: numbers of them.
         windows: of the joint map.
         recordings: folder of the recorded logs; None leaves them out.
         seeds: of the filter on each recording, 0, 1, ….
+        room_runs: two cameras in a room, seeds 0, 1, …; none by 0.
+        frames: of each.
         workers: processes.
         out: folder for picture and tables.
         quick: one short log and few particles.
     """
     if quick:
-        runs, steps, particles, windows = 2, 120, (20,), (1,)
+        runs, steps, particles, windows, room_runs, frames = 2, 120, (20,), (1,), 1, 60
     out.mkdir(parents=True, exist_ok=True)
+    results = dict[str, float]()
+    if room_runs:
+        header = [
+            "filter", "runs", "NEES / d", "± s.e.", "in 95 % [%]", "± s.e.", "landmarks", "path [m]", "batch",
+            "map [m]", "beside the batch", "± s.e.", "ms per pair",
+        ]  # fmt: skip
+        in_rooms = rooms(RoomWorld(frames=frames, laps=frames / 300), room_runs, workers)
+        write_table(out / "joint_map_stereo.csv", header, in_rooms)
+        results = {
+            f"stereo {row[0]}: {what}": float(row[at]) for row in in_rooms for at, what in ((2, "NEES"), (10, "map"))
+        }
+    if not runs:
+        return results
     found = simulated(loops(steps), runs, particles, windows, workers)
     rows = rows_of("0.3° per step", found)
     if not quick:
@@ -183,7 +272,7 @@ def main(
         write_table(out / "joint_map_recordings.csv", header, recorded(recordings, seeds, configs))
     draw(found, out)
     print(f"picture and tables in {out}")
-    return {str(row[1]): float(row[3]) for row in rows if row[0] == "0.3° per step"}
+    return results | {str(row[1]): float(row[3]) for row in rows if row[0] == "0.3° per step"}
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
-from rbpf.validation.simulation.paths import HandHeld, frame_seconds, frame_stamps
+from rbpf.validation.simulation.paths import HandHeld, frame_seconds, frame_stamps, looking
 
 SURFACE = 1e-6
 """Fraction of the line of sight that may lie in a block: a point on a block's face is seen from the front."""
@@ -192,6 +192,36 @@ class LabWorld(Ranged):
         stamps = frame_stamps(int(images[-1]) + 1, RATE_HZ)[images]
         present = np.tile([0, len(images)], (self.points, 1))
         return Scene("lab", stamps, path, points, present, blocks)
+
+
+@dataclass(frozen=True)
+class RoomWorld(Ranged):
+    """Points on the walls of an empty room, 9 m wide, in which a camera goes round in a circle.
+
+    Attributes:
+        frames: number of images.
+        laps: rounds, of 16 m.
+        rate_hz: images per second.
+        points: number of points.
+    """
+
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 600
+    laps: Positive = 2.0
+    rate_hz: Positive = 10.0
+    points: Count = 260
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws the points, at most 0.8 m before a wall; the camera looks ahead and to the outside."""
+        turn = np.pi / 2.0 * rng.integers(0, 4, self.points)
+        out, along = 4.5 - rng.uniform(0.0, 0.8, self.points), rng.uniform(-4.5, 4.5, self.points)
+        cos, sin, up = np.cos(turn), np.sin(turn), rng.uniform(-1.5, 1.5, self.points)
+        points = np.stack([cos * out - sin * along, sin * out + cos * along, up], axis=-1)
+        angle = 2.0 * np.pi * self.laps * np.arange(self.frames) / self.frames
+        place = np.stack([2.5 * np.cos(angle), 2.5 * np.sin(angle), 0.15 * np.sin(3.0 * angle)], axis=-1)
+        ahead = np.stack([np.cos(angle + np.pi / 4), np.sin(angle + np.pi / 4), 0.1 * np.sin(5.0 * angle)], axis=-1)
+        path, stamps = looking(place, ahead), frame_stamps(self.frames, self.rate_hz)
+        present, blocks = np.tile([0, self.frames], (self.points, 1)), np.zeros((0, 2, 3))
+        return Scene("room", stamps, path, points, present, blocks)
 
 
 COLUMNS, ROWS = 5, 4

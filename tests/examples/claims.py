@@ -87,6 +87,8 @@ def gps_fix(figures: dict[str, float]) -> None:
 def joint_map(figures: dict[str, float]) -> None:
     assert 0.6 < figures["joint, 20 particles, window 1"] < 1.6
     assert figures["joint, 20 particles, window 1"] < 1.25 * figures["joint EKF"]
+    assert 0.3 < figures["stereo joint, 50 particles: NEES"] < 2.0
+    assert 0.8 < figures["stereo joint, 50 particles: map"] < 1.25
 
 
 def lab_images(figures: dict[str, dict[str, float]]) -> None:

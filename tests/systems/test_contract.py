@@ -16,7 +16,7 @@ from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
-from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import LAG, System, TrackingState
 from tests.core.worlds import content, same
@@ -33,8 +33,8 @@ def mono(points=None, **options) -> System:
     return MonoSlam(CAMERA, MonoConfig(particles=5, **options), points)
 
 
-def stereo() -> System:
-    return StereoSlam(pairs(1).rig, StereoConfig(particles=60))
+def stereo(**options) -> System:
+    return StereoSlam(pairs(1).rig, StereoConfig(particles=60, **options))
 
 
 def blinking(t, image):
@@ -75,6 +75,9 @@ RESUMED = {
     ),
     "pairs": Case(
         stereo, lambda: list(pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames()), (0, 5, 6, 9)
+    ),
+    "pairs, joint map": Case(
+        lambda: stereo(map=MapConfig(kind="joint", active=30)), lambda: list(pairs(12).frames()), (0, 5, 7)
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
 }

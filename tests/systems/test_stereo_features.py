@@ -103,19 +103,39 @@ def test_halves_of_the_landmarks(log):
 
 
 def test_nees_of_the_pose(log):
-    """Per degree of freedom, 12 recordings of 20 pairs: where each pixel counts once it is 1, in S05 1.4 and more."""
+    """Per degree of freedom, 12 recordings of 20 pairs: where each pixel counts once it is 1, in S05 1.4 and more.
+
+    With a joint map 50 particles are enough.
+    """
     density = replace(StereoConfig().likelihood, kind="outliers")
     twice = replace(CONFIG, likelihood=density)
     once = replace(
         twice, proposal=ProposalConfig("ekf"), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
     )
+    joint = replace(CONFIG, particles=50, map=MapConfig(kind="joint"))
     nees = []
-    for config in (once, twice):
+    for config in (once, twice, joint):
         runs = [filtered(simulated(20, seed), config) for seed in range(12)]
         whitened = [whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]) for run in runs]
         nees.append(np.mean([one.nees.mean() for one in whitened]) / 6)
     assert 0.75 < nees[0] < 1.25  # 1.03 with a standard error of 0.09
     assert nees[1] > 1.2 * nees[0]
+    assert 0.75 < nees[2] < 1.25
+
+
+def test_a_joint_map_keeps_what_was_seen_most(log):
+    """Of so many landmarks, and those in the last pair; what is dropped leaves the rest as it is, and is new if seen again."""
+    config = replace(CONFIG, particles=50, map=MapConfig(kind="joint", active=60))
+    run = filtered(log, config)
+    held, last = run.system.map().ids, log.frames[-1].landmarks
+    assert 60 <= held.size <= 60 + last.size and np.isin(last, held).all()
+    times = {
+        name: sum(name in frame.landmarks for frame in log.frames) for frame in log.frames for name in frame.landmarks
+    }
+    gone = [times[name] for name in times if name not in held]
+    assert np.median(gone) < np.median([times[name] for name in held.tolist()])
+    nees = whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]).nees
+    assert nees.mean() < 12.0
 
 
 def test_the_odometry_as_proposal_needs_landmarks_that_weigh(log):
