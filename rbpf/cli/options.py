@@ -208,6 +208,16 @@ class LogOptions(Printed):
     unnamed: Flag = False  #: the log does not say which landmark was observed.
 
 
+@dataclass(frozen=True, kw_only=True)
+class CorridorOptions(Printed):
+    """Options of `rbpf simulate laser`."""
+
+    out: Path  #: folder for the log robot.clf, the path truth.tum, and robot.relations.
+    seed: Seed = 0  #: of the random generator.
+    scans: Annotated[int, Range(ge=2, le=MOST)] = 400  #: number of scans.
+    laps: Annotated[int, Range(ge=1, le=1000)] = 2  #: number of rounds.
+
+
 def given(options: object, *names: str) -> dict[str, object]:
     """Those of some options that were given."""
     values = {name: getattr(options, name) for name in names}

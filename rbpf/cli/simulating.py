@@ -7,7 +7,7 @@ import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
-from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, given_board
+from rbpf.cli.options import CorridorOptions, ImagesOptions, LabOptions, LogOptions, given_board
 from rbpf.cli.showing import answer, megabytes, progress
 from rbpf.errors import InputError
 
@@ -28,6 +28,15 @@ def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")
     world = RobotWorld(options.steps, options.landmarks, options.spatial, unnamed=options.unnamed)
     simulate_robot(world, options.out, options.seed)
     answer({"out": str(options.out), "steps": options.steps}, options.json, f"wrote {options.out}")
+
+
+@SIMULATE.add("laser")
+def simulate_laser_log(options: Annotated[CorridorOptions, tyro.conf.arg(name="")]) -> None:
+    """A log of a robot with a laser scanner that drives round a corridor, with ground truth."""
+    from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
+
+    simulate_laser(LaserWorld(options.scans, options.laps), options.out, options.seed)
+    answer({"out": str(options.out), "scans": options.scans}, options.json, f"wrote {options.out}")
 
 
 @SIMULATE.add("desk")

@@ -26,6 +26,7 @@ from tests.sensors.board_pictures import CAMERA, FISHEYE, pictures
 
 SHORTER = {
     ("simulate", "range-bearing"): ["--steps", "20", "--landmarks", "20"],
+    ("simulate", "laser"): ["--scans", "20", "--laps", "1"],
     ("simulate", "desk"): ["--frames", "8", "--width", "480", "--height", "360"],
     ("simulate", "room"): ["--frames", "4", "--width", "160", "--height", "120"],
     ("simulate", "lab"): ["--frames", "3", "--width", "160", "--height", "120", "--texel-m", "0.02"],

@@ -16,6 +16,7 @@ from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab
+from rbpf.validation.simulation.laser import LaserWorld
 from rbpf.validation.simulation.paths import HandHeld, WheelOdometer
 from rbpf.validation.simulation.robot import RobotWorld
 from rbpf.validation.simulation.textured_scene import ImageWorld, Rectangle
@@ -39,6 +40,7 @@ def sheet(**wrong: Any) -> Rectangle:
         (LabDrive, {"trajectory": "walk"}, "trajectory must be 'tour' or 'turn_back', got 'walk'"),
         (LabDrive, {"frames": 4001}, "has 4000 images"),
         (WheelOdometer, {"inequality": 0.6}, "inequality must be above -0.5 and below 0.5"),
+        (LaserWorld, {"dropouts": 1.0}, "dropouts must be at least 0 and below 1, got 1.0"),
         (RobotWorld, {"std_range_m": 0.0}, "std_range_m must be above 0"),
         (Imaging, {"blackout": (0,)}, "blackout names frame 0"),
         (sheet, {"corner": np.array([0.0, np.nan, 0.0])}, "finite"),
