@@ -22,7 +22,7 @@ def refine_stage(run: Run) -> Callable[[], None]:
 
     def stage() -> None:
         transition = filter_.motion.transition(filter_.particles.state, frame.control, 1.0)
-        prior = filter_.marginals.predict(transition, filter_.space)
+        prior = filter_.marginals.predict(transition, filter_.space, 1.0)
         groups = filter_.sensors[0].observe(frame, filter_.belief())
         proposed = refined(prior, filter_.marginals.information(prior.predicted(), groups, prior))
         reweight(filter_.particles.log_weights, proposed.log_w1, "benchmark")

@@ -161,12 +161,12 @@ class JointMap(Map):
         self._next_id = 0
         self._gain: np.ndarray | None = None
 
-    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+    def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior | None:
         """Joint distribution of the increment ε and all that is held, kept as (ξ, s, l) | ε; without a substate as it is."""
         coupling, dynamics, drift = transition.coupling, transition.dynamics, transition.drift
         d, m = space.dim, self._first - space.dim
         if not m:
-            return Map.predict(self, transition, space)
+            return None
         sizes = [None if block is None else block.shape[1:] for block in (coupling, dynamics, drift)]
         if coupling is None or dynamics is None or drift is None or sizes != [(d, m), (m, m), (m,)]:
             raise InputError(

@@ -42,10 +42,14 @@ class LandmarkMap(Map):
         evidence: keep per particle the log-odds that each landmark exists (unknown association needs it); a
             landmark may then be present in some particles only.
         compiled: use the models' fused kernels where they have one.
+        part: its name, another one than Part.LANDMARK where it stands beside a second map.
     """
 
-    def __init__(self, space: LieGroup, evidence: bool = False, compiled: bool = True) -> None:
+    def __init__(
+        self, space: LieGroup, evidence: bool = False, compiled: bool = True, part: Part = Part.LANDMARK
+    ) -> None:
         self.space = space
+        self.supplies = part
         self.evidence = evidence
         self.compiled = compiled
         self.layouts: list[Layout] = []

@@ -14,6 +14,8 @@ from .core.models import FusedKernel as FusedKernel
 from .core.models import Jacobians as Jacobians
 from .core.models import Landmark as Landmark
 from .core.models import Likelihood as Likelihood
+from .core.models import LikelihoodSensor as LikelihoodSensor
+from .core.models import LogDensities as LogDensities
 from .core.models import MotionModel as MotionModel
 from .core.models import NewLandmarks as NewLandmarks
 from .core.models import ObservationModel as ObservationModel

@@ -6,7 +6,17 @@ from typing import Protocol, final
 import numpy as np
 
 from rbpf.core.likelihoods import ExistenceModel, Gates, associate
-from rbpf.core.models import NEW, Belief, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
+from rbpf.core.models import (
+    NEW,
+    Belief,
+    Landmark,
+    Likelihood,
+    NewLandmarks,
+    ObservationModel,
+    Observations,
+    Part,
+    Sensor,
+)
 from rbpf.errors import InputError
 
 
@@ -27,9 +37,16 @@ class NamedLandmarkSensor(Sensor):
     contradicts the first is begun anew with it: either may be the wrong one.
     """
 
-    def __init__(self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None) -> None:
+    def __init__(
+        self,
+        model: ObservationModel,
+        landmark: Landmark,
+        likelihood: Likelihood | None = None,
+        part: Part = Part.LANDMARK,
+    ) -> None:
         self.model = model
         self.landmark = landmark
+        self.part = part
         self.likelihood = likelihood
         self.observed_once: set[int] = set()
         """Landmarks that were observed once, by a likelihood that rejects outliers."""
@@ -87,9 +104,11 @@ class AnonymousLandmarkSensor(Sensor):
         gates: Gates,
         existence: ExistenceModel | None = None,
         likelihood: Likelihood | None = None,
+        part: Part = Part.LANDMARK,
     ) -> None:
         self.model = model
         self.landmark = landmark
+        self.part = part
         self.gates = gates
         self.existence = existence or ExistenceModel()
         self.likelihood = likelihood

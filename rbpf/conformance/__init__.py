@@ -4,12 +4,21 @@ Every check calls the model as the filter does, on random arguments or on those 
 the answer with what `rbpf.core.models` promises: shapes, numeric derivatives, the compiled twin, round trips.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from rbpf.conformance.models import groups_of, landmark_checks, likelihood_checks, motion_checks, sensor_checks
+from rbpf.conformance.models import (
+    conditional_checks,
+    groups_of,
+    landmark_checks,
+    likelihood_checks,
+    motion_checks,
+    sensor_checks,
+)
 from rbpf.conformance.observation import observation_checks
 from rbpf.conformance.trial import Example, Scene, run
-from rbpf.core.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
+from rbpf.core.models import Conditional, Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
@@ -19,13 +28,13 @@ __all__ = ["Example", "check_model", "require_sound"]
 def check_model(
     model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
 ) -> list[str]:
-    """What is wrong with a MotionModel, ObservationModel, Landmark, Likelihood or Sensor.
+    """What is wrong with a MotionModel, ObservationModel, Landmark, Likelihood, Sensor or Conditional.
 
     Args:
-        model: an object of a class derived from one of these.
+        model: an object of a class derived from one of these. A Conditional begins anew.
         space: group of the state; by default `model.space`.
         rng: draws the arguments; by default always the same ones.
-        example: arguments that replace random ones; a Sensor needs its frame and belief.
+        example: arguments that replace random ones; a Sensor needs its frame and belief, a Conditional its groups.
 
     Returns one sentence per finding, none for a sound model: class, method, what was expected and found. Raises InputError:
     the object is of none of these classes, or cannot be tried without more than was given.
@@ -33,21 +42,12 @@ def check_model(
     rng, example = rng or np.random.default_rng(0), example or Example()
     space = space or getattr(model, "space", None)
     if isinstance(model, Sensor):
-        found = run(sensor_checks(model, example))
-        if found or example.belief is None:
-            return found
-        # Of a sound sensor, the models and likelihoods of what it observes.
-        observed: dict[str, None] = {}
-        for group in groups_of(model, example):
-            for part in (group.model, group.likelihood):
-                if part is not None:
-                    findings = check_model(part, example.belief.prior.space, rng, example)
-                    observed.update(dict.fromkeys(findings))
-        return list(observed)
+        return sensor_findings(model, rng, example)
     name = type(model).__name__
-    if not isinstance(model, MotionModel | ObservationModel | Landmark | Likelihood):
+    if not isinstance(model, MotionModel | ObservationModel | Landmark | Likelihood | Conditional):
         raise InputError(
-            f"check_model tries a MotionModel, ObservationModel, Landmark, Likelihood or Sensor; a {name} is none of these"
+            "check_model tries a MotionModel, ObservationModel, Landmark, Likelihood, Sensor or Conditional; "
+            f"a {name} is none of these"
         )
     with np.errstate(all="ignore"):
         if isinstance(model, Likelihood):
@@ -56,9 +56,43 @@ def check_model(
             return run(landmark_checks(model, space, rng, example))
         if space is None:
             raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
+        if isinstance(model, Conditional):
+            return run(conditional_checks(model, space, rng, example))
         if isinstance(model, MotionModel):
             return run(motion_checks(model, space, rng, example))
         return run(observation_checks(model, Scene.draw(model, space, rng, example), example.landmark))
+
+
+def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) -> list[str]:
+    """Of a sensor; of a sound one, of the models, landmarks and likelihoods of what it observes and starts."""
+    belief = example.belief
+    if belief is not None and belief.landmarks != sensor.part:
+        example = replace(example, belief=replace(belief, landmarks=sensor.part))
+    found = run(sensor_checks(sensor, example))
+    if found or example.belief is None:
+        return found
+    space, findings, groups = example.belief.prior.space, list[str](), groups_of(sensor, example)
+    for group in groups:
+        tried = example
+        if group.data is not None:
+            continue
+        if group.ids is not None and (group.ids >= 0).any():
+            # The landmark that the model belongs to: it is tried on what the map holds.
+            known = np.unique(group.ids[group.ids >= 0])
+            landmark = example.belief.map.landmark_of(int(known[0]))
+            alike = known[example.belief.map.are(known, landmark)]
+            records = example.belief.read(alike)
+            if records.log_weights is None:
+                tried = replace(example, state=example.belief.state, landmark=landmark, records=records)
+            else:
+                tried = replace(example, landmark=landmark, records=None)
+        findings += check_model(group.model, space, rng, tried)
+        if group.likelihood is not None:
+            findings += check_model(group.likelihood, space, rng, tried)
+    for new in sensor.new_landmarks(example.frame, example.belief, groups):
+        tried = replace(example, landmark=new.landmark, records=None)
+        findings += check_model(new.landmark, space, rng, tried) + check_model(new.model, space, rng, tried)
+    return list(dict.fromkeys(findings))
 
 
 def require_sound(

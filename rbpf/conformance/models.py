@@ -21,10 +21,13 @@ from rbpf.conformance.trial import (
     require_truths,
     require_type,
 )
+from rbpf.core.genealogy import Lineage
 from rbpf.core.models import (
     NEW,
+    Conditional,
     Landmark,
     Likelihood,
+    LogDensities,
     MotionModel,
     NewLandmarks,
     Observations,
@@ -33,6 +36,7 @@ from rbpf.core.models import (
     Sensor,
     Transition,
 )
+from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.gate import is_inlier, log_likelihood
 from rbpf.lie import LieGroup
@@ -210,6 +214,8 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
         name = named(sensor.observe)
         for group in groups_of(sensor, example):
             require_type(f"{name}, for a group,", group, Observations)
+            if group.data is not None:
+                continue
             measurements(name, group)
             if Part.LANDMARK not in group.model.reads:
                 continue
@@ -237,6 +243,95 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
                 require(not taken, f"{name} starts landmarks {taken}, which the map holds already")
 
     return [observed, started]
+
+
+def conditional_checks(part: Conditional, space: LieGroup, rng: np.random.Generator, example: Example) -> list[Check]:
+    """A few steps of what is marginalised: shapes, what a prediction may change, copies, and the checkpoint."""
+    states, groups = example.states(space, rng), example.groups
+    n, d = states.shape[0], space.dim
+    alike = np.repeat(states[:1], n, axis=0)
+    lineages: list[Lineage] = []
+
+    def begin() -> None:
+        lineages.append(Lineage(n))
+        called(part.begin, n, lineages[-1], repeat=False)
+
+    def held() -> dict[str, np.ndarray]:
+        arrays, name = called(part.arrays), named(part.arrays)
+        plain = isinstance(arrays, dict) and all(isinstance(array, np.ndarray) for array in arrays.values())
+        require(plain, f"{name} must return NumPy arrays by name")
+        return {key: array.copy() for key, array in arrays.items()}
+
+    def unchanged(before: dict[str, np.ndarray], what: str) -> None:
+        now = held()
+        same = before.keys() == now.keys() and all(np.array_equal(now[key], before[key], equal_nan=True) for key in now)
+        require(same, what)
+
+    def predicted(state: np.ndarray) -> Prior:
+        transition = example.transition or Transition(state, np.zeros((1, d, 1)))
+        prior = called(part.predict, transition, space, example.dt)
+        require_type(named(part.predict), prior, Prior, type(None))
+        return prior or Prior(space, transition.mean, np.zeros((1, d)), transition.noise_factor[:, :d])
+
+    def corrected(state: np.ndarray) -> LogDensities:
+        prior = predicted(state)
+        found = called(part.correct, state, space.local(prior.base, state), groups, repeat=False)
+        require_type(named(part.correct), found, LogDensities)
+        return found
+
+    def life() -> None:
+        require(
+            isinstance(part.supplies, Part), f"{type(part).__name__}.supplies is {part.supplies!r}, expected a Part"
+        )
+        begin()
+        before = held()
+        prior = predicted(states)
+        unchanged(before, f"{named(part.predict)} changes what is held: a step may be looked at and not be taken")
+        name, found = named(part.information), Information.zeros(n, d)
+        if groups:
+            found = called(part.information, states, groups, prior)
+        require_type(name, found, Information)
+        for block, shape in (("info", (n, d, d)), ("vector", (n, d)), *((other, (n,)) for other in SUMMED[2:])):
+            require_shape(f"{name}: {block}", getattr(found, block), shape)
+        unchanged(before, f"{name} changes what is held: a proposal may linearise several times, or not at all")
+        name, densities = named(part.correct), corrected(states)
+        for which, value in densities._asdict().items():
+            require_shape(f"{name}: {which}", np.where(np.isneginf(value), 0.0, value), (n,))
+        silent = not any(getattr(found, block).any() for block in SUMMED)
+        if silent and groups:
+            same = np.array_equal(densities.all, densities.after_sampling)
+            require(same, f"{name}: information says nothing, so that after_sampling must be all of the density")
+
+    def copies() -> None:
+        """Descendants of one particle are alike, and what one of them sees is nothing to the others."""
+        name, seen = named(part.resample), []
+        for between in (alike, np.concatenate([states[:1], states[1:][::-1]])):
+            begin()
+            corrected(states)
+            predicted(states)
+            ancestors = np.zeros(n, dtype=np.int64)
+            lineages[-1].advance(ancestors)
+            called(part.resample, ancestors, repeat=False)
+            corrected(between)
+            seen.append(corrected(alike).all)
+        require_close(
+            f"{name}: descendants of one particle weigh the same differently", seen[0], seen[0][:1].repeat(n), 1e-9
+        )
+        what = f"{name}: copies share memory, what one particle sees changes another"
+        require_close(what, seen[1][:1], seen[0][:1], 1e-9)
+
+    def checkpoint() -> None:
+        begin()
+        corrected(states)
+        arrays = held()
+        after = corrected(states).all
+        begin()
+        called(part.restore, arrays, repeat=False)
+        name = named(part.restore)
+        unchanged(arrays, f"{name} does not bring back what arrays() gave")
+        require_close(f"{name}: a step afterwards weighs differently", corrected(states).all, after, 1e-12)
+
+    return [life, copies, checkpoint]
 
 
 def groups_of(sensor: Sensor, example: Example) -> list[Any]:

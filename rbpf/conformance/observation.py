@@ -52,7 +52,7 @@ def check_predict(model: ObservationModel, scene: Scene) -> None:
     require_close(f"{name} does not broadcast, for a single state", one, row, 1e-9)
     for part in model.reads:
         stacked = called(model.predict, *scene.moved((2, 3), part).args)
-        require_shape(f"{name} with two more axes of {part.value}", stacked, (2, 3, *whole.shape))
+        require_shape(f"{name} with two more axes of {part}", stacked, (2, 3, *whole.shape))
         require_close(f"{name} does not broadcast, with two more leading axes", stacked[1, 2], whole, 1e-9)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.core.models import Belief, Landmark, ObservationModel, Part, Records
+from rbpf.core.models import Belief, Landmark, ObservationModel, Observations, Part, Records, Transition
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup, SE2Group, SE3Group
 
@@ -29,6 +29,8 @@ class Example:
     dt: float = 0.1  #: seconds.
     frame: object = None  #: what a sensor observes.
     belief: Belief | None = None  #: what it knows before; its map may be changed by the check.
+    groups: Sequence[Observations] = ()  #: what a conditional is updated by.
+    transition: Transition | None = None  #: of the states, for a conditional that drives the motion.
 
     def states(self, space: LieGroup, rng: np.random.Generator) -> np.ndarray:
         """(N, E), drawn around the origin where none are given."""

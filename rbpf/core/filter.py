@@ -95,7 +95,7 @@ class Filter:
     Args:
         motion: p(x_t | x_{t−1}, u_t).
         sensors: what measures; a single Sensor or several.
-        conditional: what is marginalised: a LandmarkMap, a KalmanSubstate, both in a list, or nothing.
+        conditional: what is marginalised: a LandmarkMap, a KalmanSubstate, parts of your own, several in a list, or nothing.
         proposal: where the particles are sampled; by default EKF-refined with the exact ratio.
         resampler: by default systematic when the effective sample size falls below N/2.
         n: number of particles.
@@ -373,10 +373,13 @@ class Filter:
         transition = self.motion.transition(self.particles.state, control, dt)
         what = f"step {self.steps}: {type(self.motion).__name__}.transition"
         transition = checked_transition(transition, self.particles.state, self.space, what)
-        return self.marginals.predict(transition, self.space)
+        return self.marginals.predict(transition, self.space, dt)
 
     def _observe(self, frame: object, belief: Belief) -> list[Observations]:
-        observed = [[checked_observations(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
+        observed = []
+        for sensor in self.sensors:
+            groups = sensor.observe(frame, told(belief, sensor))
+            observed.append([in_map(checked_observations(group), sensor) for group in groups])
         self._ends = list(accumulate(len(groups) for groups in observed))
         return self.marginals.decided([group for groups in observed for group in groups], belief)
 
@@ -393,8 +396,9 @@ class Filter:
         belief = self.belief()
         born, ids, first = list[NewLandmarks](), [np.zeros(0, dtype=np.int64)], 0
         for sensor, end in zip(self.sensors, self._ends, strict=True):
-            for new_landmarks in sensor.new_landmarks(frame, belief, groups[first:end]):
-                ids.append(belief.map.add(new_landmarks, self.particles.state))
+            its = told(belief, sensor)
+            for new_landmarks in sensor.new_landmarks(frame, its, groups[first:end]):
+                ids.append(its.map.add(new_landmarks, self.particles.state))
                 born.append(new_landmarks)
             first = end
         return born, np.concatenate(ids)
@@ -403,7 +407,18 @@ class Filter:
 def is_explained(group: Observations) -> bool:
     """Whether the weights take in the density of a group's measurements given all before: each counts, and once."""
     whole = Part.LANDMARK not in group.model.reads or len(group.updates) == 2
-    return whole and (group.likelihood is None or group.likelihood.normalised)
+    return whole and group.normalised and (group.likelihood is None or group.likelihood.normalised)
+
+
+def told(belief: Belief, sensor: Sensor) -> Belief:
+    """The belief for a sensor, whose landmarks may be in a map of their own."""
+    return belief if sensor.part == Part.LANDMARK else replace(belief, landmarks=sensor.part)
+
+
+def in_map(group: Observations, sensor: Sensor) -> Observations:
+    """A sensor's group, whose landmarks are those of the sensor's map."""
+    other = sensor.part != Part.LANDMARK and group.part is None and Part.LANDMARK in group.model.reads
+    return replace(group, part=sensor.part) if other else group
 
 
 def mean_count(counts: np.ndarray, weights: np.ndarray) -> float:
@@ -430,6 +445,8 @@ def checked_transition(transition: Transition, state: np.ndarray, space: LieGrou
 
 def checked_observations(group: Observations) -> Observations:
     """A group as the kernels take it. Raises InputError: z or cov has the wrong shape, is not finite, or is no covariance."""
+    if group.data is not None:
+        return group
     name, ids = type(group.model).__name__, group.ids
     group = replace(
         group,

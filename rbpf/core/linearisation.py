@@ -12,7 +12,7 @@ from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
-EVERYTHING = frozenset(Part)
+EVERYTHING = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
 _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 """Variance at which log|2πS| is zero: a row of it, with zero residual and Jacobian, says nothing."""
 

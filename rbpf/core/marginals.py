@@ -1,6 +1,6 @@
 """What is marginalised, besides a map: a Kalman-filtered substate, nothing (`StateOnly`), and several parts side by side."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import final
 
@@ -11,7 +11,7 @@ from rbpf.arrays import numbers
 from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
-from rbpf.core.linearisation import information, linearise, stacked
+from rbpf.core.linearisation import EVERYTHING, information, linearise, stacked
 from rbpf.core.models import NEW, NULL, Belief, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
 from rbpf.core.particles import Information, Particles, Prior, take
 from rbpf.errors import InputError
@@ -19,24 +19,36 @@ from rbpf.kernels.increment import conditioned
 from rbpf.lie import LieGroup
 
 GAUSSIAN = Gaussian()
+Moves = Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 _SUBSTATE = {"mean": checkpoint.numbers("n", "m"), "cov": checkpoint.numbers("covs", "m", "m")}
 
 
 @final
 class StateOnly(Conditional):
-    """Observations that read the sampled state and nothing else, as a position fix: S = R, and nothing is stored."""
+    """Observations that read the sampled state and nothing else, as a position fix: S = R, and nothing is stored.
+
+    Raw data are functions of the states (N, E) that give log-likelihoods (N,), see `LikelihoodSensor`.
+    """
 
     supplies = Part.STATE
+    takes_raw = True
 
     def __init__(self, space: LieGroup) -> None:
         self.space = space
+        self._ahead = False
 
     def begin(self, n: int, lineage: Lineage) -> None:
         """Nothing is stored."""
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
         total = Information.zeros(state.shape[0], self.space.dim)
+        self._ahead = not prior.factor.shape[2]
         for group in groups:
+            if group.data is not None:
+                # Where nothing is left to sample the states are final, and the look-ahead knows the weight.
+                if self._ahead:
+                    total.log_factor += log_likelihoods(group, state)
+                continue
             nu, jacobians = linearise(group.model, self.space, group.z, state[:, None, :])
             assert jacobians.state is not None
             cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
@@ -44,12 +56,15 @@ class StateOnly(Conditional):
         return total
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        total = np.zeros(state.shape[0])
+        total, raw = np.zeros((2, state.shape[0]))
         for group in groups:
+            if group.data is not None:
+                raw += log_likelihoods(group, state)
+                continue
             nu = group.model.innovation(group.z, state[:, None, :])
             cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
             total += (group.likelihood or GAUSSIAN).log_density(nu, cov).sum(axis=1)
-        return LogDensities(total, np.zeros_like(total))
+        return LogDensities(total + raw, np.zeros_like(raw) if self._ahead else raw)
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Nothing is stored."""
@@ -59,6 +74,16 @@ class StateOnly(Conditional):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Nothing is stored."""
+
+
+def log_likelihoods(group: Observations, state: np.ndarray) -> np.ndarray:
+    """(N,) of raw data about the states (N, E). Raises InputError: not one number each, or NaN."""
+    found = numbers(np.asarray(group.data(state)), "a log-likelihood of the states")  # type: ignore[operator]
+    if found.shape != state.shape[:1]:
+        raise InputError(
+            f"a log-likelihood of {state.shape[0]} states must have shape {state.shape[:1]}, got {found.shape}"
+        )
+    return found
 
 
 @final
@@ -72,6 +97,9 @@ class KalmanSubstate(Conditional):
         space: the group of the sampled state.
         mean: (m,) initial mean.
         cov: (m, m) initial covariance, may be singular.
+        part: its name; another one than Part.SUBSTATE where it stands beside a second substate.
+        moves: how it moves where the motion model does not drive it, as a sensor's bias: seconds → A (m, m), b (m,) and
+            the noise's factor (m, r).
 
     Attributes:
         mean: (N, m) of each particle.
@@ -80,8 +108,12 @@ class KalmanSubstate(Conditional):
 
     supplies = Part.SUBSTATE
 
-    def __init__(self, space: LieGroup, mean: np.ndarray, cov: np.ndarray) -> None:
+    def __init__(
+        self, space: LieGroup, mean: np.ndarray, cov: np.ndarray, part: Part = Part.SUBSTATE, moves: Moves | None = None
+    ) -> None:
         self.space = space
+        self.supplies = part
+        self.moves = moves
         self._mean = numbers(mean, "the mean of a substate").copy()
         self._cov = numbers(cov, "the cov of a substate").copy()
         if self._cov.shape != (self._mean.size, self._mean.size):
@@ -94,8 +126,15 @@ class KalmanSubstate(Conditional):
         self.mean = np.repeat(self._mean[None], n, axis=0)
         self.cov = self._cov[None]
 
-    def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        """Joint distribution of (ε, s_t), Mathematics (joint-substate), kept as s_t | ε."""
+    def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior | None:
+        """Joint distribution of (ε, s_t), Mathematics (joint-substate), kept as s_t | ε; what moves by itself knows no ε."""
+        if self.moves is not None:
+            dynamics, drift, factor = self.moves(dt)
+            self._increment_mean = np.zeros((1, space.dim))
+            self._predicted = self.mean @ dynamics.T + drift
+            self._gain = np.zeros((1, self._mean.size, space.dim))
+            self._rest = gaussian.symmetrise(dynamics @ self.cov @ dynamics.T + factor @ factor.T)
+            return None
         if transition.coupling is None or transition.dynamics is None or transition.drift is None:
             raise InputError(
                 "the motion model must give coupling, dynamics and drift: the filter has a Kalman substate"
@@ -159,7 +198,7 @@ class KalmanSubstate(Conditional):
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
-        self._increment_mean = self._increment_mean[ancestors]
+        self._increment_mean = take(self._increment_mean, ancestors)
         self._predicted = self._predicted[ancestors]
         self._gain = take(self._gain, ancestors)
         self._rest = take(self._rest, ancestors)
@@ -216,17 +255,33 @@ class Marginals(Conditional):
         self._holder = dict(self.parts)
         for part in parts:
             self._holder |= dict.fromkeys(part.also, part)
-        held = sum(1 + len(part.also - {Part.STATE}) for part in parts)
-        if len(self._holder) != held + 1:
-            raise InputError("the filter takes at most one landmark map and one Kalman substate")
+        held = [part.supplies for part in parts] + [other for part in parts for other in part.also - {Part.STATE}]
+        twice = sorted({part for part in held if held.count(part) > 1})
+        if twice or not isinstance(self.parts[Part.STATE], StateOnly):
+            raise InputError(
+                f"two parts of the filter are named {(twice or [Part.STATE])[0]!r}: give one of them another name, "
+                "as LandmarkMap(…, part=Part('beacons')), or hold both in one"
+            )
 
     def begin(self, n: int, lineage: Lineage) -> None:
         for part in self.parts.values():
             part.begin(n, lineage)
 
-    def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        driver = self._holder.get(Part.SUBSTATE, self._holder[Part.STATE])
-        return driver.predict(transition, space)
+    def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior:
+        """Tells every part that time goes on; the increment is distributed as the transition or one of the parts says."""
+        found: Prior | None = None
+        for name, part in self.parts.items():
+            prior = part.predict(transition, space, dt)
+            if prior is not None and found is not None:
+                raise InputError(
+                    f"{name} is the second part that drives the motion: hold what drives it in one substate"
+                )
+            found = found or prior
+        if found is not None:
+            return found
+        if transition.coupling is not None and transition.coupling.shape[-1]:
+            raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
+        return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
 
     def decided(self, groups: Sequence[Observations], belief: Belief) -> list[Observations]:
         """By the part that each group goes to, in the groups' order."""
@@ -289,32 +344,48 @@ class Marginals(Conditional):
         return parts[0].consolidate(particles)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {name: array for part in self.parts.values() for name, array in part.arrays().items()}
+        """By their names; those of a part with a name of its own come under that name."""
+        parts = self.parts.items()
+        return {prefix(of) + name: array for of, part in parts for name, array in part.arrays().items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        for part in self.parts.values():
-            part.restore(arrays)
+        for of, part in self.parts.items():
+            own = prefix(of)
+            part.restore({name.removeprefix(own): array for name, array in arrays.items() if name.startswith(own)})
 
     def options(self) -> dict[str, object]:
-        return {name: value for part in self.parts.values() for name, value in part.options().items()}
+        parts = self.parts.items()
+        return {prefix(of) + name: value for of, part in parts for name, value in part.options().items()}
 
     def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
         routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
         for group in groups:
-            reads = group.model.reads - {Part.STATE}
-            holders = {self._holder.get(part) for part in reads or {Part.STATE}}
+            name = type(group.model).__name__
+            if group.part is not None:
+                holders, wanted = {self._holder.get(group.part)}, str(group.part)
+            else:
+                reads = group.model.reads - {Part.STATE} or {Part.STATE}
+                holders, wanted = {self._holder.get(part) for part in reads}, str(next(iter(reads)))
             if len(holders) > 1:
                 raise InputError(
-                    f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
+                    f"{name} reads a landmark and the substate, which couples them: "
                     "sample that part of the substate instead, or hold both in a JointMap"
                 )
             holder = holders.pop()
             if holder is None:
+                what = "raw data are for" if group.data is not None else f"{name} reads"
+                raise InputError(f"{what} a {wanted}, which this filter does not hold")
+            if group.data is not None and not holder.takes_raw:
                 raise InputError(
-                    f"{type(group.model).__name__} reads a {next(iter(reads)).value}, which this filter does not hold"
+                    f"{type(holder).__name__} takes no raw data, but groups of rows with an observation model"
                 )
             routed[holder.supplies].append(group)
         return routed
+
+
+def prefix(part: Part) -> str:
+    """What stands before the names of a part's arrays in a checkpoint: nothing for those that every filter may have."""
+    return "" if part in EVERYTHING else f"{part}/"
 
 
 def _for_look_ahead(group: Observations) -> Observations:

@@ -12,9 +12,8 @@ C components, p measurement, r noise rank. A method that is not abstract is a ho
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import cached_property, partial
-from typing import Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 
@@ -55,15 +54,20 @@ NEW = -2
 """An observation that a particle takes as the first of a new landmark."""
 
 
-class Part(Enum):
-    """What an observation can depend on."""
+class Part(str):
+    """What is sampled or marginalised, by name: what an observation can depend on, and who holds it.
 
-    STATE = "sampled state"
-    LANDMARK = "landmark"
-    SUBSTATE = "linear substate"
+    `Part.STATE`, `Part.LANDMARK` and `Part.SUBSTATE` are what the arguments of an `ObservationModel` stand for. Any other name
+    is a part of the user's own, as `Part("occupancy grid")`.
+    """
 
-    __hash__ = object.__hash__
-    """Members are single objects; Enum's own hash, asked for at every use of a set of parts, is run by Python."""
+    __slots__ = ()
+    STATE: ClassVar["Part"]
+    LANDMARK: ClassVar["Part"]
+    SUBSTATE: ClassVar["Part"]
+
+
+Part.STATE, Part.LANDMARK, Part.SUBSTATE = Part("sampled state"), Part("landmark"), Part("linear substate")
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,15 @@ class Observations:
     #: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share a
     #: measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     updates: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
+    #: who holds what the model reads, where a filter has several maps or substates; None is the one that there is.
+    part: Part | None = None
+    data: object = None  #: what was measured as it is, see `raw`; None where z has it.
+    normalised: bool = True  #: whether the log-likelihood of raw data is that of a density, as the evidence must be.
+
+    @classmethod
+    def raw(cls, data: object, part: Part, normalised: bool = True) -> "Observations":
+        """Data as they are, as a scan, without rows z and a model: `part` itself reads them, and says how likely they are."""
+        return cls(np.zeros((0, 1)), np.zeros((0, 1, 1)), _NO_MODEL, part=part, data=data, normalised=normalised)
 
 
 @dataclass(frozen=True)
@@ -218,6 +231,21 @@ class ObservationModel(ABC):
     def kernel(self) -> FusedKernel | None:
         """A compiled twin of residual(z, predict) and jacobians; None runs them in NumPy."""
         return None
+
+
+class _NoModel(ObservationModel):
+    """Of raw data, which have no rows."""
+
+    dim = 1
+    reads = frozenset()
+
+    def predict(
+        self, state: States, landmark: Means = None, const: Constants = None, substate: Substates = None
+    ) -> Result:
+        raise InputError("raw data have no observation model: the part that they are for reads them")
+
+
+_NO_MODEL = _NoModel()
 
 
 class Landmark(ABC):
@@ -330,6 +358,9 @@ class Likelihood(ABC):
 class Sensor(ABC, Generic[Frame]):
     """Raw data → observations, given the predicted belief; then new landmarks."""
 
+    part: Part = Part.LANDMARK
+    """The map that holds its landmarks, where a filter has several; the belief's `map` is that one."""
+
     @abstractmethod
     def observe(self, frame: Frame, belief: "Belief") -> Sequence[Observations]:
         """Groups of observations of known landmarks (or of none)."""
@@ -337,6 +368,21 @@ class Sensor(ABC, Generic[Frame]):
     def new_landmarks(self, frame: Frame, belief: "Belief", observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """What starts landmarks, given the updated belief and what this sensor observed, ids of the descendants."""
         return ()
+
+
+class LikelihoodSensor(Sensor[Frame]):
+    """Weights as they are: log p(frame | state) of any form, of the sampled states alone."""
+
+    normalised: bool = True
+    """Whether it is a density of the frame, as the evidence must be."""
+
+    @abstractmethod
+    def log_likelihood(self, frame: Frame, state: Float[np.ndarray, "N E"]) -> Float[np.ndarray, " N"]:
+        """(N,) for states (N, E); zeros where the frame has nothing for this sensor."""
+
+    @final
+    def observe(self, frame: Frame, belief: "Belief") -> Sequence[Observations]:
+        return [Observations.raw(partial(self.log_likelihood, frame), Part.STATE, self.normalised)]
 
 
 LineariseAt = Callable[[Float[np.ndarray, "N d"]], Information]
@@ -355,39 +401,55 @@ class Proposal(ABC):
 
 
 class Conditional(ABC):
-    """What is marginalised: Gaussian given the sampled states. A landmark map, a Kalman substate."""
+    """What is marginalised, or known in closed form given the sampled states: a landmark map, a Kalman substate, a grid.
+
+    A step calls `predict`, `information` (as often as the proposal linearises), `resample` where the filter resamples, and
+    `correct`. All before `correct` must leave what is held as it is: a step may be looked at and not be taken. Whatever is
+    kept between `predict` and `correct` has a row per particle and is resampled, too.
+    """
 
     supplies: Part
+    """Its name in the filter. Observations come here whose `part` it is, or else whose model reads it."""
     also: frozenset[Part] = frozenset()
     """What it supplies besides."""
+    takes_raw: bool = False
+    """Whether `information` and `correct` understand groups of raw data."""
 
     @abstractmethod
     def begin(self, n: int, lineage: Lineage) -> None:
-        """Makes room for n particles whose ancestry `lineage` keeps."""
+        """Makes room for n particles, all alike, whose ancestry `lineage` keeps."""
 
-    def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        """Distribution of the increment, which only a substate changes. Raises InputError: the motion needs one."""
-        if transition.coupling is not None and transition.coupling.shape[-1]:
-            raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
-        return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
+    def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior | None:
+        """Called in every step, with the seconds since the last one; perhaps again before anything else is.
+
+        A part that the motion depends on, as a substate with `Transition.coupling`, returns the distribution of the
+        increment; one part at most. By default nothing moves with time, and nothing is said about the increment.
+        """
+        return None
 
     def decided(self, groups: Sequence[Observations], belief: "Belief") -> Sequence[Observations]:
         """The groups with what is decided once for all particles, given all of them; by default nothing is."""
         return groups
 
-    @abstractmethod
     def information(self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: Prior) -> Information:
-        """What the groups say about a right perturbation of the states (N, E)."""
+        """What the groups, at least one, say about a right perturbation of the states (N, E): for proposal and look-ahead.
+
+        By default nothing: then they count after sampling, by `correct`, which says so in `LogDensities.after_sampling`.
+        """
+        return Information.zeros(state.shape[0], prior.space.dim)
 
     @abstractmethod
     def correct(
         self, state: Float[np.ndarray, "N E"], increment: Float[np.ndarray, "N d"], groups: Sequence[Observations]
     ) -> LogDensities:
-        """Log p(z | x) at the sampled states, and the update by the same observations."""
+        """Log p(z | x) at the sampled states, and the update by the same observations; in every step, without any, too."""
 
     @abstractmethod
     def resample(self, ancestors: Int[np.ndarray, " N"]) -> None:
-        """Every particle i becomes a copy of particle ancestors[i]; `lineage` has been advanced."""
+        """Every particle i becomes a copy of particle ancestors[i]; `lineage` has been advanced.
+
+        The copies must not share memory that is written to in place.
+        """
 
     def consolidate(self, particles: Particles) -> Particles:
         """Takes in what the particles differ by, after a step, in place of resampling: they begin anew, all alike.
@@ -513,6 +575,7 @@ class Belief:
     prior: Prior  #: distribution of each particle's increment; after the update its factor is zero.
     parts: Mapping[Part, Conditional]  #: what is marginalised, by what it supplies.
     rng: np.random.Generator = field(default_factory=np.random.default_rng)  #: the filter's, for a sensor that draws.
+    landmarks: Part = Part.LANDMARK  #: which of them `map` is: the asking sensor's.
 
     @cached_property
     def state(self) -> Float[np.ndarray, "N E"]:
@@ -532,9 +595,10 @@ class Belief:
     @property
     def map(self) -> Map:
         """The landmark map. Raises InputError: the filter holds none."""
-        held = self.parts.get(Part.LANDMARK)
+        held = self.parts.get(self.landmarks)
         if not isinstance(held, Map):
-            raise InputError("this sensor needs a landmark map: give the filter a LandmarkMap")
+            named = "" if self.landmarks == Part.LANDMARK else f"(…, part={self.landmarks!r})"
+            raise InputError(f"this sensor needs a landmark map: give the filter a LandmarkMap{named}")
         return held
 
     def read(self, ids: Sequence[int] | Ids, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:

@@ -131,7 +131,7 @@ def test_mixtures_take_no_part_in_the_refinement(frames):
     filter_ = build(EkfProposal(), Systematic(), 5, np.linalg.cholesky(Q), np.random.default_rng(1))
     state = filter_.particles.state
     group = frames[1].groups[0]
-    prior = filter_.marginals.predict(filter_.motion.transition(state, None, 0.0), PLANE)
+    prior = filter_.marginals.predict(filter_.motion.transition(state, None, 0.0), PLANE, 0.0)
     mixtures, all_of_them, points = (
         filter_.marginals.information(
             state, [Observations(group.z[rows], group.cov[rows], group.model, ids=group.ids[rows])], prior
