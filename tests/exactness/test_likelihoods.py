@@ -115,7 +115,7 @@ def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood
     moved = z + np.array([[0.0, 0.0], [-5.0, 3.0]])
     once = [Observations(moved, R, Relative(), likelihood, np.array([0, 1]))]
     motion = LinearMotion(np.eye(2), 0.2 * np.eye(2))
-    prior = held_landmarks(certain).predict(motion.transition(state, None, 1.0), PLANE)
+    prior = Marginals(PLANE, []).predict(motion.transition(state, None, 1.0), PLANE, 1.0)
     zero = np.zeros((8, 2))
     densities = [held_landmarks(certain).correct(state, zero, groups).all for groups in (twice, once)]
     np.testing.assert_allclose(densities[0], densities[1], atol=1e-9)
