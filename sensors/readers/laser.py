@@ -57,7 +57,6 @@ FASTEST = 10.0
 _FAR_M, _MILLIMETRES_M = 80.0, (8.18, 8.2)
 _HEAD = ("type", "start angle", "field of view", "angular resolution", "maximum range", "accuracy", "remission mode")
 _POSES = ("x", "y", "theta", "odometry's x", "odometry's y", "odometry's theta")
-_NOT_FINITE = {"nan": np.nan, "-nan": np.nan, "inf": np.inf, "+inf": np.inf, "-inf": -np.inf}
 _log = logging.getLogger(__name__)
 
 
@@ -350,11 +349,13 @@ def _numbers(path: Path, line: int, names: Iterable[str], words: list[str]) -> A
 
 
 def _ranges(path: Path, line: int, what: str, words: list[str]) -> Array:
-    """Words as numbers of any kind."""
-    try:
-        values = np.array(words, dtype=float)
-    except ValueError:
-        values = np.array([_NOT_FINITE[w] if w in _NOT_FINITE else parse_number(path, line, what, w) for w in words])
+    """Words as numbers, which may be nan or inf."""
+    values = np.empty(len(words))
+    for k, word in enumerate(words):
+        try:
+            values[k] = float(word)
+        except ValueError:
+            raise line_error(path, line, f"expected {what} to be numbers, found {quoted(word)}") from None
     return values
 
 

@@ -65,7 +65,7 @@ CARMEN | robot.clf | 4 | FLASER 0 0 0 0 0 0 0 10.1 | expected readings, found no
 CARMEN | robot.clf | 4 | FLASER 9 1 2 3 4 5 0 0 0 0 0 0 10.1 | expected odometry's x, found the end of the line
 CARMEN | robot.clf | 4 | FLASER 3 1 2 3 4 5 0 0 0 0 0 0 10.1 robot 0.1 | expected a time, a host and a time after 11 words
 CARMEN | robot.clf | 4 | FLASER 99 1 2 3 4 5 0 0 0 0 0 0 10.1 | expected 99 readings and what follows them, found 12 words
-CARMEN | robot.clf | 4 | FLASER 5 1 2 x 4 5 0 0 0 0 0 0 10.1 | expected readings to be a finite number, found 'x'
+CARMEN | robot.clf | 4 | FLASER 5 1 2 x 4 5 0 0 0 0 0 0 10.1 | expected readings to be numbers, found 'x'
 CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 nan 0 10.1 | expected odometry's y to be a finite number, found 'nan'
 CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 5e9 | expected the time in seconds, within 4e+09 of zero
 CARMEN | robot.clf | 7 | FLASER 4 1 2 3 4 0 0 0 0 0 0 10.5 | expected 5 readings as in line 4, found 4 readings
