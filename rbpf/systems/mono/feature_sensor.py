@@ -256,18 +256,23 @@ class FeatureSensor(Sensor):
 
     def positions(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where features (K,) are in the heaviest particle's world: which of them, homogeneous points (k, 4)."""
-        which, out = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 4))]
+        which, places = self.positions_in(belief, names, slice(belief.mode, belief.mode + 1))
+        return which, places[0]
+
+    def positions_in(self, belief: Belief, names: np.ndarray, particles: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Likewise in the worlds of some particles: which features, homogeneous points (n, k, 4)."""
+        n = belief.log_weights[particles].size
+        which, out = [np.zeros(0, dtype=np.int64)], [np.zeros((n, 0, 4))]
         for model, chosen, ids in self._by_model(belief, names):
-            records = belief.read_mode(ids)
-            const = None if records.const is None else records.const[0]
+            records = belief.read(ids, particles)
             which.append(chosen)
             if isinstance(model, GroupView):
-                points = model.in_world(records.mean[0], const)[0]
-                out.append(np.pad(points, ((0, 0), (0, 1)), constant_values=1.0))
+                points = model.in_world(records.mean, records.const)[:, 0]
+                out.append(np.pad(points, ((0, 0), (0, 0), (0, 1)), constant_values=1.0))
             else:
-                x, w = model.world_point(records.mean[0], const)
+                x, w = model.world_point(records.mean, records.const)
                 out.append(np.concatenate([x, w], axis=-1))
-        return np.concatenate(which), np.concatenate(out)
+        return np.concatenate(which), np.concatenate(out, axis=1)
 
     def depth_known(self, belief: Belief, names: np.ndarray, std_ratio: float) -> np.ndarray:
         """Whether the heaviest particle knows the depth of features (K,) to this fraction of it, (K,) bool."""

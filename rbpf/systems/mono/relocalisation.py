@@ -304,9 +304,8 @@ class Relocaliser:
         near = in_view if in_view.sum() >= self.config.min_inliers_with_last_view else np.ones_like(in_view)
         rows, seen = rows[near], seen[near]
         poses = np.empty((belief.log_weights.size, 7))
-        for i in range(len(poses)):
-            alone = np.where(np.arange(len(poses)) == i, 0.0, -np.inf)
-            which, places = self.sensor.features.positions(replace(belief, log_weights=alone), rows)
+        which, all_places = self.sensor.features.positions_in(belief, rows, slice(None))
+        for i, places in enumerate(all_places):
             ahead = places[:, 3] > 0.0
             poses[i] = pose
             if ahead.sum() >= MIN_FITTED:
