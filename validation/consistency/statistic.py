@@ -25,7 +25,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.special import betaincinv, chdtr, ndtri
 
+from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.lie import LieGroup
 
 LEVEL = 0.95
@@ -152,10 +154,8 @@ def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statis
 
     Standard deviations may be wrong by the factor, either way.
     """
-    from scipy.stats import chi2
-
     tail = 0.5 * (1.0 - LEVEL)
-    low, high = (value * dof / bound for bound in chi2.ppf([1.0 - tail, tail], dof))
+    low, high = (value * dof / bound for bound in chi_square_quantile([1.0 - tail, tail], dof))
     return Statistic(name, value, float(low), float(high), (factor**-2, factor**2), dof)
 
 
@@ -254,8 +254,6 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
 
 def _bias(correction: np.ndarray, cov: np.ndarray, excess: float) -> Statistic | None:
     """The constant b that explains the corrections best, û = cov b: its clearest component that is informed."""
-    from scipy.stats import norm
-
     total = cov.sum(axis=0)
     values, vectors = np.linalg.eigh(total)
     informed = values > 1.0
@@ -263,7 +261,7 @@ def _bias(correction: np.ndarray, cov: np.ndarray, excess: float) -> Statistic |
         return None
     along = (vectors.T @ correction.sum(axis=0))[informed] / values[informed]
     std = np.sqrt(excess / values[informed])
-    margin = float(norm.ppf(0.5 + 0.5 * LEVEL ** (1.0 / along.size)))  # all components together
+    margin = float(ndtri(0.5 + 0.5 * LEVEL ** (1.0 / along.size)))  # all components together
     lows = np.maximum(np.abs(along) - margin * std, 0.0)
     worst = int(np.argmax(lows)) if lows.any() else int(np.argmax(np.abs(along) + margin * std))
     size = float(np.abs(along[worst]))
@@ -278,17 +276,15 @@ def coverage(
 
     From normalised squared errors (T,) of `dim` degrees of freedom each, which are worth so many independent samples.
     """
-    from scipy.stats import beta, chi2
-
     out, tail = [], 0.5 * (1.0 - LEVEL)
     for probability in probabilities:
-        bound = float(chi2.ppf(probability, dim))
+        bound = float(chi_square_quantile(probability, dim))
         fraction = float((nees <= bound).mean())
         # Clopper and Pearson's interval, for a number of samples that need not be whole
         hits = fraction * samples
-        low = float(beta.ppf(tail, hits, samples - hits + 1.0)) if hits > 0.0 else 0.0
-        high = float(beta.ppf(1.0 - tail, hits + 1.0, samples - hits)) if hits < samples else 1.0
-        zone = (float(chi2.cdf(bound / STATE_FACTOR**2, dim)), float(chi2.cdf(bound * STATE_FACTOR**2, dim)))
+        low = float(betaincinv(hits, samples - hits + 1.0, tail)) if hits > 0.0 else 0.0
+        high = float(betaincinv(hits + 1.0, samples - hits, 1.0 - tail)) if hits < samples else 1.0
+        zone = (float(chdtr(dim, bound / STATE_FACTOR**2)), float(chdtr(dim, bound * STATE_FACTOR**2)))
         name = f"poses inside the {100 * probability:g} % region"
         out.append(
             Statistic(name, fraction, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.core.diagnostics import chi_square_band
+from rbpf.core.diagnostics import chi_square_band, chi_square_quantile
 from rbpf.runs import plots
 from rbpf.runs.plots import COLOURS, SIGMAS, Views, World, label, moved_map, new_axes, outline, save_figures
 from rbpf.runs.reading import PathAndMap, RunFolder
@@ -146,12 +146,11 @@ def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any
 def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
     """Distances of landmarks (M,) in σ, in order, beside those that an honest filter's would have."""
     from matplotlib.figure import Figure
-    from scipy.stats import chi2
 
     figure = Figure(figsize=(7.0, 5.0), layout="constrained")
     axes, count = figure.subplots(), squares.size
     places = np.arange(1, count + 1)
-    right = np.sqrt(chi2.ppf((places - 0.5) / count, dim))
+    right = np.sqrt(chi_square_quantile((places - 0.5) / count, dim))
     axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
     axes.plot(places, right, color="tab:green", lw=1.0, label="independent landmarks of an honest filter")
     label(axes, title, "landmark", "distance [σ of the filter]", equal=False)

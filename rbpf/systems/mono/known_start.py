@@ -7,6 +7,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from rbpf import gaussian
+from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -77,13 +78,11 @@ def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tupl
     beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Their
     covariances have the traces std_m². Errors as `resect_known`.
     """
-    from scipy.stats import chi2
-
     pose = resect_known(camera, known, noise_px)
     local = SE3.inverse_transform(pose, known.positions)
     residual = camera.project(local) - known.px
     squared, dof = float(np.square(residual).sum()), residual.size - 6
-    excess = squared / dof - noise_px**2 if squared > chi2.ppf(NOISE_PROBABILITY, dof) * noise_px**2 else 0.0
+    excess = squared / dof - noise_px**2 if squared > chi_square_quantile(NOISE_PROBABILITY, dof) * noise_px**2 else 0.0
     seen = excess * (local[:, 2] / camera.fx) ** 2
     var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[:, None, None]
     line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]

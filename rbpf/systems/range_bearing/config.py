@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.core.models import Likelihood
 from rbpf.errors import InputError
@@ -30,9 +31,7 @@ class AssociationConfig(Ranged):
 
     def gates(self, dim: int) -> Gates:
         """χ² thresholds for measurements of `dim` numbers."""
-        from scipy.stats import chi2
-
-        accept, isolate = chi2.ppf([self.accept_probability, self.isolate_probability], dim)
+        accept, isolate = chi_square_quantile([self.accept_probability, self.isolate_probability], dim)
         return Gates(float(accept), float(isolate), np.log(self.new_density), np.log(self.clutter_density))
 
     def existence(self) -> ExistenceModel:
