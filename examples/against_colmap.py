@@ -26,7 +26,8 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
     camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, width / 2 - 0.5, 3 * width / 8 - 0.5)
     with TemporaryDirectory() as folder:
         desk = Path(folder) / "desk"
-        simulate_images(TexturedDesk(frames=frames), Imaging(known=6), camera, desk, seed=0)
+        world = TexturedDesk(frames=frames, texel_m=0.003 if quick else 0.001)
+        simulate_images(world, Imaging(known=6, grid=1 if quick else 2), camera, desk, seed=0)
         run = filter_recording(MonoRecording(desk, desk / "known_points.csv"), MonoConfig())
         estimate = PathAndMap.of_run(run)
         options = ReconstructionOptions(every=every, features=800 if quick else 4096)

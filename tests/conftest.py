@@ -20,6 +20,18 @@ if os.environ.get("RBPF_SHAPES") != "0":
 DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Long statistics, studies and recordings run lines a thousand times that other tests run, too.
+
+    Counting these would take a third of their time; what they alone run counts as not run.
+    """
+    if config.pluginmanager.hasplugin("pytest_cov"):
+        for item in items:
+            folder = item.path.relative_to(Path(__file__).parent).parts[0]
+            if folder in {"exactness", "examples", "recordings"} and item.get_closest_marker("slow"):
+                item.add_marker("no_cover")
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of recordings: `RBPF_DATA`, by default `../shared/data` from the project's root."""

@@ -86,7 +86,7 @@ def hand_over_compiled_kernels(site: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, plain_pictures):
     """A run to report on."""
     folder = tmp_path_factory.mktemp("finished")
     simulate_robot(RobotWorld(steps=8, landmarks=10), folder / "log", seed=0)
@@ -103,7 +103,7 @@ def test_an_installed_package_simulates_and_reports(built, finished, tmp_path):
     python = tmp_path / "environment" / "bin" / "python"
     (site,) = (tmp_path / "environment" / "lib").glob("python*/site-packages")
     run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index",
-         "--target", str(site), str(distribution)])  # fmt: skip
+         "--no-compile", "--target", str(site), str(distribution)])  # fmt: skip
     hand_over_compiled_kernels(site)
     lower = [path for path in sys.path if path.endswith("site-packages")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *lower])}

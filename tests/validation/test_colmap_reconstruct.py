@@ -9,9 +9,9 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers import open_images, open_stereo
+from rbpf.sensors.readers import open_images
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
 from rbpf.validation.colmap.compare import cloud_distance, compare_with_path, compare_with_truth
@@ -26,16 +26,12 @@ CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 FEW = ReconstructionOptions(every=1, features=800)
 
 
-def rendered(folder, frames, camera=CAMERA, every=15):
-    """Frames of a desk, far enough apart to be key frames."""
-    simulate_images(TexturedDesk(frames=frames, texel_m=0.004), Imaging(known=0, noise_std=1.0), camera, folder, seed=2)
-    opened = open_stereo if isinstance(camera, RectifiedStereo) else open_images
-    return opened(folder), replace(FEW, every=every)
-
-
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
-    return rendered(tmp_path_factory.mktemp("colmap") / "desk", 150)
+    """A desk, seen in frames that are far enough apart to be key frames."""
+    folder, world = tmp_path_factory.mktemp("colmap") / "desk", TexturedDesk(frames=10, rate_hz=2.0, texel_m=0.004)
+    simulate_images(world, Imaging(known=0, noise_std=1.0), CAMERA, folder, seed=2)
+    return open_images(folder), FEW
 
 
 @pytest.fixture(scope="module")

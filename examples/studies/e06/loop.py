@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from examples.studies.e06.new_landmarks import round_a_desk
 from examples.studies.e06.setting import Row, Setting, true_poses
-from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
 from rbpf.runs.recordings import filter_images
@@ -65,8 +65,7 @@ def started_until(frames: list[dict[str, np.ndarray]], until: int) -> int:
 
 def reproduce(setting: Setting) -> list[Row]:
     """Filters the loop."""
-    world = LoopOverDesk(frames=150, radius_m=0.35, texel_m=0.002) if setting.quick else LoopOverDesk()
-    sequence, known = setting.sequence("loop", world)
+    sequence, known = round_a_desk(setting)
     run = filter_images(sequence, setting.config(), known)
     mapped = run.system.map()
     first = started_until(run.log.all_observed(), START)

@@ -12,6 +12,7 @@ from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, label, outline, save_figures
 from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
+from rbpf.sensors.readers import ImageSequence, KnownPixels
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import Tracked
 from rbpf.validation.report.video import draw_search
@@ -56,12 +57,14 @@ def line_lengths(observation: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(np.linalg.norm(observation["line"][rows, 1] - observation["line"][rows, 0], axis=1))
 
 
+def round_a_desk(setting: Setting) -> tuple[ImageSequence, KnownPixels | None]:
+    """The sequence of figures 5, 7 and 8."""
+    return setting.sequence("loop", LoopOverDesk(frames=75, texel_m=0.002) if setting.quick else LoopOverDesk())
+
+
 def reproduce(setting: Setting) -> list[Row]:
     """Looks for the frame with most epipolar lines, and draws it with the map of that moment."""
-    frames = 75 if setting.quick else 480
-    world = LoopOverDesk(frames=frames, texel_m=0.002 if setting.quick else 0.001)
-    name = "short_loop" if setting.quick else "loop"
-    sequence, known = setting.sequence(name, world)
+    sequence, known = round_a_desk(setting)
     best: list[Shown] = []
 
     def watch(run: Run, _: Tracked) -> None:
