@@ -161,6 +161,9 @@ class JointMap(Map):
         self._next_id = 0
         self._gain: np.ndarray | None = None
 
+    def driving(self) -> np.ndarray | None:
+        return self.mean[:, self.space.dim : self._first] if self._first > self.space.dim else None
+
     def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior | None:
         """Joint distribution of the increment ε and all that is held, kept as (ξ, s, l) | ε; without a substate as it is."""
         coupling, dynamics, drift = transition.coupling, transition.dynamics, transition.drift

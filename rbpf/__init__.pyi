@@ -41,6 +41,7 @@ from .kernels.signature import observation_kernel as observation_kernel
 from .lie import SE2 as SE2
 from .lie import SE3 as SE3
 from .lie import Euclidean as Euclidean
+from .lie import Finite as Finite
 from .lie import Product as Product
 from .maps.joint_map import JointMap as JointMap
 from .maps.landmark_map import LandmarkMap as LandmarkMap

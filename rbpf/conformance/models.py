@@ -35,6 +35,7 @@ from rbpf.core.models import (
     Records,
     Sensor,
     Transition,
+    draws,
 )
 from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
@@ -53,10 +54,27 @@ def motion_checks(model: MotionModel, space: LieGroup, rng: np.random.Generator,
     """Shapes, membership of the group, and independence of the particles."""
     name, states = named(model.transition), example.states(space, rng)
 
+    def drawn() -> None:
+        """From the generator that is given, and from nothing else."""
+        nonlocal states
+        name = named(model.sample)
+        if draws(model):
+            twice = [
+                called(model.sample, states, example.control, example.dt, np.random.default_rng(1), repeat=False)
+                for _ in range(2)
+            ]
+            require_shape(f"{name}: states", twice[0], states.shape)
+            same = np.array_equal(*twice)
+            require(same, f"{name} draws from something else than the generator that it is given")
+            what = f"{name} leaves the group {space!r}, use its compose or retract"
+            require_close(what, twice[0], space.normalise(twice[0]), 1e-9)
+            states = twice[0]
+
     def transition(state: np.ndarray) -> Any:
         return called(model.transition, state, example.control, example.dt)
 
     def shapes() -> None:
+        drawn()
         n, d, m, found = states.shape[0], space.dim, 0, transition(states)
         require_type(name, found, Transition)
         given = [part is not None for part in (found.coupling, found.dynamics, found.drift)]

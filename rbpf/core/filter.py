@@ -30,6 +30,7 @@ from rbpf.core.models import (
     Resampler,
     Sensor,
     Transition,
+    draws,
 )
 from rbpf.core.particles import (
     Estimate,
@@ -42,7 +43,7 @@ from rbpf.core.particles import (
     reweight,
     uniform_log_weights,
 )
-from rbpf.core.proposals import EkfProposal
+from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import Consolidation, EssTriggered, Systematic
 from rbpf.errors import InputError
 from rbpf.kernels.increment import are_sound
@@ -129,6 +130,9 @@ class Filter:
         require_memory(8.0 * n * (40 + 4 * motion.space.dim**2), f"a filter of {n} particles")
         self.motion = motion
         self.space = motion.space
+        self._draws = draws(motion)
+        if not self._draws and type(motion).transition is MotionModel.transition:
+            raise InputError(f"{type(motion).__name__} does not move: override transition, sample, or both")
         self.sensors = [sensors] if isinstance(sensors, Sensor) else list(sensors)
         parts = [conditional] if isinstance(conditional, Conditional) else list(conditional)
         self.marginals = Marginals(self.space, parts)
@@ -154,7 +158,10 @@ class Filter:
     def expect(self, control: object = None, stamp_ns: int | None = None) -> Belief:
         """The belief that `step` would give the sensors, for looking at a frame before it is filtered; no particle moves."""
         _, dt = self._clock(stamp_ns)
-        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals.parts, self.rng)
+        before = self.rng.bit_generator.state
+        prior = self._predict(control, dt)
+        self.rng.bit_generator.state = before
+        return Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng)
 
     def step(
         self, frame: object, control: object = None, stamp_ns: int | None = None, proposal: Proposal | None = None
@@ -173,15 +180,16 @@ class Filter:
         error is about what came in before the particles are weighed (time, control, measurements), the filter is as
         it was; otherwise it stands between two steps: `load` a checkpoint.
         """
-        # Predict, and observe given the prediction.
-        stamp_ns, dt = self._clock(stamp_ns)
-        prior = self._predict(control, dt)
-        groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng))
-
-        # Refine, and weigh by the look-ahead w₁.
         proposal = proposal or self.proposal
-        proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
-        log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
+        with self._draws_undone_by_failure():
+            # Predict, and observe given the prediction.
+            stamp_ns, dt = self._clock(stamp_ns)
+            prior = self._predict(control, dt)
+            groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng))
+
+            # Refine, and weigh by the look-ahead w₁.
+            proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
+            log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
         weights = np.exp(log_weights)
 
@@ -203,7 +211,12 @@ class Filter:
             log_weights = uniform_log_weights(self.n)
             self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
             self.marginals.resample(ancestors)
-            prior = prior.take(ancestors)
+            if self._draws and isinstance(proposal, PriorProposal):
+                # Nothing has looked at what was drawn: each descendant draws anew.
+                self.particles = Particles(self.particles.state[ancestors], log_weights)
+                prior = self._predict(control, dt)
+            else:
+                prior = prior.take(ancestors)
             groups = [
                 replace(group, ids=group.ids[ancestors]) if group.ids is not None and group.ids.ndim == 2 else group
                 for group in groups
@@ -263,6 +276,10 @@ class Filter:
         Mapping with known poses, or the maps of paths that were drawn elsewhere. The weights stay as they are. Arguments and
         errors as `step`; returns the log-likelihood (N,) of the observations.
         """
+        if self._draws:
+            raise InputError(
+                f"follow needs a path of Gaussian increments, but {type(self.motion).__name__} draws: see `sample`"
+            )
         stamp_ns, dt = self._clock(stamp_ns)
         state = checked_start(np.asarray(state, dtype=float), self.n, self.space)
         prior, log_weights = self._predict(control, dt), self.particles.log_weights
@@ -348,6 +365,15 @@ class Filter:
         }
 
     @contextmanager
+    def _draws_undone_by_failure(self) -> Iterator[None]:
+        before = self.rng.bit_generator.state
+        try:
+            yield
+        except InputError:
+            self.rng.bit_generator.state = before
+            raise
+
+    @contextmanager
     def _unchanged_by_failure(self) -> Iterator[None]:
         """Puts the filter back as it was if it cannot be restored; what is restored takes new objects, never the old ones."""
         held = [(item, dict(vars(item))) for item in (self, *self.marginals.parts.values())]
@@ -370,9 +396,15 @@ class Filter:
         return int(stamp_ns), 0.0 if previous is None else (stamp_ns - previous) * 1e-9
 
     def _predict(self, control: object, dt: float) -> Prior:
-        transition = self.motion.transition(self.particles.state, control, dt)
-        what = f"step {self.steps}: {type(self.motion).__name__}.transition"
-        transition = checked_transition(transition, self.particles.state, self.space, what)
+        state, what = self.particles.state, f"step {self.steps}: {type(self.motion).__name__}"
+        if self._draws:
+            state = checked_states(self.motion.sample(state, control, dt, self.rng), state.shape, f"{what}.sample")
+        substate = self.marginals.driving()
+        if substate is None:
+            transition = self.motion.transition(state, control, dt)
+        else:
+            transition = self.motion.transition_given(state, substate, control, dt)
+        transition = checked_transition(transition, state, self.space, f"{what}.transition")
         return self.marginals.predict(transition, self.space, dt)
 
     def _observe(self, frame: object, belief: Belief) -> list[Observations]:
@@ -441,6 +473,14 @@ def checked_transition(transition: Transition, state: np.ndarray, space: LieGrou
     if not (np.isfinite(mean).all() and np.isfinite(factor).all()):
         raise InputError(f"{what} returned NaN or infinity: check the control")
     return transition
+
+
+def checked_states(state: np.ndarray, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """States (N, E) that were drawn. Raises InputError: another shape, or not finite."""
+    state = np.ascontiguousarray(numbers(state, what))
+    if state.shape != shape or not np.isfinite(state).all():
+        raise InputError(f"{what} must return {shape} finite numbers, got {state.shape}")
+    return state
 
 
 def checked_observations(group: Observations) -> Observations:

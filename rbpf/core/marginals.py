@@ -166,6 +166,9 @@ class KalmanSubstate(Conditional):
             self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
+    def driving(self) -> np.ndarray | None:
+        return None if self.moves else self.mean
+
     def given(self, increment: np.ndarray) -> np.ndarray:
         """Mean (N, m) of s_t given increments (N, d)."""
         offset = increment - self._increment_mean
@@ -333,6 +336,9 @@ class Marginals(Conditional):
     def resample(self, ancestors: np.ndarray) -> None:
         for part in self.parts.values():
             part.resample(ancestors)
+
+    def driving(self) -> np.ndarray | None:
+        return next((mean for part in self.parts.values() if (mean := part.driving()) is not None), None)
 
     def consolidate(self, particles: Particles) -> Particles:
         """By the one part that there is: Gaussians apart from one another lack the correlation that the particles show."""

@@ -162,13 +162,43 @@ class LogDensities(NamedTuple):
 
 
 class MotionModel(ABC, Generic[Control]):
-    """p(x_t | x_{t-1}, u_t), linear-Gaussian in the substate if there is one."""
+    """p(x_t | x_{t-1}, u_t): what `sample` draws, then the Gaussian of `transition`. Override one of them, or both.
+
+    What is Gaussian is drawn given the observations, and may drive a substate; what is not, as a mode that jumps, is
+    drawn before.
+    """
 
     space: LieGroup
 
-    @abstractmethod
+    def sample(
+        self, state: Float[np.ndarray, "N E"], control: Control, dt: float, rng: np.random.Generator
+    ) -> Float[np.ndarray, "N E"]:
+        """States (N, E) drawn from any distribution given those before (N, E); by default they stay as they are."""
+        return state
+
     def transition(self, state: Float[np.ndarray, "N E"], control: Control, dt: float) -> Transition:
-        """Distribution of the next state, given states (N, E), a control and a time step in seconds."""
+        """Gaussian of the next state, given states (N, E), a control and a time step in seconds; they come from `sample`.
+
+        Its noise may depend on the state. By default nothing moves any more.
+        """
+        return Transition(state, np.zeros((1, self.space.dim, 0)))
+
+    def transition_given(
+        self, state: Float[np.ndarray, "N E"], substate: Float[np.ndarray, "N m"], control: Control, dt: float
+    ) -> Transition:
+        """`transition`, linearised about the substate's mean (N, m): to be overridden where it is not linear in it."""
+        return self.transition(state, control, dt)
+
+    def log_density(
+        self, before: Float[np.ndarray, "N E"], after: Float[np.ndarray, "J E"], control: Control, dt: float
+    ) -> Float[np.ndarray, "J N"] | None:
+        """Log p(after | before) (J, N) for states (N, E) and (J, E), which backward simulation needs where `sample` draws."""
+        return None
+
+
+def draws(motion: MotionModel) -> bool:
+    """Whether `sample` does something."""
+    return type(motion).sample is not MotionModel.sample
 
 
 class ObservationModel(ABC):
@@ -450,6 +480,10 @@ class Conditional(ABC):
 
         The copies must not share memory that is written to in place.
         """
+
+    def driving(self) -> Float[np.ndarray, "N m"] | None:
+        """Mean of the substate that drives the motion, for `MotionModel.transition_given`; None holds no such."""
+        return None
 
     def consolidate(self, particles: Particles) -> Particles:
         """Takes in what the particles differ by, after a step, in place of resampling: they begin anew, all alike.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.core.genealogy import History
-from rbpf.core.models import MotionModel
+from rbpf.core.models import MotionModel, draws
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
@@ -59,6 +59,13 @@ def _transition_log_density(
     motion: MotionModel, before: np.ndarray, after: np.ndarray, control: object, dt: float
 ) -> np.ndarray:
     """Log p(after_j | before_i) up to what does not depend on i, (J, N): Mathematics (backward)."""
+    density = motion.log_density(before, after, control, dt)
+    if density is not None:
+        return density
+    if draws(motion):
+        raise InputError(
+            f"backward simulation needs the density of {type(motion).__name__}.sample: override log_density"
+        )
     transition = motion.transition(before, control, dt)
     if transition.coupling is not None and transition.coupling.shape[-1]:
         raise InputError("backward simulation takes motion models without a substate")

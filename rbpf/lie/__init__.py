@@ -6,11 +6,11 @@ estimation in robotics" (2018), and Barfoot, "State Estimation for Robotics" (20
 """
 
 from rbpf.lie.base import Array, LieGroup
-from rbpf.lie.product import Euclidean, Product
+from rbpf.lie.product import Euclidean, Finite, Product
 from rbpf.lie.se2 import SE2Group
 from rbpf.lie.se3 import SE3Group, skew
 
 SE2 = SE2Group()
 SE3 = SE3Group()
 
-__all__ = ["SE2", "SE3", "Array", "Euclidean", "LieGroup", "Product", "SE2Group", "SE3Group", "skew"]
+__all__ = ["SE2", "SE3", "Array", "Euclidean", "Finite", "LieGroup", "Product", "SE2Group", "SE3Group", "skew"]

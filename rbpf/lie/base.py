@@ -58,18 +58,23 @@ class LieGroup(ABC):
     ) -> Float[np.ndarray, " {self.size}"]:
         """Weighted Fréchet mean: the m with sum_i w_i local(m, x_i) = 0, of points (N, E) whose weights (N,) sum to one.
 
-        Gauss-Newton from the heaviest point. It is unique where the points lie within a quarter turn of one another; a wider
-        cloud gives the stationary point next to its heaviest member. The sum runs in the order of the rows: equal bytes.
+        Gauss-Newton from the heaviest point; a `Finite` part has its most probable value. It is unique where the points lie
+        within a quarter turn of one another; a wider cloud gives the stationary point next to its heaviest member. The sum
+        runs in the order of the rows: equal bytes.
         """
         points = np.asarray(x, dtype=float)
         column = np.asarray(weights, dtype=float)[:, None]
-        mean = points[np.argmax(column)]
+        mean = self._first_guess(points, column[:, 0])
         for _ in range(_MEAN_ITERATIONS):
             step = (column * self.local(mean, points)).sum(0)
             mean = self.retract(mean, step)
             if np.abs(step).max(initial=0.0) <= _MEAN_TOLERANCE:
                 break
         return mean
+
+    def _first_guess(self, points: Array, weights: Array) -> Array:
+        """Where the mean is looked for: the heaviest point."""
+        return points[np.argmax(weights)]  # type: ignore[no-any-return]
 
     @abstractmethod
     def exp(self, xi: Tangents) -> StateArray:

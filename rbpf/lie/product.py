@@ -1,4 +1,4 @@
-"""The vector space R^n, and direct products of Lie groups."""
+"""The vector space R^n, finite sets, and direct products of Lie groups."""
 
 from collections.abc import Callable, Sequence
 from itertools import accumulate, pairwise
@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbpf.arrays import Float
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
@@ -73,6 +73,57 @@ class Euclidean(LieGroup):
 
 
 @final
+class Finite(LieGroup):
+    """The numbers 0, …, n − 1, as a mode or an answer: a group without a tangent, by addition modulo n.
+
+    What is discrete moves by `MotionModel.sample` alone; its mean is the most probable value.
+    """
+
+    def __init__(self, n: int) -> None:
+        if n < 1:
+            raise InputError(f"Finite(n) needs n >= 1, got n = {n}.")
+        self.n = n
+        self.size, self.dim = 1, 0
+
+    def __repr__(self) -> str:
+        return f"Finite({self.n})"
+
+    def probabilities(self, x: States, weights: Like[ArrayLike, " N"]) -> Float[np.ndarray, " {self.n}"]:
+        """Of each value (n,), from particles (N, 1) and their weights (N,)."""
+        return np.bincount(np.asarray(x)[:, 0].astype(np.int64), np.asarray(weights, dtype=float), self.n)
+
+    def _first_guess(self, points: Array, weights: Array) -> Array:
+        return np.array([float(np.argmax(self.probabilities(points, weights)))])
+
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
+        return np.zeros((*shape, 1))
+
+    def exp(self, xi: Tangents) -> StateArray:
+        return np.zeros((*np.shape(xi)[:-1], 1))
+
+    def log(self, x: States) -> TangentArray:
+        return np.zeros((*np.shape(x)[:-1], 0))
+
+    def compose(self, a: States, b: States) -> StateArray:
+        return (np.asarray(a, dtype=float) + np.asarray(b, dtype=float)) % self.n
+
+    def inverse(self, a: States) -> StateArray:
+        return -np.asarray(a, dtype=float) % self.n
+
+    def normalise(self, x: States) -> StateArray:
+        return np.round(np.asarray(x, dtype=float)) % self.n
+
+    def adjoint(self, a: States) -> TangentMatrix:
+        return np.zeros((*np.shape(a)[:-1], 0, 0))
+
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
+        return np.zeros((*np.shape(xi)[:-1], 0, 0))
+
+    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
+        return np.zeros((*np.shape(xi)[:-1], 0, 0))
+
+
+@final
 class Product(LieGroup):
     """G_1 x G_2 x ...: storages and tangents follow one another in the order of the factors.
 
@@ -112,6 +163,10 @@ class Product(LieGroup):
     def _each(self, name: str, *arrays: list[Array]) -> Array:
         """What the factors' methods of this name make of their parts."""
         return join([getattr(group, name)(*parts) for group, *parts in zip(self.groups, *arrays, strict=True)])
+
+    def _first_guess(self, points: Array, weights: Array) -> Array:
+        parts = zip(self.groups, self.split(points), strict=True)
+        return join([group._first_guess(part, weights) for group, part in parts])
 
     def exp(self, xi: Tangents) -> StateArray:
         return self._each("exp", self.split_tangent(xi))
