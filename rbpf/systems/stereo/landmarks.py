@@ -369,11 +369,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         features = frame.features
         self.ids = self.associate(frame, belief) if frame.landmarks is None else frame.landmarks
         known = self.ids >= 0
-        if self.config.kind == "joint":
-            self.seconds = time.perf_counter() - started
-            return [Observations(features.z[known], features.cov[known], self.model, None, self.ids[known])]
         weighs = known
-        if self.config.weigh != "all":
+        if self.config.weigh != "all" and self.config.kind != "joint":
             # With this observation they are seen often enough.
             often = self.manager.observations + 1 >= self.manager.config.observations
             weighs = np.isin(self.ids, self.manager.names[often])
@@ -546,8 +543,7 @@ class NamedLandmarks(Landmarks[NamedPixels]):
     def __init__(self, rig: RectifiedStereo, config: MapConfig, likelihood: Likelihood) -> None:
         self.rig, self.config, self.model, self.landmark = rig, config, StereoPoint(rig), Point(3)
         self.ids = np.zeros(0, dtype=np.int64)
-        joint = config.kind == "joint"
-        self._sensor = NamedLandmarkSensor(self.model, self.landmark, None if joint else likelihood)
+        self._sensor = NamedLandmarkSensor(self.model, self.landmark, likelihood)
         # (M,) landmarks of the map, ascending, and how often each was seen.
         self._held, self._observations = np.zeros((2, 0), dtype=np.int64)
 
