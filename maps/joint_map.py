@@ -248,7 +248,7 @@ class JointMap(Map):
         total += _beyond_gaussian(rows, inside, chol, nu)
         slope = rows.by_marginal[inside] @ self.cov[rows.columns]
         half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        moves, cov = nu @ half, gaussian.symmetrise(self.cov - half.T @ half)
+        moves, cov = nu @ half, self.cov - half.T @ half
         fixed = rows.considered
         if fixed.size:
             # Their mean over the particles stays, and so does their covariance, Mathematics (considered).
@@ -363,7 +363,7 @@ class JointMap(Map):
         d, n = self.space.dim, mean.shape[1]
         nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
         by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
-        considered, parts = [np.zeros(0, dtype=np.int64)], list[_Group]()
+        considered, used, parts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], list[_Group]()
         for group in groups:
             model, z, noise, ids = group.model, group.z, group.cov, self._checked_ids(group)
             log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
@@ -391,6 +391,7 @@ class JointMap(Map):
             if kind is not None and jac.landmark is not None:
                 slope = jac.landmark.mean(axis=0)
                 np.put_along_axis(block, np.repeat(kind.columns[:, None], p, axis=1), slope, axis=2)
+                used.append(kind.columns.ravel())
                 considered.append(kind.columns[kind.landmark.considered(slope, _blocks(cov, kind.columns))])
             if kind is not None and anchors is not None and jac.state is not None:
                 # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
@@ -398,12 +399,15 @@ class JointMap(Map):
                 turn = turn @ self.space.right_jacobian(mean[:, kind.clones])
                 by_clone = -(jac.state @ turn).mean(axis=0)
                 np.put_along_axis(block, np.repeat(kind.clones[:, None], p, axis=1), by_clone, axis=2)
+                used.append(kind.clones.ravel())
             if jac.substate is not None:
                 block[..., d : self._first] = jac.substate.mean(axis=0)
+                used.append(np.arange(d, self._first))
             if in_world and jac.state is not None:
                 # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
                 turn = self.space.adjoint(self.space.inverse(state)) @ self.space.right_jacobian(mean[:, :d])
                 block[..., :d] = (jac.state @ turn[:, None]).mean(axis=0)
+                used.append(np.arange(d))
             by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
             nus.append(np.broadcast_to(nu, (self.n, count, p)).reshape(self.n, -1))
             by_states.append(np.broadcast_to(by_state, (self.n, count, p, d)).reshape(self.n, -1, d))
@@ -411,16 +415,15 @@ class JointMap(Map):
             first = sum(len(each) for each in noises)
             parts.append(_Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
             noises.extend(noise)
-        slope = np.concatenate(by_marginal)
-        used = np.flatnonzero(slope.any(axis=0))
-        slope = slope[:, used]
-        innovation = gaussian.symmetrise(slope @ cov[np.ix_(used, used)] @ slope.T)
+        columns = np.unique(np.concatenate(used))
+        slope = np.concatenate(by_marginal)[:, columns]
+        innovation = gaussian.symmetrise(slope @ cov[np.ix_(columns, columns)] @ slope.T)
         end = 0
         for noise in noises:
             rows = slice(end, end := end + noise.shape[0])
             innovation[rows, rows] += noise
         nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
-        return _Rows(nu, by_state, slope, used, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
+        return _Rows(nu, by_state, slope, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
 
     def _checked_ids(self, group: Observations) -> np.ndarray | None:
         """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
@@ -710,28 +713,39 @@ def _log_odds(nu: np.ndarray, cov: np.ndarray, groups: list[_Group]) -> list[np.
     """
     alone = [likelihood.log_odds(nu[rows], _blocks(cov, rows)) for likelihood, rows, _ in groups]
     taken = [odds >= 0.0 for odds in alone]
+    inside = np.concatenate([rows[took].ravel() for (_, rows, _), took in zip(groups, taken, strict=True)])
+    given = _swept(np.concatenate([cov, nu[:, None]], axis=1), inside, False)
     for _ in range(2 * sum(len(each) for each in taken) + 1):
-        inside = np.concatenate([rows[took].ravel() for (_, rows, _), took in zip(groups, taken, strict=True)])
-        info = np.linalg.inv(cov[np.ix_(inside, inside)])
-        place = np.zeros(len(nu), dtype=np.int64)
-        place[inside] = np.arange(inside.size)
-        pull, gain = info @ nu[inside], cov[:, inside] @ info
-        outer_nu, outer_cov = nu - gain @ nu[inside], cov - gain @ cov[inside]
         found = []
         for (likelihood, rows, _), took in zip(groups, taken, strict=True):
             # An inlier is left out of what it is judged by: ν = Π⁻¹ (S⁻¹ν) with covariance Π⁻¹, Π its block of S⁻¹.
-            given, spread = outer_nu[rows], _blocks(outer_cov, rows)
-            spread[took] = np.linalg.inv(_blocks(info, place[rows[took]]))
-            given[took] = (spread[took] @ pull[place[rows[took]]][..., None])[..., 0]
-            found.append(likelihood.log_odds(given, gaussian.symmetrise(spread)))
+            own, spread = given[rows, -1], _blocks(given, rows)
+            spread[took] = -np.linalg.inv(spread[took])
+            own[took] = (spread[took] @ own[took][..., None])[..., 0]
+            found.append(likelihood.log_odds(own, gaussian.symmetrise(spread)))
         amiss = [np.where(took, -odds, odds) for took, odds in zip(taken, found, strict=True)]
         worst = max(range(len(groups)), key=lambda g: amiss[g].max(initial=-np.inf))
         if not amiss[worst].max(initial=-np.inf) > 0.0:
             break
-        taken[worst][amiss[worst].argmax()] ^= True
+        which = amiss[worst].argmax()
+        given = _swept(given, groups[worst].rows[which], bool(taken[worst][which]))
+        taken[worst][which] ^= True
     return [
         np.where(took, np.maximum(odds, 0.0), np.minimum(odds, -TINY)) for took, odds in zip(taken, found, strict=True)
     ]
+
+
+def _swept(given: np.ndarray, rows: np.ndarray, back: bool) -> np.ndarray:
+    """[S | ν] (R, R + 1) swept by some rows k, or `back`: what is given all rows U that it is swept by.
+
+    Then it has −S_UU⁻¹ in U, S_UU⁻¹ν beside it, and elsewhere covariance and innovation given U (J. Goodnight 1979).
+    """
+    inverse, sign = np.linalg.inv(given[np.ix_(rows, rows)]), -1.0 if back else 1.0
+    gain, beside = given[:, rows] @ inverse, given[rows]
+    given = given - gain @ beside
+    given[rows], given[:, rows] = sign * (inverse @ beside), sign * gain
+    given[np.ix_(rows, rows)] = -inverse
+    return given
 
 
 def _beyond_gaussian(rows: _Rows, inside: np.ndarray, chol: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -768,6 +782,6 @@ def _whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def _spread(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Covariance (k, k) that weighted values (N, k) are a sample of: Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
-    offset = values - weights @ values
+    offset = np.sqrt(weights)[:, None] * (values - weights @ values)
     left = 1.0 - float(np.square(weights).sum())
-    return (weights[:, None] * offset).T @ offset / left if left > 0.0 else np.zeros((values.shape[1],) * 2)
+    return offset.T @ offset / left if left > 0.0 else np.zeros((values.shape[1],) * 2)

@@ -27,9 +27,9 @@ CONFIG = StereoConfig(
 )
 
 
-def simulated(frames: int = 40, seed: int = 0, camera=STEREO) -> FeatureLog:
+def simulated(frames: int = 40, seed: int = 0, camera=STEREO, **options) -> FeatureLog:
     world = LabWorld(LabDrive(frames=frames, every=4), points=8000)
-    return simulate_features(world, Measuring(known=0, measurements=40, new_per_frame=20), camera, seed)
+    return simulate_features(world, Measuring(known=0, measurements=40, new_per_frame=20, **options), camera, seed)
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +136,16 @@ def test_a_joint_map_keeps_what_was_seen_most(log):
     assert np.median(gone) < np.median([times[name] for name in held.tolist()])
     nees = whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]).nees
     assert nees.mean() < 12.0
+
+
+def test_wrong_pixels_in_a_joint_map():
+    """One in twenty lies anywhere: with outliers in the likelihood the filter knows its error, with a Gaussian it does not."""
+    wrong, nees = simulated(outlier_rate=0.05), []
+    for kind in ("outliers", "gaussian"):
+        likelihood = replace(StereoConfig().likelihood, kind=kind)
+        run = filtered(wrong, replace(CONFIG, particles=50, likelihood=likelihood, map=MapConfig(kind="joint")))
+        nees.append(whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]).nees.mean() / 6)
+    assert nees[0] < 2.0 and nees[1] > 10.0
 
 
 def test_the_odometry_as_proposal_needs_landmarks_that_weigh(log):

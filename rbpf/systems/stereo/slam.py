@@ -30,6 +30,7 @@ from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.features import FeatureExtractor
 from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
+from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
@@ -135,7 +136,7 @@ class StereoSlam(System):
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
         self.joint = JointMap(SE3, compiled=config.compiled) if config.map.kind == "joint" else None
         self._once = self.joint is not None or config.odometry.role == "proposal"
-        self._proposal = replace(config.proposal, kind="ekf") if self.joint else config.proposal
+        self._proposal = ProposalConfig("ekf", 1) if self.joint else config.proposal
         refined = self.joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
         if self._once and not refined:
             raise InputError(
