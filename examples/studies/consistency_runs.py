@@ -315,7 +315,7 @@ Trials = dict[str, Callable[[int], Trial]]
 
 def robot_trials(steps: int, particles: tuple[int, ...]) -> tuple[Trials, Trials]:
     """Range-bearing runs by number of particles, and with one thing changed at the middle number."""
-    world, base = RobotWorld(steps=steps), RangeBearingConfig(particles=particles[1])
+    world, base = RobotWorld(steps=steps), RangeBearingConfig(particles=particles[1], map="particles")
     changed = {
         "bootstrap proposal": replace(base, proposal=ProposalConfig(kind="prior")),
         "one linearisation": replace(base, proposal=ProposalConfig(iterations=1)),
@@ -323,7 +323,7 @@ def robot_trials(steps: int, particles: tuple[int, ...]) -> tuple[Trials, Trials
         "start never re-estimated": replace(base, anchor_every=0),
         "start re-estimated in every step": replace(base, anchor_every=1),
     }
-    sizes = {f"{n} particles": RobotTrial(world, RangeBearingConfig(particles=n)) for n in particles}
+    sizes = {f"{n} particles": RobotTrial(world, RangeBearingConfig(particles=n, map="particles")) for n in particles}
     return sizes, {name: RobotTrial(world, config) for name, config in changed.items()}
 
 

@@ -296,7 +296,7 @@ def main(
             recording = out / "log"
             if not recording.exists():
                 simulate_robot(RobotWorld(steps=30 if quick else 200, landmarks=25), recording, seed=0)
-        config = RangeBearingConfig(particles=20 if quick else 100)
+        config = RangeBearingConfig(particles=20 if quick else 100, map="particles")
         causes = robot_causes(recording, config, range(seeds), print)
     write_table(out / "causes.csv", list(HEADER), [cause.row() for cause in causes])
     save_figures({"causes.png": picture(causes)}, out)

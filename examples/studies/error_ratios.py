@@ -204,7 +204,7 @@ def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5) -> dict[s
 def simulated(folder: Path, quick: bool, seeds: int) -> Iterator[ErrorRatio]:
     """A robot's log and a rendered desk, of which everything is known."""
     simulate_robot(RobotWorld(steps=60 if quick else 200, landmarks=25), folder / "simulated_robot", seed=0)
-    yield robot_ratio(folder / "simulated_robot", RangeBearingConfig(), range(seeds))
+    yield robot_ratio(folder / "simulated_robot", RangeBearingConfig(map="particles"), range(seeds))
     width, frames = (320, 30) if quick else (640, 300)
     camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, width / 2 - 0.5, 3 * width / 8 - 0.5)
     desk = folder / "rendered_desk"
@@ -217,7 +217,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
     """The recordings that are there."""
     for name in ROBOTS:
         if (data / name).is_dir():
-            yield robot_ratio(data / name, RangeBearingConfig(), range(seeds))
+            yield robot_ratio(data / name, RangeBearingConfig(map="particles"), range(seeds))
     for name in PAIRS:
         if (data / name).is_dir():
             yield stereo_ratio(StereoRecording(data / name), StereoConfig(), range(seeds))

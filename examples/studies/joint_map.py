@@ -34,7 +34,7 @@ from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
 
 JOINT = RangeBearingConfig(map="joint")
-PARTICLES = RangeBearingConfig(likelihood=LikelihoodConfig("gaussian"))
+PARTICLES = RangeBearingConfig(map="particles", likelihood=LikelihoodConfig("gaussian"))
 """Of the same likelihood."""
 RECORDINGS = ("mrpt_kf_slam_2d", "mrpt_kf_slam_6d", "mrclam6_robot1")
 

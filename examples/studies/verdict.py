@@ -132,7 +132,7 @@ def robot(
     derivative: bool = False,
 ) -> Callable[[], Run]:
     """A robot's run."""
-    config = RangeBearingConfig(particles=particles, seed=seed, compiled=not derivative)
+    config = RangeBearingConfig(particles=particles, seed=seed, compiled=not derivative, map="particles")
 
     def run() -> Run:
         with wrong_derivative() if derivative else nullcontext():

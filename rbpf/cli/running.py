@@ -52,6 +52,7 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
         with progress() as bar, patient(bar("filtering")) as report:
             recording = RobotRecording(options.log, given_part(options))
             run = filter_recording(recording, config, out, options.resume, [listener(report)])
+        say(run.system.why_map)
         if options.batch:
             say("solving the batch problem with the same measurements …")
         with finishing():

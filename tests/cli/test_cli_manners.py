@@ -62,7 +62,7 @@ def test_without_json_nothing_is_on_standard_output(log, tmp_path, capsys):
     assert main(quick(log, tmp_path / "run")) == 0
     out, err = capsys.readouterr()
     assert out == "" and "report.html" in err
-    assert "Do not trust its uncertainty: " in err or "can be trusted cannot be told: " in err
+    assert "one Gaussian (map=joint)" in err and "rust its uncertainty: " in err
 
 
 def test_bad_input_is_exit_code_2_and_a_fault_is_1(tmp_path):

@@ -92,7 +92,7 @@ def robot(config: RangeBearingConfig | None = None) -> tuple[System, Iterator[ob
         Frame(t, still if t else None, 1e-4 * np.eye(3), np.arange(3), z + rng.normal(size=(3, 2)) * noise, cov)
         for t in count()
     )
-    return RangeBearingSlam(config or RangeBearingConfig(particles=10)), frames
+    return RangeBearingSlam(config or RangeBearingConfig(particles=10, map="particles")), frames
 
 
 def camera(config: MonoConfig = SMALL) -> tuple[System, Iterator[object]]:

@@ -15,7 +15,7 @@ def test_many_first_sightings_in_one_frame_take_time_in_proportion_to_their_numb
     z = np.stack([rng.uniform(1.0, 100.0, count), rng.uniform(-3.0, 3.0, count)], axis=1)
     cov_z = np.broadcast_to(np.diag([1e-2, 1e-3]), (count, 2, 2))
     names = np.minimum(np.arange(count), count - 2)
-    slam = RangeBearingSlam(RangeBearingConfig(particles=2))
+    slam = RangeBearingSlam(RangeBearingConfig(particles=2, map="particles"))
     started = time.process_time()
     used = slam.track(z, cov_z, names).observed["landmarks"]
     assert time.process_time() - started < 2.0  # 0.3 s; 4 s if each is compared with all before it

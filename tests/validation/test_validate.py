@@ -41,7 +41,7 @@ def page(folder) -> str:
 def test_a_finished_run_has_its_verdict_on_top(finished):
     text = page(finished)
     top = text[text.index('class="verdict') : text.index("<h2>")]
-    assert top.count('class="verdict ') == 2 and "<b>Path: fair</b>" in top and "<b>Uncertainty: " in top
+    assert top.count('class="verdict ') == 2 and "<b>Path: good</b>" in top and "<b>Uncertainty: " in top
     assert "from the truth" in top and "Pictures are in the truth&#39;s world." in top
     assert text.count("data:image/png;base64,") >= 9
     assert "http" not in text.replace("http-equiv", "")
