@@ -33,6 +33,9 @@ SHORTER = {
 }
 """Added to a command that would render or simulate for minutes."""
 
+SHORTER_OF_PAGE = {"docs/how_to/datasets.md": {("run",): ["--no-batch"]}}
+"""On a page about something else."""
+
 LEFT_OUT = {("sweep",): "--scheduler"}
 """An option with its value: tests/validation/test_sweep.py starts a cluster."""
 
@@ -173,13 +176,13 @@ def place(recording: Path, name: Path) -> None:
             shutil.copy(calibration, name.with_suffix(".yaml"))
 
 
-def shortened(arguments: list[str]) -> list[str]:
-    """The words of an `rbpf` command, with what makes it short."""
+def shortened(arguments: list[str], page: str = "") -> list[str]:
+    """The words of an `rbpf` command on a page, with what makes it short."""
     for start, option in LEFT_OUT.items():
         if tuple(arguments[: len(start)]) == start and option in arguments:
             at = arguments.index(option)
             arguments = arguments[:at] + arguments[at + 2 :]
-    for start, more in SHORTER.items():
+    for start, more in (SHORTER | SHORTER_OF_PAGE.get(page, {})).items():
         if tuple(arguments[: len(start)]) == start:
             arguments = arguments + more
     return arguments

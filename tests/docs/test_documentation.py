@@ -67,7 +67,7 @@ def run(command: list[str], block: Block) -> None:
     program = Path(command[0]).name
     where = f"{block.page}:{block.line}: {shlex.join(command)}"
     if program == "rbpf":
-        assert main(shortened(command[1:])) == 0, where
+        assert main(shortened(command[1:], block.page)) == 0, where
     elif program == "make":
         run_make(command, where)
     elif program == "python":

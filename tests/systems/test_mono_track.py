@@ -1,12 +1,11 @@
 """`MonoSlam.track`: one frame at a time, what it waits for and revises, bounded memory, exchanged parts."""
 
-import gc
 from dataclasses import replace
-from types import FunctionType, MethodType, ModuleType
 
 import numpy as np
 import pytest
 
+from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.frame_log import FrameLog
@@ -81,21 +80,6 @@ def test_known_points_wait_for_the_first_image():
     assert tracked[2].state is TrackingState.TRACKED and not tracked[2].messages
     as_usual = tracked_all(MonoSlam(CAMERA, CONFIG, KNOWN), frames[2:])
     assert tracked[-1].pose.tobytes() == as_usual[-1].pose.tobytes()
-
-
-def held_bytes(root: object) -> int:
-    """Of all arrays that an object refers to, directly or not."""
-    seen, waiting, total = set(), [root], 0
-    while waiting:
-        item = waiting.pop()
-        while isinstance(item, np.ndarray) and item.base is not None:
-            item = item.base
-        if id(item) in seen or isinstance(item, type | ModuleType | FunctionType | MethodType):
-            continue
-        seen.add(id(item))
-        total += item.nbytes if isinstance(item, np.ndarray) else 0
-        waiting.extend(gc.get_referents(item))
-    return total
 
 
 @pytest.mark.slow
