@@ -251,10 +251,13 @@ class JointMap(Map):
         moves, cov = nu @ half, self.cov - half.T @ half
         fixed = rows.considered
         if fixed.size:
-            # Their mean over the particles stays, and so does their covariance, Mathematics (considered).
+            # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
+            # are wider apart than they are uncertain would take more out of it than there is: they are off, not informative.
             moves[:, fixed] -= moves[:, fixed].mean(axis=0)
+            values, vectors = np.linalg.eigh(_spread(nu, np.full(self.n, 1.0 / self.n)))
+            root = np.sqrt(np.clip(values, 0.0, 1.0))[:, None] * vectors.T @ half[:, fixed]
             at = np.ix_(fixed, fixed)
-            cov[at] = self.cov[at] - _spread(moves[:, fixed], np.full(self.n, 1.0 / self.n))
+            cov[at] = self.cov[at] - gaussian.symmetrise(root.T @ root)
         self.mean, self.cov = self.mean + moves, cov
         return LogDensities(total, np.zeros_like(total))
 

@@ -251,6 +251,17 @@ def test_depth_without_parallax_is_considered():
     assert np.trace(joint.cov) < np.trace(before[1])
 
 
+def test_particles_that_are_far_off_leave_a_covariance():
+    """Innovations of many standard deviations: what is considered is not told to be better known than that allows."""
+    joint, _ = rays(5)
+    joint._kinds[1] = InverseDepth(0.1, least_parallax=1e9)
+    joint.mean[:, :6] = 0.0
+    state, ids = SE3.exp(0.2 * np.random.default_rng(3).normal(size=(5, 6))), np.array([20, 21, 22, 23])
+    z, cov = np.full((4, 2), 300.0), np.repeat(np.eye(2)[None], 4, axis=0)
+    joint.correct(state, np.zeros((5, 6)), [Observations(z, cov, CameraRay(CAMERA), ids=ids)])
+    assert np.linalg.eigvalsh(joint.cov).min() > -1e-15
+
+
 def test_a_checkpoint_with_clones(tmp_path):
     frames = turned().frames(FromAnchor(SE2))
     ends = []
