@@ -64,8 +64,8 @@ class StepReport:
     ess: float  #: effective sample size before resampling.
     resampled: bool  #: whether the particles were resampled or consolidated before they moved.
     #: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density, or where
-    #: observations of landmarks updated only the state or only the landmarks: that is no density of what was
-    #: measured.
+    #: observations of landmarks updated only the state or only the landmarks, and no other group of the same ones
+    #: the rest: that is no density of what was measured.
     log_evidence: float
     #: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
     #: innovation of the rows that took part, a weighted mean over the particles.
@@ -247,7 +247,7 @@ class Filter:
 
         # Start landmarks, and report.
         first_observations, new_landmarks = self._start_landmarks(frame, groups)
-        evidence = look_ahead + correction if all(map(is_explained, groups)) else float("nan")
+        evidence = look_ahead + correction if are_explained(groups) else float("nan")
         self.log_evidence += evidence
         self._end(stamp_ns)
         if self.consolidation is not None:
@@ -436,10 +436,25 @@ class Filter:
         return born, np.concatenate(ids)
 
 
-def is_explained(group: Observations) -> bool:
-    """Whether the weights take in the density of a group's measurements given all before: each counts, and once."""
-    whole = Part.LANDMARK not in group.model.reads or len(group.updates) == 2
-    return whole and group.normalised and (group.likelihood is None or group.likelihood.normalised)
+def are_explained(groups: Sequence[Observations]) -> bool:
+    """Whether the weights take in the density of a step's measurements given all before: each counts, and once.
+
+    Measurements that one group gives to the state and another one to the landmarks are whole.
+    """
+    if not all(group.normalised and (group.likelihood is None or group.likelihood.normalised) for group in groups):
+        return False
+    halves = [group for group in groups if Part.LANDMARK in group.model.reads and len(group.updates) == 1]
+    rest = [half for half in halves if Part.STATE not in half.updates]
+    return len(halves) == 2 * len(rest) and all(
+        any(are_same(half, other) for other in rest) for half in halves if Part.STATE in half.updates
+    )
+
+
+def are_same(one: Observations, other: Observations) -> bool:
+    """Whether two groups are of the same measurements, whatever they update."""
+    rows = {name: getattr(one, name) for name in ("z", "cov", "ids", "log_odds")}
+    alike = vars(replace(other, **rows, updates=one.updates)) == vars(one)
+    return alike and all(np.array_equal(array, getattr(other, name)) for name, array in rows.items())
 
 
 def told(belief: Belief, sensor: Sensor) -> Belief:

@@ -72,13 +72,18 @@ def landmarks(filter_: Filter) -> Records:
 def test_one_group_for_each_is_one_group_for_both(space, proposal, compiled):
     """E06 §5.2 with the same model in both: whole runs with resampling agree."""
     world, frames = scene(space)
+    ((groups,), *_) = frames
     both, reports = run(world, frames, compiled, proposal)
     parted, others = run(world, [split(*groups) for groups in frames], compiled, proposal)
     assert both.lineage.generation == parted.lineage.generation > 0
     np.testing.assert_allclose(parted.particles.state, both.particles.state, atol=1e-9)
     np.testing.assert_allclose(parted.particles.log_weights, both.particles.log_weights, atol=1e-7)
-    # The parts of a measurement are no density of it, whatever they add up to.
-    assert np.isfinite(both.log_evidence) and np.isnan([other.log_evidence for other in others]).all()
+    # Both parts of a measurement are its density; of the parts of two, that differ in a row or the noise, that is not said.
+    assert [other.log_evidence for other in others] == pytest.approx([one.log_evidence for one in reports], abs=1e-7)
+    assert np.isfinite(both.log_evidence)
+    for change in ({"z": groups.z[::-1]}, {"cov": 2.0 * groups.cov}, {"ids": groups.ids[::-1]}):
+        first, second = split(groups)
+        assert np.isnan(run(world, [[first, replace(second, **change)]], compiled, proposal)[0].log_evidence)
     assert [other.rows for other in others] == [one.rows for one in reports]
     np.testing.assert_allclose(landmarks(parted).mean, landmarks(both).mean, atol=1e-9)
     np.testing.assert_allclose(landmarks(parted).cov, landmarks(both).cov, atol=1e-11)
