@@ -1,6 +1,8 @@
 """Bytes of a file, damaged at random: by chance, and by what breaks careless readers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from hypothesis import strategies as st
 
@@ -47,3 +49,13 @@ def read_or_refused(read: Callable[[], object]) -> None:
     else:
         return
     assert said.strip() and "\n" not in said
+
+
+@contextmanager
+def restored(path: Path) -> Iterator[bytes]:
+    """What a file holds, which is put back afterwards."""
+    whole = path.read_bytes()
+    try:
+        yield whole
+    finally:
+        path.write_bytes(whole)

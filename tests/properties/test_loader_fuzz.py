@@ -23,7 +23,7 @@ from rbpf.validation.consistency.comparison import read_comparisons
 from rbpf.validation.report.page import write_report
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
-from tests.properties.mutations import damaged, read_or_refused
+from tests.properties.mutations import damaged, read_or_refused, restored
 
 pytestmark = pytest.mark.slow
 
@@ -89,14 +89,11 @@ READ = ["config.yaml", "summary.json", "trajectory.npz", "truth.npz", "map.npz",
 @given(data=st.data())
 def test_run_folders(run, data):
     path = run / data.draw(st.sampled_from([*READ, "validation_groundtruth.json"]))
-    whole = path.read_bytes()
-    try:
+    with restored(path) as whole:
         path.write_bytes(data.draw(damaged(whole)))
         read_or_refused(lambda: read_all(run))
         read_or_refused(lambda: load(run).estimate)
         read_or_refused(lambda: read_comparisons(run))
-    finally:
-        path.write_bytes(whole)
 
 
 def read_all(run: Path) -> None:
@@ -108,12 +105,9 @@ def read_all(run: Path) -> None:
 @given(data=st.data())
 def test_the_report_of_a_damaged_run(run, data):
     path = run / data.draw(st.sampled_from(READ))
-    whole = path.read_bytes()
-    try:
+    with restored(path) as whole:
         path.write_bytes(data.draw(damaged(whole)))
         read_or_refused(lambda: write_report(run))
-    finally:
-        path.write_bytes(whole)
 
 
 @FEW
@@ -165,8 +159,7 @@ def known(tmp_path_factory) -> Path:
 @FEW
 @given(data=st.data())
 def test_maps_to_find_a_camera_in(known, data):
-    whole = known.read_bytes()
-    try:
+    with restored(known) as whole:
         if data.draw(st.booleans()):
             known.write_bytes(data.draw(damaged(whole)))
         else:
@@ -174,8 +167,6 @@ def test_maps_to_find_a_camera_in(known, data):
             name = data.draw(st.sampled_from(sorted(arrays)))
             save_arrays(known, arrays | {name: data.draw(others(arrays[name]))})
         read_or_refused(lambda: read_known_map(known))
-    finally:
-        known.write_bytes(whole)
 
 
 @st.composite

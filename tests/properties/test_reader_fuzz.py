@@ -21,7 +21,7 @@ from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, rea
 from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.properties.mutations import damaged, read_or_refused
+from tests.properties.mutations import damaged, read_or_refused, restored
 from tests.readers import small
 from tests.readers.images import bags, folders
 from tests.validation.worlds import world
@@ -158,24 +158,18 @@ def recording(request, tmp_path_factory) -> tuple[Path, Read, list[Path]]:
 def test_a_damaged_file_is_read_or_refused(recording, data):
     folder, read, files = recording
     path = data.draw(st.sampled_from(files), "file")
-    whole = path.read_bytes()
-    try:
+    with restored(path) as whole:
         path.write_bytes(data.draw(damaged(whole), "content"))
         read_or_refused(lambda: read(folder))
-    finally:
-        path.write_bytes(whole)
     assert not (folder / "pwned").exists() and not Path("pwned").exists()
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_a_damaged_video_is_read_or_refused(video, data):
-    whole = video.read_bytes()
-    try:
+    with restored(video) as whole:
         video.write_bytes(data.draw(damaged(whole)))
         read_or_refused(lambda: frames(video))
-    finally:
-        video.write_bytes(whole)
 
 
 @pytest.fixture(scope="module")
