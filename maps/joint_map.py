@@ -43,14 +43,17 @@ from rbpf.core.models import (
     Records,
     Transition,
 )
-from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights
+from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
+from rbpf.kernels.dense import product
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
 from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
 from rbpf.maps.point import Point
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
+QUICK = 30_000_000
+"""Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
 GAUSSIAN = Gaussian()
 TINY = float(np.finfo(float).tiny)
 
@@ -203,9 +206,11 @@ class JointMap(Map):
         prior, weights = belief.prior, belief.weights
         rows = self._seen_through(belief.state, groups, prior)
         spread = np.einsum("n,nra->ra", weights, rows.by_state @ prior.spread(prior.mean))
-        nu = weights @ rows.nu
+        nu = weighted_mean(rows.nu, weights)
         apart = rows.nu - nu
-        chosen = iter(_log_odds(nu, rows.cov + spread @ spread.T + (weights[:, None] * apart).T @ apart, rows.groups))
+        chosen = iter(
+            _log_odds(nu, rows.cov + spread @ spread.T + _product((weights[:, None] * apart).T, apart), rows.groups)
+        )
         decided = []
         for group in groups:
             log_odds = np.full(len(group.z), np.inf)
@@ -246,9 +251,9 @@ class JointMap(Map):
         nu = _whitened(chol, rows.nu[:, inside, None])[..., 0]
         total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + _log_det(chol))
         total += _beyond_gaussian(rows, inside, chol, nu)
-        slope = rows.by_marginal[inside] @ self.cov[rows.columns]
+        slope = _product(rows.by_marginal[inside], self.cov[rows.columns])
         half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        moves, cov = nu @ half, self.cov - half.T @ half
+        moves, cov = _product(nu, half), self.cov - _product(half.T, half)
         fixed = rows.considered
         if fixed.size:
             # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
@@ -312,7 +317,7 @@ class JointMap(Map):
         world = self.world(state)
         origin, centre = space.mean(world, weights), space.mean(state, weights)
         # Every particle's means as seen from its own robot, and T, by which the covariance turns with their mean.
-        before = weights @ self.mean
+        before = weighted_mean(self.mean, weights)
         moved = self.mean.copy()
         moved[:, :d] = space.local(origin, world)
         slopes = [(np.arange(d), self._turn(particles))]
@@ -326,7 +331,7 @@ class JointMap(Map):
             at = self._clone_columns(np.arange(len(clones)))
             clones = space.between(centre, space.retract(clones, before[at]))
             moved[:, at] = space.local(clones, space.between(state[:, None], self._poses(self.mean, at, self.clones)))
-        mean = weights @ moved
+        mean = weighted_mean(moved, weights)
         if len(clones):
             slopes.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
         mean[:d] = 0.0  # the mean of all worlds is the origin
@@ -343,7 +348,7 @@ class JointMap(Map):
     def _turn(self, particles: Particles) -> np.ndarray:
         """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
         centre = self.space.mean(particles.state, particles.weights)
-        frame = particles.weights @ self.mean[:, : self.space.dim]
+        frame = weighted_mean(self.mean[:, : self.space.dim], particles.weights)
         return self.space.adjoint(self.space.inverse(centre)) @ self.space.right_jacobian(frame)
 
     def _given(self, increment: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -420,7 +425,7 @@ class JointMap(Map):
             noises.extend(noise)
         columns = np.unique(np.concatenate(used))
         slope = np.concatenate(by_marginal)[:, columns]
-        innovation = gaussian.symmetrise(slope @ cov[np.ix_(columns, columns)] @ slope.T)
+        innovation = gaussian.symmetrise(_product(_product(slope, cov[np.ix_(columns, columns)]), slope.T))
         end = 0
         for noise in noises:
             rows = slice(end, end := end + noise.shape[0])
@@ -783,8 +788,15 @@ def _whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.asarray(solved).reshape(count, n, k).transpose(1, 0, 2)
 
 
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Left (m, k) times right (k, n)."""
+    if left.size * right.shape[1] > QUICK:
+        return left @ right
+    return np.asarray(product(np.ascontiguousarray(left), np.ascontiguousarray(right)))
+
+
 def _spread(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Covariance (k, k) that weighted values (N, k) are a sample of: Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
-    offset = np.sqrt(weights)[:, None] * (values - weights @ values)
+    offset = np.sqrt(weights)[:, None] * (values - weighted_mean(values, weights))
     left = 1.0 - float(np.square(weights).sum())
-    return offset.T @ offset / left if left > 0.0 else np.zeros((values.shape[1],) * 2)
+    return _product(offset.T, offset) / left if left > 0.0 else np.zeros((values.shape[1],) * 2)

@@ -64,6 +64,11 @@ def effective_sample_size(weights: np.ndarray) -> float:
     return float(1.0 / np.square(weights).sum())
 
 
+def weighted_mean(values: Float[np.ndarray, "N k"], weights: Float[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
+    """Σ W values (k,), row by row: BLAS would add up in another order on another number of threads."""
+    return np.asarray((weights[:, None] * values).sum(axis=0))
+
+
 def take(array: np.ndarray, ancestors: np.ndarray | slice) -> np.ndarray:
     """Rows of the ancestors; an array shared by all particles (first axis 1) stays as it is."""
     return array if array.shape[0] == 1 else array[ancestors]
@@ -203,7 +208,7 @@ def balanced(
     if left * effective_sample_size(weights) <= 2.0 * noise.shape[1] + apart.shape[1] + 1.0:
         return noise if left > 0.0 else np.zeros_like(noise)
     column = weights[:, None]
-    noise, apart = noise - weights @ noise, apart - weights @ apart
+    noise, apart = noise - weighted_mean(noise, weights), apart - weighted_mean(apart, weights)
     inverse = np.linalg.pinv((column * apart).T @ apart, hermitian=True)
     noise = noise - apart @ (inverse @ ((column * apart).T @ noise))
     chol = np.linalg.cholesky((column * noise).T @ noise / left)

@@ -1,7 +1,8 @@
-"""Linear algebra of one small matrix: Cholesky's factor in its lower triangle, and what is solved by it."""
+"""Linear algebra of small matrices: Cholesky's factor in its lower triangle, what is solved by it, and products."""
 
 import math
 
+import numpy as np
 from numba import njit
 
 
@@ -33,3 +34,20 @@ def solve(chol, vector):
         for b in range(a + 1, vector.size):
             vector[a] -= chol[b, a] * vector[b]
         vector[a] /= chol[a, a]
+
+
+@njit(cache=True, error_model="numpy")
+def product(left, right):
+    """(m, k) times (k, n), C-contiguous: the same bytes on any number of threads, which BLAS does not promise."""
+    m, count = left.shape
+    out = np.zeros((m, right.shape[1]))
+    whole = count - count % 4
+    for i in range(m):
+        for k in range(0, whole, 4):
+            a, b, c, d = left[i, k], left[i, k + 1], left[i, k + 2], left[i, k + 3]
+            for j in range(right.shape[1]):
+                out[i, j] += (a * right[k, j] + b * right[k + 1, j]) + (c * right[k + 2, j] + d * right[k + 3, j])
+        for k in range(whole, count):
+            for j in range(right.shape[1]):
+                out[i, j] += left[i, k] * right[k, j]
+    return out

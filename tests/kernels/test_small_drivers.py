@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rbpf.kernels.dense import product
 from rbpf.kernels.increment import are_sound, conditioned
 from rbpf.kernels.robust_fit import robust_fit
 
@@ -85,3 +86,9 @@ def test_soundness(rng):
         bad = cov.copy()
         bad[place] = value
         assert not are_sound(z, bad)
+
+
+@pytest.mark.parametrize(("m", "k", "n"), [(3, 7, 5), (2, 4, 1), (1, 0, 2), (0, 3, 2)])
+def test_a_product_is_numpys(m, k, n, rng):
+    left, right = rng.normal(size=(m, k)), rng.normal(size=(k, n))
+    np.testing.assert_allclose(product(left, right), left @ right, rtol=1e-12, atol=1e-14)
