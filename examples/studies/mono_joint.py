@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from examples.studies.consistency_runs import Mean
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
@@ -115,6 +116,19 @@ def joint_run(log: FeatureLog, config: MonoConfig, window: int, true_depth: bool
     return np.array(poses), np.array(covs)
 
 
+def draw(curves: dict[str, np.ndarray], path: Path) -> None:
+    """The median of the recordings' NEES (S, T) over time, and all of them thinly."""
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    for number, (name, nees) in enumerate(curves.items()):
+        axes.plot(np.median(nees, axis=0), color=f"C{number}", label=name)
+        axes.plot(nees.T, color=f"C{number}", lw=0.4, alpha=0.4)
+    axes.axhline(1.0, color="black", lw=0.8)
+    axes.set(xlabel="frame", ylabel="NEES / 6", yscale="log", title="pose, median of the recordings and each of them")
+    axes.legend(fontsize="small")
+    figure.savefig(path, dpi=110)
+
+
 def main(
     seeds: int = 10,
     first: int = 0,
@@ -134,7 +148,7 @@ def main(
         particles: of the joint map.
         own_maps: particles with maps of their own.
         windows: frames of the joint map's window.
-        out: folder for the table.
+        out: folder for table and picture.
         quick: two short recordings, few particles.
     """
     if quick:
@@ -142,6 +156,7 @@ def main(
     names = [f"maps of their own, {own_maps}"]
     names += [f"joint map, {particles}, window {w}{end}" for w in windows for end in ("", ", true depth")]
     errors: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
+    curves: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for seed in range(first, first + seeds):
         log = simulate_features(DeskWorld(frames=frames), Measuring(), MONO, seed)
         assert log.truth is not None
@@ -152,6 +167,7 @@ def main(
         paths += [joint_run(log, config, window, true) for window in windows for true in (False, True)]
         for name, (poses, covs) in zip(names, paths, strict=True):
             nees = whitened_errors(SE3, poses, covs, truth).nees
+            curves[name].append(nees / 6.0)
             distance = np.linalg.norm(poses[:, 4:] - truth[:, 4:], axis=1)
             inside = 100.0 * float((nees <= BOUND).mean())
             errors[name].append((float(nees.mean()) / 6.0, inside, 1e3 * float(np.sqrt(np.square(distance).mean()))))
@@ -170,6 +186,7 @@ def main(
         "filter", "runs", "NEES / 6", "± s.e.", "median", "worst", "in 95 % [%]", "± s.e.", "error [mm]", "median", "worst",
     ]  # fmt: skip
     write_table(out / "mono_joint.csv", header, rows)
+    draw({name: np.array(of_runs) for name, of_runs in curves.items()}, out / "mono_joint.png")
     return {name: float(np.median(np.array(of_runs)[:, 0])) for name, of_runs in errors.items()}
 
 

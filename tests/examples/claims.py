@@ -91,6 +91,11 @@ def joint_map(figures: dict[str, float]) -> None:
     assert 0.8 < figures["stereo joint, 50 particles: map"] < 1.25
 
 
+def mono_joint(figures: dict[str, float]) -> None:
+    assert 0.3 < figures["joint map, 50, window 1"] < 1.6
+    assert 0.3 < figures["joint map, 50, window 1, true depth"] < 1.4
+
+
 def lab_images(figures: dict[str, dict[str, float]]) -> None:
     clear, dim = figures.values()
     assert dim["share matched, left to right"] < 0.9 * clear["share matched, left to right"]
