@@ -102,9 +102,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "named features, nothing known": lambda: named(False),
     "stereo": stereo,
     "named stereo": named_stereo,
-    "robot": lambda: robot("known"),
+    "robot": lambda: robot("known", map="particles"),
     "robot, unnamed": lambda: robot("ml"),
-    "robot, joint map": lambda: robot("known", map="joint"),
+    "robot, joint map": lambda: robot("known"),
 }
 
 
