@@ -127,4 +127,5 @@ def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
         figures = compare_gtsam(found, optimum).figures
     except InputError as error:  # too short, or its camera stays where it began
         return entries | {"batch_problem": str(error)}
-    return entries | {"filter_minus_batch_rmse_m": figures["filter_minus_batch_rmse_m"]}
+    shown = ("filter_minus_batch_rmse_m", "log_evidence_batch", "log_evidence_batch_error", "posterior_draws_ess")
+    return entries | {name: figures[name] for name in shown if name in figures}

@@ -67,9 +67,10 @@ NAMES_OF_PAGE = {
 }
 
 BEFORE = {
+    "docs/how_to/after_the_run.md": [["run", "range-bearing", "log", "--out", "run", "--no-batch"]],
     "docs/how_to/compare.md": [
         ["run", "mono", "desk", "--known-points", "desk/known_points.csv", "--out", "out/mono", "--no-video"]
-    ]
+    ],
 }
 """Commands that a page takes as done."""
 

@@ -13,13 +13,24 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_map, write_run, write_summary, write_trajectory
 from rbpf.runs.measurement_files import write_measurements
-from rbpf.runs.reading import PathAndMap
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.recordings import filter_features
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.consistency.against_batch import SAME, SCALED, compare, compare_folder, compare_run
+from rbpf.validation.consistency import against_batch
+from rbpf.validation.consistency.against_batch import (
+    DRAWS,
+    LANDMARKS,
+    POSES,
+    SAME,
+    SCALED,
+    compare,
+    compare_folder,
+    compare_run,
+    compare_with_batch,
+)
 from rbpf.validation.gtsam.batch_problem import problem_of, read_problem, solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose
 from tests.validation.camera_scenes import scene
@@ -48,6 +59,16 @@ def test_in_a_linear_world_the_filter_is_the_batch_within_monte_carlo_error(line
     assert found.poses.keys.tolist() == [11]
     assert found.scale == 1.0 and found.gauge == SAME
     assert found.fit_batch.sightings == found.fit_filter.sightings == len(found.optimum.problem.z)
+
+
+def test_a_posterior_that_is_not_gaussian_is_no_witness(folder, monkeypatch):
+    found, _ = compare_with_batch(RunFolder.open(folder))
+    assert {POSES, LANDMARKS} < {statistic.name for statistic in found.statistics}
+    assert found.figures["posterior_draws_ess"] > 0.99 * DRAWS and "no witness" not in found.accuracy
+    monkeypatch.setattr(against_batch, "LEAST_COUNT", 1.1)
+    found, _ = compare_with_batch(RunFolder.open(folder))
+    assert not {POSES, LANDMARKS} & {statistic.name for statistic in found.statistics}
+    assert "so that it is no witness of the uncertainty." in found.accuracy
 
 
 def test_a_folder_tells_the_same_as_the_run(linear_run, folder):

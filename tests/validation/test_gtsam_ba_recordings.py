@@ -12,13 +12,14 @@ from rbpf import gaussian
 from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_vo import MotionPrior
 from rbpf.runs.trajectory import align
-from rbpf.sensors.readers import RobotLog, open_log
-from rbpf.sensors.readers.measurements import KINDS, Measurements, initial_estimate, point_dim
+from rbpf.sensors.readers import LogNoise, RobotLog, open_log
+from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measurements, initial_estimate, point_dim
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
 from rbpf.validation.gtsam.observations import observation_table
+from rbpf.validation.gtsam.path_sampling import draw_posterior
 from rbpf.validation.gtsam.robot import Problem, solve
 from rbpf.validation.metrics.accuracy import landmark_errors
 
@@ -140,6 +141,24 @@ def test_visual_odometry_alone(tracks, solved):
     assert not any(one.messages for one in said)
     assert np.sqrt(np.square(off).mean()) < 0.1
     assert off[-1] < 0.2
+
+
+@pytest.mark.parametrize(("folder", "error"), [("mrpt_kf_slam_2d", 0.01), ("mrclam6_robot1", 0.15)])
+def test_the_evidence_of_a_recording_does_not_hang_on_the_seed(data_dir, folder, error):
+    found = []
+    for scale in (0.5, 1.0, 2.0):
+        m = from_log(open_log(data_dir / folder, LogNoise(scale_odometry=scale)))
+        batch = solve(m, marginals=False, incremental=True)
+        start = InitialEstimate(batch.world_from_robot, batch.landmarks)
+        draws = [
+            draw_posterior(m, start, np.random.default_rng(seed), 200) for seed in ((0, 1) if scale == 1.0 else (0,))
+        ]
+        found.append(draws[0].log_evidence)
+        if scale == 1.0:
+            assert max(one.error for one in draws) < error
+            assert abs(draws[0].log_evidence - draws[1].log_evidence) < 4.0 * error
+    # The simulator's noise is the stated one, that of the other log the best of these too.
+    assert found[1] > max(found[0], found[2]) + 20.0
 
 
 def from_log(log: RobotLog, start: Array | None = None) -> Measurements:

@@ -78,6 +78,11 @@ def test_gtsam_stands_beside(run_folder, tmp_path, capsys):
     assert 0.0 < figures["poses_bhattacharyya_median"] < 5.0 and figures["poses_count"] == 1
     assert 0.5 < figures["landmarks_sigma_ratio_median"] < 1.5
     assert figures["batch_log_likelihood"] > figures["filter_log_likelihood"] - 5.0
+    summary = json.loads((run_folder / "summary.json").read_text())
+    names = ("log_evidence_batch", "log_evidence_batch_error", "posterior_draws_ess")
+    assert [figures[name] for name in names] == pytest.approx([summary[name] for name in names], abs=0.01)
+    assert figures["log_evidence_batch_error"] < 0.1 and figures["posterior_draws_ess"] > 150.0
+    assert figures["log_evidence_batch"] == pytest.approx(summary["log_evidence"], abs=30.0)
     assert "Against gtsam" in page(run_folder)
     assert "Against the ground truth" in page(run_folder)
     assert "uncertainty" in capsys.readouterr().err.replace("\n", " ")

@@ -7,6 +7,10 @@ What is conditioned on what. The map and the last pose know the same measurement
 Gaussians. An earlier online pose knows its past only, the optimum's also its future: of it the squared error is told that
 the optimum's posterior expects, see `rbpf.validation.consistency.statistic.posterior_ratio`.
 
+A second witness. The weights of draws from a robot's batch posterior say whether the posterior is the Gaussian that filter and
+covariances are compared with, see `rbpf.validation.gtsam.path_sampling`; where hardly a draw counts, it is not, and says
+nothing of the filter's uncertainty. They give the evidence of the measurements besides.
+
 Gauge. One camera without known points does not measure the scale: the filter's is its prior's, the batch's is held.
 Both begin at the same first pose; the filter is scaled about it, so that its path fits the optimum's best, and
 densities are compared in the directions that a change of scale does not move: across the line from the first camera
@@ -24,6 +28,7 @@ from rbpf.lie import Array
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
 from rbpf.validation.gtsam.batch_problem import (
@@ -39,6 +44,7 @@ from rbpf.validation.gtsam.batch_problem import (
     solve_problem,
 )
 from rbpf.validation.gtsam.observations import HUBER
+from rbpf.validation.gtsam.path_sampling import draw_posterior
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 from rbpf.validation.metrics.gaussian_differences import (
     Differences,
@@ -57,6 +63,10 @@ POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the bat
 
 LEAST_STEPS = 3
 """Of a run that is compared."""
+DRAWS = 200
+"""Of paths and maps from a robot's batch posterior."""
+LEAST_COUNT = 0.1
+"""Fraction of them that has to count for the posterior to be a witness."""
 SAME = "one world: nothing to fix"
 SCALED = "the filter scaled about the first camera onto the optimum; densities across the line from that camera"
 
@@ -215,16 +225,27 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
         "path_spread_m": found.optimum.estimate.trajectory.spread,
         "batch_error": found.optimum.error,
     }
-    statistics = found.statistics()
+    statistics, said = found.statistics(), ""
     if not isinstance(problem, FeatureLog):
         residuals = problem.z.size - found.optimum.estimate.landmarks.mean.size
         figures["batch_error_right"] = 0.5 * residuals
         if residuals > 0:
             value = 2.0 * found.optimum.error / residuals
             statistics.insert(0, variance_ratio(RESIDUALS, value, residuals, NOISE_FACTOR))
+        batch = found.optimum.estimate
+        start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
+        draws = draw_posterior(problem, start, np.random.default_rng(0), DRAWS)
+        figures |= {"log_evidence_batch": draws.log_evidence, "log_evidence_batch_error": draws.error}
+        figures |= {"posterior_draws": DRAWS, "posterior_draws_ess": draws.ess}
+        if draws.ess < LEAST_COUNT * DRAWS:
+            statistics = [s for s in statistics if s.name not in (POSES, LANDMARKS)]
+            said = (
+                f"; that posterior is not Gaussian (of {DRAWS} draws from its Gaussian {draws.ess:.0f} count), so that it is "
+                "no witness of the uncertainty"
+            )
     accuracy = f"The path is {1e3 * found.path.rmse:.3g} mm (rms) from the batch optimum of the same measurements"
     # Single numbers of the Gaussians for the page; the rows behind them are `AgainstBatch.as_dict`'s.
     figures |= figures_of("landmarks", found.landmarks) | figures_of("poses", found.poses)
     for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
         figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
-    return Comparison("gtsam", f"{accuracy}.", figures, statistics), found
+    return Comparison("gtsam", f"{accuracy}{said}.", figures, statistics), found

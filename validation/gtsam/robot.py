@@ -6,7 +6,7 @@ F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 
     start:        x₀ = the known pose, a hard constraint
     odometry:     Log(δ_t⁻¹ x_{t−1}⁻¹ x_t) ~ N(0, Q_t)
-    observation:  h(x_t, l) − z ~ N(0, R), h and its derivatives from the filter's own observation model
+    observation:  h(x_t, l) − z ~ N(0, R), h and its derivatives as written in `Sensor`
 
 A singular Q_t (a robot that cannot slip sideways) is kept exactly: the residual is turned into Q_t's
 eigenvectors, and those without variance become hard constraints. A solver that starts far away would have to
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.errors import InputError
-from rbpf.lie import Array, SE2Group
+from rbpf.lie import Array, SE2Group, skew
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
 from rbpf.validation.gtsam.observations import SINGULAR
 from rbpf.validation.gtsam.solvers import (
@@ -140,7 +140,7 @@ def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterat
         params.setRelinearizeThreshold(moved)
     isam, m = gtsam.ISAM2(params), problem.m
     held = isam.getLinearizationPoint()  # while Python knows this object, no call of a factor copies it
-    pose, seen = m.start, set[int]()
+    pose, seen, start = m.start, set[int](), m.model()
     for first in range(0, len(m.stamps_ns), chunk):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for step in range(first, min(first + chunk, len(m.stamps_ns))):
@@ -151,7 +151,7 @@ def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterat
                 landmark = int(problem.index[row])
                 if landmark not in seen:
                     seen.add(landmark)
-                    values.insert(problem.landmark_key(landmark), problem.model.invert(pose, m.z[row]))
+                    values.insert(problem.landmark_key(landmark), start.invert(pose, m.z[row]))
         isam.update(graph, values)
         if moved is not None:
             isam.update()
@@ -171,6 +171,46 @@ def _explaining(problem: "Problem") -> Iterator[None]:
 
 
 @final
+class Sensor:
+    """What a robot's sensor measures, written apart from the filter's own model, which the batch is to judge."""
+
+    def __init__(self, m: Measurements) -> None:
+        self._space, self._sign, self._mount = m.space, m.pitch_sign, m.robot_from_sensor
+        self._polar, self._turn = m.measurement == "range_bearing", m.space.rotation(m.robot_from_sensor).T
+
+    def residual(self, pose: Array, point: Array, z: Array) -> Array:
+        """What is expected of points (…, D) from poses (…, E), less what was measured (…, p); angles in (−π, π]."""
+        at = self._space.inverse_transform(self._mount, self._space.inverse_transform(pose, point))
+        if not self._polar:
+            return at - z
+        angles = [np.arctan2(at[..., 1], at[..., 0])]
+        if at.shape[-1] == 3:
+            angles.append(self._sign * np.arctan2(at[..., 2], np.hypot(at[..., 0], at[..., 1])))
+        turned = np.stack(angles, axis=-1) - z[..., 1:]
+        turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
+        return np.concatenate([np.linalg.norm(at, axis=-1, keepdims=True) - z[..., :1], turned], axis=-1)
+
+    def slopes(self, pose: Array, point: Array) -> tuple[Array, Array]:
+        """∂/∂pose (…, p, d) in its right chart and ∂/∂point (…, p, D), of poses (…, E) and points (…, D)."""
+        near = self._space.inverse_transform(pose, point)
+        at = self._space.inverse_transform(self._mount, near)
+        planar, slope = at.shape[-1] == 2, self._turn
+        if self._polar:
+            x, y, flat, far = at[..., 0], at[..., 1], np.hypot(at[..., 0], at[..., 1]), np.linalg.norm(at, axis=-1)
+            rows = [
+                at / far[..., None],
+                np.stack([-y, x] if planar else [-y, x, 0 * x], axis=-1) / flat[..., None] ** 2,
+            ]
+            if not planar:
+                high = at[..., 2] / flat
+                rows.append(self._sign * np.stack([-x * high, -y * high, flat], axis=-1) / far[..., None] ** 2)
+            slope = np.stack(rows, axis=-2) @ slope
+        turning = np.stack([near[..., 1:], -near[..., :1]], axis=-2) if planar else skew(near)
+        still = np.broadcast_to(-np.eye(at.shape[-1]), (*near.shape, at.shape[-1]))
+        return slope @ np.concatenate([turning, still], axis=-1), slope @ self._space.rotation(pose).mT
+
+
+@final
 class Problem:
     """Variables and factors of a run; see `solve`.
 
@@ -187,18 +227,19 @@ class Problem:
             row = int(np.argmax(singular))
             place = f"landmark {m.landmarks[row]} at step {m.steps[row]}"
             raise InputError(f"The observation of {place} has a singular covariance, expected noise in all of it.")
-        self.m, self.robust, self.model = m, robust, m.model()
+        self.m, self.robust, self.sensor = m, robust, Sensor(m)
         self.chart = PLANAR if isinstance(m.space, SE2Group) else SPATIAL
         self.names, self.index = np.unique(m.landmarks, return_inverse=True)
         self._by_step = np.argsort(m.steps, kind="stable")
         self._bounds = np.searchsorted(m.steps[self._by_step], np.arange(len(m.stamps_ns) + 1))
-        self._variances, self._axes = np.linalg.eigh(m.covs)
-        self._null = self._variances <= SINGULAR * self._variances.max(-1, keepdims=True, initial=0.0)
+        #: (T - 1, d) of the motions along their (T - 1, d, d) axes, and which of them are none.
+        self.variances, self.axes = np.linalg.eigh(m.covs)
+        self.null = self.variances <= SINGULAR * self.variances.max(-1, keepdims=True, initial=0.0)
 
     @property
     def singular(self) -> bool:
         """Whether any odometry has a direction without noise."""
-        return bool(self._null.any())
+        return bool(self.null.any())
 
     def pose_key(self, step: int) -> int:
         """Key of a step's pose."""
@@ -257,7 +298,7 @@ class Problem:
         return InitialEstimate(self.m.space.normalise(np.array(poses)), points)
 
     def _odometry(self, step: int, soft: bool) -> Any:
-        variances, axes, null = (x[step - 1] for x in (self._variances, self._axes, self._null))
+        variances, axes, null = (x[step - 1] for x in (self.variances, self.axes, self.null))
         space, chart, delta = self.m.space, self.chart, self.m.deltas[step - 1]
         if soft:
             variances = np.where(null, SOFT**2 * variances[-1], variances)
@@ -280,16 +321,15 @@ class Problem:
         return gtsam.CustomFactor(mixed, list(keys), error)
 
     def _observation(self, row: int) -> Any:
-        model, chart, z = self.model, self.chart, self.m.z[row]
+        sensor, chart, z = self.sensor, self.chart, self.m.z[row]
         pose_key, landmark_key = (self.pose_key(int(self.m.steps[row])), self.landmark_key(int(self.index[row])))
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
             state, landmark = chart.storage(values, pose_key), chart.point(values, landmark_key)
             if jacobians is not None:
-                by_state, by_landmark, _ = model.jacobians(state, landmark)
-                assert by_state is not None and by_landmark is not None
+                by_state, by_landmark = sensor.slopes(state, landmark)
                 jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
-            return -model.residual(z, model.predict(state, landmark))
+            return sensor.residual(state, landmark, z)
 
         loss = huber(noise(self.m.cov_z[row]), self.robust)
         return gtsam.CustomFactor(loss, [pose_key, landmark_key], error)
