@@ -122,7 +122,7 @@ class CompareOptions(Printed):
 
     run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]  #: folder that `rbpf run` left.
     run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]  #: another one of the same recording.
-    seeds: Count = 5  #: runs of each, from which the error is estimated.
+    seeds: Count = 5  #: runs of each, from which the error is estimated; parts of the draws where it is done in batch.
     workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes; -1 is one per core.
 
 

@@ -42,6 +42,20 @@ def test_the_right_noise_explains_a_recording_better(tmp_path):
     assert back.difference == pytest.approx(-found.difference)
 
 
+def test_named_landmarks_and_gaussian_noise_are_compared_in_batch(tmp_path):
+    """Without particles, a hundred times as sharp; the filters find the same within their error."""
+    simulate_robot(RobotWorld(steps=30), tmp_path / "log", seed=0)
+    wrong = replace(CONFIG, noise=LogNoise(std_range_m=0.03))
+    sharp = compare_evidence(CONFIG, wrong, tmp_path / "log", range(3))
+    assert sharp.error < 0.05
+    # What is no other model: outliers that never come.
+    rare = LikelihoodConfig("outliers", outlier_rate=1e-9)
+    by_filters = [replace(config, likelihood=rare) for config in (CONFIG, wrong)]
+    found = compare_evidence(*by_filters, tmp_path / "log", range(3))
+    assert found.error > 2.0 * sharp.error
+    assert abs(found.difference - sharp.difference) < 4.0 * found.error + 1.0
+
+
 def test_two_ways_of_computing_the_same_model_are_equal_within_the_error():
     log = simulated_log(RobotWorld(steps=10), 1)
     once = replace(CONFIG, proposal=ProposalConfig(iterations=1))

@@ -8,6 +8,10 @@ that from S seeds with mean m and variance s² of log Ẑ
 
 That law is of no use where s is large: then log Z is taken as the logarithm of the mean of Ẑ, which a single seed may
 carry, with s for its error.
+
+Where a robot's landmarks are named and its likelihood is Gaussian, the filter's model is the batch's, and Ẑ is that of
+draws from the batch posterior (`rbpf.validation.gtsam.path_sampling`), one part of them for each seed: closer by orders of
+magnitude than by particles, and in one pass.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,13 +20,17 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf.core.likelihoods import Gaussian
 from rbpf.errors import InputError
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import RobotRecording, filter_features, filter_recording, filter_robot_log
+from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import Part, RobotLog
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
@@ -71,7 +79,7 @@ class EvidenceDifference:
         difference, error = self.difference, self.error
         better, worse = (name_a, name_b) if difference > 0.0 else (name_b, name_a)
         both = f"log-evidence {self.log_evidence_a:.1f} against {self.log_evidence_b:.1f}"
-        found = f"{both}, difference {difference:.1f} ± {error:.1f}"
+        found = f"{both}, difference {difference:.1f} ± {error:.2g}"
         if abs(difference) <= CLEAR * error:
             if self.spread > NOISY:
                 return f"Too random to tell ({found}, {self.spread:.1f} from seed to seed): use more particles."
@@ -105,7 +113,7 @@ def compare_evidence(
     workers: int = 1,
     on_run: Callable[[int, int], None] | None = None,
 ) -> EvidenceDifference:
-    """Filters the same data with two configurations of one system, once per seed.
+    """Compares how two configurations of one system explain the same data: filtered once per seed, or in batch.
 
     Args:
         config_a: the first; its own seed is not used.
@@ -113,7 +121,7 @@ def compare_evidence(
         data: a log, or where one lies.
         seeds: two or more.
         workers: processes; −1 for one per core.
-        on_run: called with the runs done and their number.
+        on_run: called with the runs done and their number; not in batch.
 
     Raises:
         InputError: the configurations are of different systems, differ in what is data, do not fit the data, or one has no
@@ -153,6 +161,9 @@ def compare_evidence(
                     f"two stereo configurations that differ in {name} do not explain the same data: what odometry says "
                     "is given to the filter, and differs between them"
                 )
+    in_batch = _in_batch(config_a, data, len(seeds)), _in_batch(config_b, data, len(seeds))
+    if in_batch[0] and in_batch[1]:
+        return evidence_difference(*in_batch)
     jobs = [(replace(config, seed=seed), data) for config in (config_a, config_b) for seed in seeds]
     logs: list[float] = []
     for value in Parallel(n_jobs=workers, return_as="generator")(delayed(_evidence)(*job) for job in jobs):
@@ -215,16 +226,41 @@ def _config_of(record: RunFolder) -> RangeBearingConfig | StereoConfig:
     return load_settings(RangeBearingConfig, "range-bearing", path, (), {})
 
 
+def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
+    """Log-evidences by parts of the draws from a robot's batch posterior; none where the filter's model is not the batch's."""
+    from rbpf.validation.gtsam.batch_problem import solve_problem
+    from rbpf.validation.gtsam.path_sampling import draw_posterior
+
+    if not isinstance(config, RangeBearingConfig) or config.association != "known":
+        return []
+    run = _filtered(replace(config, particles=1), data)
+    if not isinstance(run.system.likelihood, Gaussian):
+        return []
+    problem = run.system.measurements(run.name, run.log)
+    batch = solve_problem(problem, run.log.poses, marginals=False).estimate
+    start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
+    draws = draw_posterior(problem, start, np.random.default_rng(0))
+    logs = np.array_split(draws.log_ratio, parts)
+    return [float(np.logaddexp.reduce(part) - np.log(part.size)) for part in logs]
+
+
+def _filtered(config: RangeBearingConfig, data: Data) -> Run[RangeBearingSlam]:
+    if isinstance(data, Path | RobotRecording):
+        return filter_recording(RobotRecording(data) if isinstance(data, Path) else data, config)
+    if config.noise.given():
+        raise InputError("a log that was read already has its noise: give the recording's path to change it")
+    if isinstance(data, RobotLog):
+        return filter_robot_log(data, config)
+    raise _no_filter(config, data)
+
+
 def _evidence(config: Config, data: Data) -> float:
     if isinstance(config, RangeBearingConfig):
-        if isinstance(data, Path):
-            data = RobotRecording(data)
-        if isinstance(data, RobotRecording):
-            return float(filter_recording(data, config).system.filter.log_evidence)
-        if config.noise.given():
-            raise InputError("a log that was read already has its noise: give the recording's path to change it")
-        if isinstance(data, RobotLog):
-            return float(filter_robot_log(data, config).system.filter.log_evidence)
-    elif isinstance(data, FeatureLog):
+        return float(_filtered(config, data).system.filter.log_evidence)
+    if isinstance(data, FeatureLog):
         return float(filter_features(data, config).system.filter.log_evidence)
-    raise InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")
+    raise _no_filter(config, data)
+
+
+def _no_filter(config: Config, data: Data) -> InputError:
+    return InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")

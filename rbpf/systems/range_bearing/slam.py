@@ -80,7 +80,7 @@ class RangeBearingSlam(System):
         self.joint = JointMap(space, compiled=config.compiled) if self.kept_map == "joint" else None
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
-        likelihood = config.of_innovations(misread)
+        self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         sensor: Sensor
         if config.association == "known":
             sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
