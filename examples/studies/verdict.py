@@ -1,13 +1,13 @@
 """Does the verdict tell the truth? Runs whose fault is known, judged as a run judges itself, and with the truth beside.
 
-A robot drives round among landmarks. In eight runs the filter is told one thing wrongly: the noise of its sensor or of its
-odometry too large or too small, an odometer with a bias of one of its standard deviations, a fifth of the sightings under
-wrong names, or derivatives of the measured angle by the landmark with the wrong sign. In two nothing is wrong, and in two
-nothing but that few particles go round in loops, so that they share one past. The last one is a camera without known
-points, whose scale is arbitrary. A run without truth is judged by its innovations and by the batch posterior of its
-measurements. Beside the verdicts stands what they are about: how many poses lie in the 95 % region, and how many times
-larger than claimed the errors of poses and landmarks are; those of the camera in the world of its first pose, which a
-simulation knows exactly.
+A robot drives round among landmarks. In eight runs the filter is told one thing wrongly: the noise of its sensor or of
+its odometry too large or too small, an odometer with a bias of one of its standard deviations, a fifth of the sightings
+under wrong names, or derivatives of the measured angle by the landmark with the wrong sign. In two nothing is wrong,
+and in two nothing but that few particles with maps of their own go round in loops, so that they share one past; with a
+joint map the same loops are right. The last one is a camera without known points, whose scale is arbitrary. A run
+without truth is judged by its innovations and by the batch posterior of its measurements. Beside the verdicts stands
+what they are about: how many poses lie in the 95 % region, and how many times larger than claimed the errors of poses
+and landmarks are; those of the camera in the world of its first pose, which a simulation knows exactly.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 from unittest import mock
 
 import numpy as np
@@ -130,9 +131,11 @@ def robot(
     world: RobotWorld = LAP,
     seed: int = 0,
     derivative: bool = False,
+    joint: bool = False,
 ) -> Callable[[], Run]:
     """A robot's run."""
-    config = RangeBearingConfig(particles=particles, seed=seed, compiled=not derivative, map="particles")
+    kept: Literal["joint", "particles"] = "joint" if joint else "particles"
+    config = RangeBearingConfig(particles=particles, seed=seed, compiled=not derivative, map=kept)
 
     def run() -> Run:
         with wrong_derivative() if derivative else nullcontext():
@@ -160,6 +163,8 @@ CASES = (
     Case("nothing, another world", robot(particles=1000, world=SHORT, seed=1), wrong=False),
     Case("30 particles in loops of 94 m", robot(particles=30, world=LOOPS), wrong=False),
     Case("the same in another world", robot(particles=30, world=LOOPS, seed=1), wrong=False),
+    Case("30 particles in loops, joint map", robot(particles=30, world=LOOPS, joint=True), wrong=False),
+    Case("the same in another world, joint map", robot(particles=30, world=LOOPS, seed=1, joint=True), wrong=False),
     Case("camera without known points", camera_without_known_points, wrong=False),
 )
 

@@ -18,7 +18,10 @@ from rbpf.validation.consistency.verdict import PathGrade, Verdict, grade_path, 
 from rbpf.validation.report.page import verdict_of
 from tests.validation.fixes import Receiver, Walk
 
-ALIKE = {"sensor noise × 2", "odometry noise × 3", "nothing, another world", "the same in another world"}
+ALIKE = {
+    "sensor noise × 2", "odometry noise × 3", "nothing, another world", "the same in another world",
+    "the same in another world, joint map",
+}  # fmt: skip
 SLOW = {"20 % wrong names"}
 
 

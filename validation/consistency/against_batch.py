@@ -235,9 +235,10 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
         batch = found.optimum.estimate
         start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
         draws = draw_posterior(problem, start, np.random.default_rng(0), DRAWS)
-        figures |= {"log_evidence_batch": draws.log_evidence, "log_evidence_batch_error": draws.error}
-        figures |= {"posterior_draws": DRAWS, "posterior_draws_ess": draws.ess}
-        if draws.ess < LEAST_COUNT * DRAWS:
+        weighed = {"log_evidence_batch": draws.log_evidence, "log_evidence_batch_error": draws.error}
+        weighed["posterior_draws_ess"] = draws.ess
+        figures |= {name: value for name, value in weighed.items() if np.isfinite(value)}
+        if not draws.ess >= LEAST_COUNT * DRAWS:
             statistics = [s for s in statistics if s.name not in (POSES, LANDMARKS)]
             said = (
                 f"; that posterior is not Gaussian (of {DRAWS} draws from its Gaussian {draws.ess:.0f} count), so that it is "
