@@ -74,7 +74,7 @@ class LieGroup(ABC):
 
     def _first_guess(self, points: Array, weights: Array) -> Array:
         """Where the mean is looked for: the heaviest point."""
-        return points[np.argmax(weights)]  # type: ignore[no-any-return]
+        return points[np.argmax(weights)]
 
     @abstractmethod
     def exp(self, xi: Tangents) -> StateArray:
