@@ -545,7 +545,8 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         self.ids = np.zeros(0, dtype=np.int64)
         self._sensor = NamedLandmarkSensor(self.model, self.landmark, likelihood)
         # (M,) landmarks of the map, ascending, and how often each was seen.
-        self._held, self._observations = np.zeros((2, 0), dtype=np.int64)
+        self._held = np.zeros(0, dtype=np.int64)
+        self._observations = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: View[NamedPixels], belief: Belief) -> Sequence[Observations]:
         self.ids = np.where(frame.free, frame.features.names, NULL)
