@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 
 from rbpf import SE2, Filter, LandmarkMap, MixturePoint, ObservationModel
-from rbpf.maps.point import ring
+from rbpf.maps.point import ring, ring_components
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 
 STD_RANGE = 0.1  # [m]
 STD_ODOMETRY = np.array([0.005, 0.01, 0.005])  # turn [rad], forward [m], to the left [m]
-COMPONENTS = 24
+COMPONENTS = ring_components(20.0, STD_RANGE)  # enough for beacons up to 20 m away
 BEACONS = np.array([[6.0, 5.0], [-4.0, 6.0], [3.0, -5.0], [10.0, -1.0], [-5.0, -3.0]])
 
 
@@ -51,7 +51,7 @@ def simulate(rng: np.random.Generator, steps: int = 200) -> list[tuple[np.ndarra
 def main() -> dict[str, float]:
     """Prints when each beacon becomes a point, and how far off it is in the end."""
     beacon_map = LandmarkMap(SE2)
-    sensor = NamedLandmarkSensor(Range(), MixturePoint(COMPONENTS, dominant=0.9))
+    sensor = NamedLandmarkSensor(Range(), MixturePoint(COMPONENTS))
     filter_ = Filter(OdometryMotion(SE2), sensor, beacon_map, n=50, rng=np.random.default_rng(0))
     errors, promoted = [], {}
     for t, (true_pose, frame) in enumerate(simulate(np.random.default_rng(2))):

@@ -6,6 +6,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.models import Landmark, Records, RigidSpace
+from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 
 
@@ -75,20 +76,46 @@ class MixturePoint(Landmark):
         return (np.exp(records.log_weights) * near).sum(axis=-1) >= self.dominant
 
 
-def ring(centre: np.ndarray, radius: np.ndarray, std_radius: float, components: int) -> Records:
-    """Gaussians along a circle, for a beacon whose range alone was measured; neighbours overlap at one standard deviation.
+def ring_components(radius: float, std_radius: float, dim: int = 2) -> int:
+    """The fewest Gaussians that follow a circle, or in 3 dimensions a sphere; radius and its deviation in metres.
 
-    Centres (N, 2) of the sensor and ranges (K,), metres, with the deviation `std_radius`, give records with means
-    (N, K, C, 2), covariances (N, K, C, 2, 2) and equal weights.
+    Each is flat: at one standard deviation along it the curve must be no further away than the deviation across it.
     """
-    angle = 2 * np.pi * np.arange(components) / components
-    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    across = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+    bend = 2.0 * std_radius / radius
+    if dim == 3:
+        return max(6, int(np.ceil(4.0 / bend)))
+    return max(4, int(np.ceil(np.pi / np.arcsin(min(1.0, np.sqrt(bend))))))
+
+
+def ring(centre: np.ndarray, radius: np.ndarray, std_radius: float, components: int | None = None) -> Records:
+    """Gaussians along a circle, or over a sphere, for a beacon whose range alone was measured; neighbours overlap at one σ.
+
+    Centres (N, D) of the sensor, D = 2 or 3, and ranges (K,), metres, with the deviation `std_radius`, give records with
+    means (N, K, C, D), covariances (N, K, C, D, D) and equal weights; C is that of the landmarks' `MixturePoint`, by default
+    what the longest range needs. Raises InputError: the range needs more components than C.
+    """
+    (n, dim), k, longest = centre.shape, radius.size, float(radius.max(initial=std_radius))
+    needed = ring_components(longest, std_radius, dim)
+    components = components or needed
+    if components < needed:
+        raise InputError(
+            f"a range of {longest:.3g} ± {std_radius:.3g} m needs {needed} components, not {components}: "
+            f"see ring_components(longest range, deviation, {dim})"
+        )
+    if dim == 2:
+        angle = 2 * np.pi * np.arange(components) / components
+        along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        half_step = radius * np.sin(np.pi / components)
+        turned = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+        across = turned[:, :, None] * turned[:, None, :]
+    else:
+        # A Fibonacci lattice: equal areas, each that of a disc of the radius 2 r / √C.
+        height = 1.0 - (2.0 * np.arange(components) + 1.0) / components
+        angle, flat = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(components), np.sqrt(1.0 - height**2)
+        along = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=-1)
+        half_step = 2.0 * radius / np.sqrt(components)
+        across = np.eye(3) - along[:, :, None] * along[:, None, :]
     mean = centre[:, None, None, :] + radius[None, :, None, None] * along
-    half_step = radius * np.sin(np.pi / components)
-    cov = std_radius**2 * along[:, :, None] * along[:, None, :] + np.multiply.outer(
-        half_step**2, across[:, :, None] * across[:, None, :]
-    )
-    n, k = centre.shape[0], radius.size
+    cov = std_radius**2 * along[:, :, None] * along[:, None, :] + np.multiply.outer(half_step**2, across)
     weights = np.full((n, k, components), -np.log(components))
-    return Records(mean, np.broadcast_to(cov, (n, k, components, 2, 2)).copy(), None, weights)
+    return Records(mean, np.broadcast_to(cov, (n, k, components, dim, dim)).copy(), None, weights)

@@ -49,6 +49,7 @@ from .maps.point import AnchoredPoint as AnchoredPoint
 from .maps.point import MixturePoint as MixturePoint
 from .maps.point import Point as Point
 from .maps.point import ring as ring
+from .maps.point import ring_components as ring_components
 from .motion.odometry import Odometry as Odometry
 from .motion.odometry import OdometryMotion as OdometryMotion
 from .runs.results import Results as Results

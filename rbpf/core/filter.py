@@ -18,6 +18,7 @@ from rbpf import gaussian
 from rbpf.arrays import numbers
 from rbpf.core import checkpoint
 from rbpf.core.genealogy import History, Lineage
+from rbpf.core.health import Health
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import (
     Belief,
@@ -106,6 +107,9 @@ class Filter:
         clouds: keep whole clouds, for backward simulation.
         consolidation: when a conditional that can takes in what the particles differ by; they are then never resampled.
             Paths are not kept across it: ask for a lag of one step. States are in a frame of the conditional's choice.
+
+    Attributes:
+        health: what in the last steps looks like failure; `health.findings` holds what it warned of.
     """
 
     def __init__(
@@ -147,6 +151,7 @@ class Filter:
         self.lineage = Lineage(n)
         self.marginals.begin(n, self.lineage)
         self.history = History(self.lineage, lag, clouds)
+        self.health = Health(n, self.space)
         self.log_evidence = 0.0
         self.stamp_ns: int | None = None
         self.steps = 0
@@ -245,10 +250,20 @@ class Filter:
         if proposed.nis is None:
             mixture, second = (Prior.exactly(self.space, state), None, log_weights), None
 
-        # Start landmarks, and report.
+        # Start landmarks, look for signs of failure, and report.
         first_observations, new_landmarks = self._start_landmarks(frame, groups)
         evidence = look_ahead + correction if are_explained(groups) else float("nan")
         self.log_evidence += evidence
+        ess = effective_sample_size(weights)
+        nis = float("nan") if proposed.nis is None else float((weights * proposed.nis).sum())
+        rows = 0.0 if proposed.rows is None else mean_count(proposed.rows, weights)
+        if groups:
+            self.health.innovations(self.steps, nis, rows, ess)
+            self.health.evidence(self.steps, evidence / max(sum(group.z.size for group in groups), 1))
+        if ancestors is not None:
+            self.health.descendants(self.steps, ancestors)
+        if self.consolidation is None and not (self._draws and ancestors is not None):
+            self.health.states(self.steps, state)
         self._end(stamp_ns)
         if self.consolidation is not None:
             self._age += 1
@@ -258,11 +273,11 @@ class Filter:
             stamp_ns=stamp_ns,
             mixture=mixture,
             second=second,
-            ess=effective_sample_size(weights),
+            ess=ess,
             resampled=ancestors is not None or consolidated,
             log_evidence=evidence,
-            nis=float("nan") if proposed.nis is None else float((weights * proposed.nis).sum()),
-            rows=0.0 if proposed.rows is None else mean_count(proposed.rows, weights),
+            nis=nis,
+            rows=rows,
             groups=groups,
             first_observations=first_observations,
             new_landmarks=new_landmarks,

@@ -10,6 +10,7 @@ the run and what `track` returned, after each frame.
 
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from rbpf.core.checkpoint import fitting, load_arrays, read_one, text
+from rbpf.core.health import HealthWarning
 from rbpf.errors import InputError, printable
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.provenance import decisive_settings, require_same
@@ -72,11 +74,17 @@ class Run(Generic[SystemT]):
         Errors as `System.take`.
         """
         started = time.perf_counter()
-        tracked = self.system.take(frame)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", HealthWarning)
+            tracked = self.system.take(frame)
         seconds = time.perf_counter() - started
         self.frame = frame
         place = f"{self.system.frame_word} {len(self.log)}"
-        self.messages += [f"{place}: {printable(words)}" for words in tracked.messages]
+        for warning in caught:
+            if not issubclass(warning.category, HealthWarning):
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+        doubts = [str(warning.message) for warning in caught if issubclass(warning.category, HealthWarning)]
+        self.messages += [f"{place}: {printable(words)}" for words in (*tracked.messages, *doubts)]
         self.log.append(tracked, seconds, waiting)
         return tracked
 

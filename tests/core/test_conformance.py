@@ -34,6 +34,7 @@ from tests.core.scripted import Polar, says
 from tests.core.worlds import Recipe, drive, planar_world
 from tests.exactness.models import Frame, Scripted
 
+RING = 16
 COUNTS = iter(range(10**9))
 MOUNTED = SE3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
 
@@ -83,7 +84,7 @@ class RangeOnly(Polar):
         return super().predict(state, landmark)[..., :1]
 
     def initialise(self, state, z, cov):
-        return ring(state[:, 1:], z[:, 0], float(np.sqrt(cov[0, 0, 0])), 6)
+        return ring(state[:, 1:], z[:, 0], 0.5, RING)
 
 
 class Speed(ObservationModel):
@@ -134,7 +135,7 @@ SOUND: list[tuple[Any, Any, Example | None]] = [
     (RelativePosition(SE2), None, None),
     (RelativePosition(SE3, MOUNTED), None, None),
     (Anchored(), None, Example(landmark=AnchoredPoint(SE2))),
-    (RangeOnly(), None, Example(landmark=MixturePoint(6))),
+    (RangeOnly(), None, Example(landmark=MixturePoint(RING))),
     (Speed(), None, Example(substate=3)),
     *((landmark, SE2, None) for landmark in (Point(2), AnchoredPoint(SE2), MixturePoint(4, 2))),
     *((landmark, SE3, None) for landmark in (Point(3), AnchoredPoint(SE3), MixturePoint(4, 3))),
@@ -253,8 +254,8 @@ def test_findings_about_what_a_parametrisation_needs():
         def initialise(self, state, z, cov):
             return replace(super().initialise(state, z, cov), const=None)
 
-    findings = check_model(Components(), example=Example(landmark=MixturePoint(6)))
-    assert findings == ["Components.initialise: weights of the components: expected 1, found 6 at (0, 0)"]
+    findings = check_model(Components(), example=Example(landmark=MixturePoint(RING)))
+    assert findings == ["Components.initialise: weights of the components: expected 1, found 16 at (0, 0)"]
     findings = check_model(Forgetful(), example=Example(landmark=AnchoredPoint(SE2)))
     assert findings == ["Forgetful.initialise: const is a NoneType, expected a NumPy array"]
 

@@ -29,6 +29,8 @@ BOUNDS: dict[str, dict[str, tuple[float, float]]] = {
     "mono_desk": {"ratio": (1.0, 2.5), "nees": (3.0, 15.0)},
     "mono_video": {"frames_tracked": (20.0, 20.0), "ate_rmse_m": (0.0, 0.02)},
     "own_landmark": {"findings": NONE, "located": (25.0, 1e3), "map": (0.0, 0.5), "path": (0.0, 0.2)},
+    "jump_markov": {"off": (0.0, 0.12), "evidence": (-0.5, 0.5)},
+    "stochastic_volatility": {"off_exact": (0.0, 0.05), "evidence": (-1.0, 1.0), "error": (0.2, 0.6)},
     "range_only_beacons": {"promoted": (4.0, 1e3), "map": (0.0, 0.5), "path": (0.0, 0.3)},
     "soak": {
         f"{system}, {name}": (0.0, most)
