@@ -28,8 +28,8 @@ class WidenedProposal(Proposal):
         self.refined = EkfProposal()
         self.factor = factor
 
-    def propose(self, prior, linearise):
-        proposed = self.refined.propose(prior, linearise)
+    def propose(self, prior, linearise, rng):
+        proposed = self.refined.propose(prior, linearise, rng)
         return replace(proposed, root=self.factor * proposed.root)
 
 

@@ -79,9 +79,9 @@ class MixturePoint(Landmark):
 def ring_components(radius: float, std_radius: float, dim: int = 2) -> int:
     """The fewest Gaussians that follow a circle, or in 3 dimensions a sphere; radius and its deviation in metres.
 
-    Each is flat: at one standard deviation along it the curve must be no further away than the deviation across it.
+    Each is flat: at one standard deviation along it the curve must be no further away than half the deviation across it.
     """
-    bend = 2.0 * std_radius / radius
+    bend = std_radius / radius
     if dim == 3:
         return max(6, int(np.ceil(4.0 / bend)))
     return max(4, int(np.ceil(np.pi / np.arcsin(min(1.0, np.sqrt(bend))))))

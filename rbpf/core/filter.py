@@ -193,7 +193,7 @@ class Filter:
             groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng))
 
             # Refine, and weigh by the look-ahead w₁.
-            proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
+            proposed = proposal.propose(prior, self.marginals.linearised(prior, groups), self.rng)
             log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
         weights = np.exp(log_weights)
@@ -207,7 +207,7 @@ class Filter:
             self._consolidate()
             consolidated = True
             prior = self._predict(control, dt)
-            proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
+            proposed = proposal.propose(prior, self.marginals.linearised(prior, groups), self.rng)
             log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
             mixture, weights = (prior, proposed, log_weights), np.exp(log_weights)
 

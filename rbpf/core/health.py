@@ -5,6 +5,7 @@ particle or two, descendants of a parent or two, a number of the state that all 
 over the last steps, so that an outlier, or a first fix that decides between guesses, is none.
 """
 
+import math
 import warnings
 from collections import deque
 
@@ -41,14 +42,14 @@ class Health:
         self._few = max(2.0, FEW * n)
         self._ratios, self._ess, self._parents = (deque[float](maxlen=WINDOW) for _ in range(3))
         self._recent = deque[float](maxlen=WINDOW)
-        self._steady = np.zeros(3)  # number, mean and summed squares of the evidence before the recent one.
+        self._steady = 0.0, 0.0, 0.0  # number, mean and summed squares of the evidence before the recent one.
         self._most: np.ndarray | None = None
         groups = space.groups if isinstance(space, Product) else (space,)
         self._continuous = np.repeat([not isinstance(group, Finite) for group in groups], [g.size for g in groups])
 
     def innovations(self, step: int, nis: float, rows: float, ess: float) -> None:
         """After a step with observations: what `StepReport` says of them."""
-        if rows > 0.0 and np.isfinite(nis):
+        if rows > 0.0 and math.isfinite(nis):
             self._ratios.append(nis / rows)
             ratio = _lasting(self._ratios, step)
             if ratio > LARGE:
@@ -70,19 +71,19 @@ class Health:
 
     def evidence(self, step: int, log_evidence: float) -> None:
         """After a step with observations: the log-evidence of one number measured."""
-        if not np.isfinite(log_evidence):
+        if not math.isfinite(log_evidence):
             return
         if len(self._recent) == WINDOW:
             # Those that leave the recent ones are the past (B. Welford 1962).
             number, mean, squares = self._steady
             oldest = self._recent[0]
             moved = mean + (oldest - mean) / (number + 1.0)
-            self._steady = np.array([number + 1.0, moved, squares + (oldest - mean) * (oldest - moved)])
+            self._steady = number + 1.0, moved, squares + (oldest - mean) * (oldest - moved)
         self._recent.append(log_evidence)
         number, mean, squares = self._steady
         if number >= WINDOW and step % 4 == 0:
-            sigma = max(np.sqrt(squares / number), 0.1)
-            best = float(np.sort(self._recent)[3 * WINDOW // 4])
+            sigma = max(math.sqrt(squares / number), 0.1)
+            best = sorted(self._recent)[3 * WINDOW // 4]
             if best < mean - EVIDENCE_SIGMA * sigma:
                 self._tell(
                     "evidence",
@@ -126,4 +127,4 @@ class Health:
 
 def _lasting(values: deque[float], step: int) -> float:
     """The median of a full window, looked at in every fourth step; −∞ says nothing."""
-    return float(np.sort(values)[WINDOW // 2]) if len(values) == WINDOW and step % 4 == 0 else -np.inf
+    return sorted(values)[WINDOW // 2] if len(values) == WINDOW and step % 4 == 0 else -math.inf

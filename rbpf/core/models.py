@@ -426,8 +426,8 @@ class Proposal(ABC):
     """Whether samples are corrected by w₂ = p(z|x) p(x|x⁻) / (q(x) w₁); E06 takes w₂ := 1."""
 
     @abstractmethod
-    def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
-        """Gaussian to sample from, and the look-ahead weight log w₁."""
+    def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
+        """Gaussian to sample from, and the look-ahead weight log w₁; what it draws comes from the filter's generator."""
 
 
 class Conditional(ABC):

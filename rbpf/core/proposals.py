@@ -22,7 +22,7 @@ from rbpf.kernels.signature import run_driver
 class PriorProposal(Proposal):
     """The bootstrap filter's: q is the motion model, w₁ = 1, w₂ = p(z | x) (S05 §II-A)."""
 
-    def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
+    def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
         n, rank = prior.base.shape[0], prior.factor.shape[2]
         return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(n))
 
@@ -45,7 +45,7 @@ class EkfProposal(Proposal):
         self.iterations = iterations
         self.start = start
 
-    def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
+    def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
         at = prior.mean if self.start is None else np.tile(self.start, (prior.base.shape[0], 1))
         for iteration in range(self.iterations):
             proposed = refined(prior, linearise(at))

@@ -122,7 +122,9 @@ class StartAnchor:
                 records = landmark_map.read(ids[held])
                 present = ~np.isneginf(landmark_map.log_odds(ids[held]))
                 groups.append(self._without_first_frame(records, first.model, first.z[held], first.cov[held], present))
-        proposed = self._proposal.propose(prior, _linearised_first_frame(prior, groups, self._likelihood))
+        proposed = self._proposal.propose(
+            prior, _linearised_first_frame(prior, groups, self._likelihood), self._filter.rng
+        )
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
         # A square factor (N, d, d), also of noise of lower rank.
         factor = prior.factor @ proposed.root

@@ -34,7 +34,7 @@ from tests.core.scripted import Polar, says
 from tests.core.worlds import Recipe, drive, planar_world
 from tests.exactness.models import Frame, Scripted
 
-RING = 16
+RING = 24
 COUNTS = iter(range(10**9))
 MOUNTED = SE3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
 
@@ -255,7 +255,7 @@ def test_findings_about_what_a_parametrisation_needs():
             return replace(super().initialise(state, z, cov), const=None)
 
     findings = check_model(Components(), example=Example(landmark=MixturePoint(RING)))
-    assert findings == ["Components.initialise: weights of the components: expected 1, found 16 at (0, 0)"]
+    assert findings == ["Components.initialise: weights of the components: expected 1, found 24 at (0, 0)"]
     findings = check_model(Forgetful(), example=Example(landmark=AnchoredPoint(SE2)))
     assert findings == ["Forgetful.initialise: const is a NoneType, expected a NumPy array"]
 

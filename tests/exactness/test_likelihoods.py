@@ -130,7 +130,7 @@ def looked_ahead(z: np.ndarray, likelihood: TruncatedMahalanobis, noise: float) 
     group = Observations(z[:, None], np.full((z.size, 1, 1), noise), LinearObservation(by_state=[[1.0]]), likelihood)
     parts = Marginals(motion.space, [])
     prior = parts.predict(motion.transition(np.zeros((1, 1)), None, 1.0), motion.space, 1.0)
-    return float(EkfProposal().propose(prior, parts.linearised(prior, [group])).log_w1[0])
+    return float(EkfProposal().propose(prior, parts.linearised(prior, [group]), np.random.default_rng(0)).log_w1[0])
 
 
 def integrated(z: np.ndarray, noise: float) -> float:

@@ -29,6 +29,7 @@ BOUNDS: dict[str, dict[str, tuple[float, float]]] = {
     "mono_desk": {"ratio": (1.0, 2.5), "nees": (3.0, 15.0)},
     "mono_video": {"frames_tracked": (20.0, 20.0), "ate_rmse_m": (0.0, 0.02)},
     "own_landmark": {"findings": NONE, "located": (25.0, 1e3), "map": (0.0, 0.5), "path": (0.0, 0.2)},
+    "gps_imu": {"rmse": (0.0, 0.6), "gone": (0.0, 6.0), "nees": (0.5, 2.0), "least": (0.5, 2.0), "findings": NONE},
     "jump_markov": {"off": (0.0, 0.12), "evidence": (-0.5, 0.5)},
     "stochastic_volatility": {"off_exact": (0.0, 0.05), "evidence": (-1.0, 1.0), "error": (0.2, 0.6)},
     "range_only_beacons": {"promoted": (4.0, 1e3), "map": (0.0, 0.5), "path": (0.0, 0.3)},

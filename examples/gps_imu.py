@@ -1,0 +1,95 @@
+"""GPS, wheels and a gyroscope with a bias: what comes at 50 Hz is summed up between the fixes, which come at 1 Hz.
+
+A particle that draws noise fifty times between two measurements wanders off, and a bias that is sampled becomes a copy in all
+particles. So the increments of a second are composed to one, with its covariance, and the bias, which turns it, is held in
+one Gaussian with the frame of the last few steps. For 25 s there is no fix.
+"""
+
+import numpy as np
+from gps_fix import Position
+
+from rbpf import SE2, Consolidation, Filter, JointMap, MotionModel, Observations, Sensor, Transition
+
+RATE, SECONDS, OUTAGE = 50, 120, range(60, 85)
+STD_TICK = np.array([0.002, 0.01, 0.002])  # of an increment: turn [rad], forward [m], to the left [m]
+STD_BIAS, WALK_BIAS, STD_FIX = 0.05, 0.0002, 0.5  # rad/s, rad/s per √s, m
+
+
+def summed(ticks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Increments (K, 3) composed: the whole (3,), its noise's factor (3, 3), its derivative by the gyroscope's bias (3, 1)."""
+    whole, cov, by_bias = SE2.identity(), np.zeros((3, 3)), np.zeros((3, 1))
+    for tick in ticks:
+        step = SE2.exp(tick)
+        back, jac = SE2.adjoint(SE2.inverse(step)), SE2.right_jacobian(tick)
+        whole = SE2.compose(whole, step)
+        cov = back @ cov @ back.T + jac @ np.diag(STD_TICK**2) @ jac.T
+        by_bias = back @ by_bias - jac[:, :1] / RATE
+    return whole, np.linalg.cholesky(cov), by_bias
+
+
+class Driven(MotionModel):
+    """x' = x · whole · Exp(B bias + w); the control is what `summed` gives."""
+
+    space = SE2
+
+    def transition(self, state, control, dt):
+        whole, factor, by_bias = control or (SE2.identity(), np.zeros((3, 3)), np.zeros((3, 1)))
+        noise = np.zeros((4, 4))
+        noise[:3, :3], noise[3, 3] = factor, WALK_BIAS * np.sqrt(dt)
+        return Transition(SE2.compose(state, whole), noise[None], by_bias[None], np.eye(1)[None], np.zeros((1, 1)))
+
+
+class Receiver(Sensor):
+    """A frame is a fix (2,), or None."""
+
+    def observe(self, frame, belief):
+        return [] if frame is None else [Observations(frame[None], STD_FIX**2 * np.eye(2)[None], Position())]
+
+
+def simulate(rng: np.random.Generator) -> list[tuple[np.ndarray, float, np.ndarray | None, np.ndarray | None]]:
+    """True pose and bias, the ticks (RATE, 3) of the last second and the fix, at each second."""
+    pose, bias, out = SE2.identity(), STD_BIAS * rng.standard_normal(), []
+    for second in range(SECONDS):
+        ticks = None
+        if second:
+            ticks = np.tile([0.3 * np.sin(0.1 * second) / RATE, 5.0 / RATE, 0.0], (RATE, 1))
+            for tick in ticks:
+                pose = SE2.retract(pose, tick + STD_TICK * rng.standard_normal(3))
+            ticks[:, 0] += bias / RATE
+            bias += WALK_BIAS * rng.standard_normal()
+        fix = pose[1:] + STD_FIX * rng.standard_normal(2) if second not in OUTAGE else None
+        out.append((pose, bias, ticks, fix))
+    return out
+
+
+def track(world: list, seed: int) -> tuple[np.ndarray, np.ndarray, Filter]:
+    """Errors (T, 3) in the chart of the estimate, and NEES (T,)."""
+    held, window = JointMap(SE2, (np.zeros(1), STD_BIAS**2 * np.eye(1))), Consolidation(window=5)
+    rng, errors, nees = np.random.default_rng(seed), [], []
+    filter_ = Filter(Driven(), Receiver(), held, rng=rng, lag=1, consolidation=window)
+    for pose, _, ticks, fix in world:
+        filter_.step(fix, None if ticks is None else summed(ticks))
+        estimate = held.estimate(filter_.particles)
+        errors.append(SE2.local(estimate.mean, pose))
+        nees.append(errors[-1] @ np.linalg.pinv(estimate.cov, hermitian=True) @ errors[-1])
+    return np.array(errors), np.array(nees), filter_
+
+
+def main() -> dict[str, float]:
+    """Four worlds, with the default number of particles."""
+    figures = []
+    for seed in range(4):
+        world = simulate(np.random.default_rng(seed))
+        errors, nees, filter_ = track(world, seed)
+        away = np.linalg.norm(errors[:, 1:], axis=1)
+        before, gone = np.sqrt(np.square(away[20:60]).mean()), away[max(OUTAGE)]
+        figures.append([before, gone, nees[1:].mean() / 3, len(filter_.health.findings)])
+        print(
+            f"world {seed}: {before:.2f} m RMS, {gone:.2f} m after 25 s without a fix, NEES per number {figures[-1][2]:.2f}"
+        )
+    rmse, gone, nees, findings = np.transpose(figures)
+    return {"rmse": rmse.max(), "gone": gone.max(), "nees": nees.max(), "least": nees.min(), "findings": findings.sum()}
+
+
+if __name__ == "__main__":
+    main()
