@@ -1,10 +1,13 @@
-"""A laser scanner in the plane, and a recording of one."""
+"""A laser scanner in the plane, a recording of one, and a scan as the beams that a grid takes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple, final
 
 import numpy as np
 
 from rbpf.arrays import Float, Int
+from rbpf.core.models import Belief, Observations, Part, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 
@@ -30,6 +33,46 @@ class Scanner:
         if self.robot_from_sensor.shape != (SE2.size,) or not np.isfinite(self.robot_from_sensor).all():
             raise InputError(f"robot_from_sensor must be ({SE2.size},) finite numbers: {self.robot_from_sensor}")
 
+    def beams(self, ranges: Float[np.ndarray, " B"], correlation_m: float) -> Float[np.ndarray, "K 5"]:
+        """The readings that came back, in the robot's frame: where each beam begins and ends [m], and its weight.
+
+        Neighbouring ends on one wall err together, by the wall's error in the map: a stretch of `correlation_m` counts as one
+        measurement. So the weight is the distance to the nearer neighbour over that length, 1 at most.
+
+        Raises InputError: there are not as many readings as beams.
+        """
+        ranges = np.asarray(ranges, dtype=float)
+        if ranges.shape != self.angles.shape:
+            raise InputError(f"a scan of this scanner has {self.angles.size} readings, got {ranges.shape}")
+        came_back = np.isfinite(ranges) & (ranges > self.min_range_m) & (ranges < self.max_range_m)
+        angle, reach = self.angles[came_back], ranges[came_back]
+        ends = SE2.transform(self.robot_from_sensor, reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        gaps = np.full(len(ends) + 1, np.inf)
+        gaps[1:-1] = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+        weight = np.minimum(np.minimum(gaps[:-1], gaps[1:]) / correlation_m, 1.0)
+        starts = np.broadcast_to(self.robot_from_sensor[1:], ends.shape)
+        return np.ascontiguousarray(np.column_stack([starts, ends, weight]))
+
+
+class Scan(NamedTuple):
+    """A scan of a recording: time, ranges (B,), and world_from_robot (E,) by odometry, None where there is none."""
+
+    stamp_ns: int
+    ranges: np.ndarray
+    odometry: np.ndarray | None = None
+
+
+@final
+class BeamSensor(Sensor[np.ndarray]):
+    """Hands a scan's beams (K, 5), see `Scanner.beams`, to the part of the filter that reads them."""
+
+    def __init__(self, reader: Part) -> None:
+        self.reader = reader
+
+    def observe(self, frame: np.ndarray, belief: Belief) -> Sequence[Observations]:
+        # A weighted product of densities is none.
+        return [Observations.raw(frame, self.reader, normalised=False)]
+
 
 @dataclass(frozen=True)
 class LaserLog:
@@ -42,3 +85,9 @@ class LaserLog:
     ranges: Float[np.ndarray, "T B"]
     #: (T, E) world_from_robot by odometry, elements of SE2; None where the log has none.
     odometry: Float[np.ndarray, "T E"] | None = None
+
+    @property
+    def frames(self) -> list[Scan]:
+        """The scans, one by one."""
+        odometry = [None] * len(self.stamps_ns) if self.odometry is None else list(self.odometry)
+        return [Scan(*scan) for scan in zip(self.stamps_ns.tolist(), self.ranges, odometry, strict=True)]

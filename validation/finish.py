@@ -23,7 +23,7 @@ from rbpf.validation.consistency.comparison import clear_comparisons
 from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
 from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.rerun import write_rerun
-from rbpf.validation.report.validate import compare_gtsam, report_run
+from rbpf.validation.report.validate import COMPARISONS, compare_gtsam, report_run
 from rbpf.validation.report.video import PICTURES, write_annotated
 
 MOST = 300_000
@@ -71,6 +71,8 @@ def finish_run(
     """
     callbacks = callbacks or Callbacks()
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
+    if run.system.name not in COMPARISONS["gtsam"]:  # it measures nothing that a batch optimiser takes
+        wanted, batch = {}, False
     entries = write_run(run, out, dict(sources) | left_out(**wanted))
     (out / BATCH).unlink(missing_ok=True)
     clear_comparisons(out)

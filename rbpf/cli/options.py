@@ -83,6 +83,19 @@ class RangeBearingOptions(PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LaserRunOptions(PartOptions):
+    """Options of `rbpf run laser`."""
+
+    #: recording: a CARMEN log (FLASER, ROBOTLASER, RAWLASER with ODOM), plain or packed by gzip, or a ROS bag with
+    #: LaserScan.
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
+    particles: WholeCount = None  #: number of particles; by default 30, or as in --config.
+    scanner: Text = None  #: message (CARMEN) or topic (ROS) of the scans; by default the first that the log has.
+    max_range: RealPositive = None  #: what is farther gives no return, m; by default what the log says.
+    upside_down: Flag = False  #: the scanner is mounted upside down, or its readings run clockwise.
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImageRunOptions(PartOptions):
     """Of every run over images."""
 

@@ -12,6 +12,7 @@ from rbpf.cli.compiling import compile_kernels, use_threads
 from rbpf.cli.interrupts import finishing, patient
 from rbpf.cli.options import (
     ImageRunOptions,
+    LaserRunOptions,
     MonoOptions,
     RangeBearingOptions,
     RunOptions,
@@ -57,6 +58,26 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
             say("solving the batch problem with the same measurements …")
         with finishing():
             entries = finish_run(run, out, recording.sources(), batch=options.batch)
+    _finish(entries, options, out, run.failure)
+
+
+@RUN.add("laser")
+def run_laser(options: Annotated[LaserRunOptions, tyro.conf.arg(name="")]) -> None:
+    """Grid SLAM over a laser scanner's log (Grisetti et al. 2007: scan matching in each particle's own map)."""
+    from rbpf.runs.recordings import LaserRecording, filter_recording
+    from rbpf.sensors.readers import LaserOptions
+    from rbpf.systems.laser.config import LaserConfig
+    from rbpf.systems.settings import load_settings
+    from rbpf.validation.finish import finish_run
+
+    config = load_settings(LaserConfig, "laser", options.config, options.set, given(options, "particles", "seed"))
+    told = LaserOptions(options.scanner, options.upside_down, options.max_range, given_part(options))
+    recording = LaserRecording(options.log, told)
+    with _prepared(options) as out:
+        with progress() as bar, patient(bar("filtering")) as report:
+            run = filter_recording(recording, config, out, options.resume, [listener(report)])
+        with finishing():
+            entries = finish_run(run, out, recording.sources())
     _finish(entries, options, out, run.failure)
 
 

@@ -15,7 +15,7 @@ from rbpf.core.checkpoint import open_new
 from rbpf.errors import InputError
 
 CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajectory.npz", "map.npz"
-POSTERIOR = "posterior.npz"
+POSTERIOR, GRID = "posterior.npz", "grid.npz"
 LOCK = ".lock"
 """In a run's folder while somebody writes there; with the number of that process."""
 VERSION = 1

@@ -19,6 +19,11 @@ What else a system leaves stands in its `files`; of the monocular one
 posterior.npz            the paths (T, N, 7) of the last frame's particles, and the particles' log-weights
 posterior.tum            their weighted mean, which later frames have sharpened
 known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
+
+and of the laser's
+
+grid.npz                 log-odds of the cells of the particle of highest weight, see `rbpf.maps.grid.Picture`
+grid.pgm, grid.yaml      the same for programs that read map_server's files, see `rbpf.runs.grid_files`
 """
 
 import json
@@ -35,7 +40,8 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays
 from rbpf.lie import SE3
-from rbpf.runs.files import MAP, POSTERIOR, SUMMARY, TRAJECTORY, VERSION, prepare_folder, write_csv, write_text
+from rbpf.runs.files import GRID, MAP, POSTERIOR, SUMMARY, TRAJECTORY, VERSION, prepare_folder, write_csv, write_text
+from rbpf.runs.grid_files import write_grid
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.run import Run
@@ -75,6 +81,8 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
             weights = np.exp(arrays["log_weights"])
             mean = np.array([SE3.mean(poses, weights) for poses in arrays["world_from_camera"]])
             write_tum(out / "posterior.tum", Trajectory(arrays["stamps_ns"], mean))
+        if name == GRID:
+            write_grid(out, arrays)
     write_config(out, system.name, sources, asdict(system.config))
     entries = summarise(run)
     write_summary(out, entries)

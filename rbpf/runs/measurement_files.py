@@ -80,9 +80,9 @@ _WHOLE = re.compile(r"[+-]?\d{1,19}", re.ASCII)
 _INT64 = np.iinfo(np.int64)
 
 
-def write_measurements(folder: Path, m: Measurements | FeatureLog) -> None:
-    """Writes the files; they appear under their names when all are complete, and those of a former run are replaced."""
-    texts = _camera_texts(m) if isinstance(m, FeatureLog) else _robot_texts(m)
+def write_measurements(folder: Path, m: Measurements | FeatureLog | None) -> None:
+    """Writes the files; they appear under their names when all are complete, and those of a former run are replaced or go."""
+    texts = {} if m is None else _camera_texts(m) if isinstance(m, FeatureLog) else _robot_texts(m)
     with ExitStack() as together:
         for name, text in texts.items():
             together.enter_context(whole(folder / name)).write_text(text, encoding="utf-8")

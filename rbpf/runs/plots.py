@@ -1,7 +1,7 @@
 """Pictures of a run of any system, from its folder, drawn without a screen: one set for all.
 
 path.png        the path beside the truth, the odometry and the batch optimum
-map.png         landmarks with 3σ ellipses, rays, known points
+map.png         landmarks with 3σ ellipses, rays, known points; of a laser scanner the occupancy grid
 particles.png   the last frame's particles
 error.png       error of the position along the truth's axes beside what the filter itself believes
 tracking.png    what was looked for and found, effective sample size, innovations (a robot's: ess.png)
@@ -20,7 +20,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.files import whole
+from rbpf.runs.files import GRID, whole
+from rbpf.runs.grid_files import read_grid
 from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH
@@ -88,6 +89,8 @@ def map_figure(found: RunFolder) -> Any:
     """Path and map: points with 3σ ellipses, rays, known points."""
     world = World.of(found)
     path, motion = world.of_filter(found), world.motion(found.trajectory)
+    if (found.folder / GRID).is_file():
+        return _grid_figure(found, world, path, motion)
     figure, shown = Views.of(found.system, path).axes(f"{found.name}: {SIGMAS:g}σ map in {world.name}")
     landmarks, at = moved_map(found.map, motion), path.positions
     mean, cov = landmarks.points().in_space()
@@ -111,6 +114,21 @@ def map_figure(found: RunFolder) -> Any:
             axes.plot(places[:, right], places[:, up], "+", color=COLOURS["known"], ms=9, label="known points")
         close_up(axes, plane, np.concatenate([mean[near], at]))
     shown[0][0].legend(loc="best", fontsize="small")
+    return figure
+
+
+def _grid_figure(found: RunFolder, world: "World", path: Trajectory, motion: Similarity) -> Any:
+    """Path and occupancy grid: black where something is, white where beams have passed, grey where none has."""
+    grid, figure, axes = read_grid(found.folder), *new_axes(f"{found.name}: map in {world.name}")
+    height, width = grid.log_odds.shape
+    x = grid.corner[0] + grid.cell_m * np.arange(width + 1)
+    y = grid.corner[1] + grid.cell_m * np.arange(height + 1)
+    corners = np.stack([*np.meshgrid(x, y), np.zeros((height + 1, width + 1))], axis=-1)
+    at = motion.transform(corners.reshape(-1, 3)).reshape(corners.shape)
+    shade_ = np.sign(grid.log_odds)
+    axes.pcolormesh(at[..., 0], at[..., 1], shade_, cmap="Greys", vmin=-1.0, vmax=1.0, rasterized=True)
+    axes.plot(path.positions[:, 0], path.positions[:, 1], color=COLOURS["filter"], lw=0.7, label="path")
+    axes.legend(loc="best", fontsize="small")
     return figure
 
 
@@ -322,7 +340,7 @@ class Views:
     @classmethod
     def of(cls, system: str, path: Trajectory) -> "Views":
         """For a path of a system: of a robot z is up, of a camera what its images' rows are square to."""
-        if system == "range-bearing":
+        if system in ("range-bearing", "laser"):
             flat = not np.ptp(path.positions[:, 2]) > 0.0
             return cls((0, 1), None if flat else (0, 2))
         return cls.of_camera(path.world_from_body)

@@ -1,7 +1,7 @@
 """What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -21,6 +21,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import (
     ImageSequence,
     KnownPixels,
+    LaserOptions,
     Part,
     RobotLog,
     Topics,
@@ -28,11 +29,14 @@ from rbpf.sensors.readers import (
     open_log,
     open_stereo,
     read_known_points,
+    read_laser_log,
 )
 from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.sensors.readers.part import WHOLE
 from rbpf.sensors.readers.robot_log import UNNAMED
+from rbpf.systems.laser.config import LaserConfig
+from rbpf.systems.laser.slam import LaserSlam
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageScreen
 from rbpf.systems.mono.known_map import KnownMap, read_known_map
@@ -184,6 +188,24 @@ class StereoRecording:
         named = {"recording": self.pairs, "calibration": self.calibration}
         found: dict[str, str | float | bool] = {name: str(path) for name, path in named.items() if path is not None}
         return found | self.topics.entries() | self.part.entries()
+
+
+@dataclass(frozen=True)
+class LaserRecording:
+    """A laser scanner's log."""
+
+    log: Path  #: file or folder of a known kind.
+    options: LaserOptions = field(default_factory=LaserOptions)  #: what it leaves open, and which of its scans.
+
+    def open(self, config: LaserConfig) -> Opened:
+        log = read_laser_log(self.log, self.options)
+        return Opened(LaserSlam(log.scanner, config), LogSource(log), log.stamps_ns, None)
+
+    def sources(self) -> dict[str, str | float | bool]:
+        options = self.options
+        named = {"recording": str(self.log), "scanner": options.scanner, "max_range": options.max_range_m}
+        found: dict[str, str | float | bool] = {name: value for name, value in named.items() if value is not None}
+        return found | ({"upside_down": True} if options.upside_down else {}) | options.part.entries()
 
 
 def part_of_log(log: RobotLog, part: Part) -> RobotLog:

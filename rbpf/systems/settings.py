@@ -15,7 +15,7 @@ HEADER = (
     "rbpf", "system", "versions", "input_sha256",
     "recording", "known_points", "board", "square_m", "calibration", "known_map", "localize",
     "aruco", "marker_m", "gap_m", "dictionary", "image_topic", "truth_topic", "video", "batch",
-    "start_s", "end_s", "every", "resize_px",
+    "start_s", "end_s", "every", "resize_px", "scanner", "max_range", "upside_down",
 )  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 

@@ -182,7 +182,7 @@ class System(ABC):
         """The landmarks as they are known now, each a Gaussian within + between particles, in the reported world."""
 
     @abstractmethod
-    def measurements(self, name: str, log: Recorded) -> FeatureLog | Measurements:
+    def measurements(self, name: str, log: Recorded) -> FeatureLog | Measurements | None:
         """What the system used of a recording of this name, landmarks named as in `map`: for a batch optimiser."""
 
     def particle_poses(self) -> np.ndarray:

@@ -12,13 +12,22 @@ from rbpf.cli import DemoOptions, main
 from rbpf.cli.cameras import CalibrateOptions, RecalibrateOptions
 from rbpf.cli.installed import DoctorOptions
 from rbpf.cli.judging import CompareOptions, ExportOptions, ReportOptions, SweepOptions, ValidateOptions
-from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, MonoOptions, RangeBearingOptions, StereoOptions
+from rbpf.cli.options import (
+    ImagesOptions,
+    LabOptions,
+    LaserRunOptions,
+    LogOptions,
+    MonoOptions,
+    RangeBearingOptions,
+    StereoOptions,
+)
 
 pytestmark = pytest.mark.slow
 
 COMMANDS = {
     "demo": DemoOptions,
     "run range-bearing": RangeBearingOptions,
+    "run laser": LaserRunOptions,
     "run mono": MonoOptions,
     "run stereo": StereoOptions,
     "simulate range-bearing": LogOptions,

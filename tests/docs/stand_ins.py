@@ -17,6 +17,7 @@ from rbpf.cli import main
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
@@ -48,6 +49,7 @@ NAMES = {
     "DATA/mono_redkitchen_a": "desk",
     "DATA/stereo_zed_room1": "desk",
     "DATA/mono_robot_lateral": "desk",
+    "robot.clf": "robot.clf",
     "phone.mp4": "phone.mp4",
     "board.mp4": "board.mp4",
     "drive.bag": "drive.bag",
@@ -113,6 +115,10 @@ class Shelf:
 
     def _log(self, path: Path) -> None:
         simulate_robot(RobotWorld(steps=20, landmarks=20), path, seed=0)
+
+    def _robot(self, path: Path) -> None:
+        simulate_laser(LaserWorld(scans=20, laps=1), self.folder / "corridor", seed=0)
+        shutil.copy(self.folder / "corridor" / "robot.clf", path)
 
     def _pairs(self, path: Path) -> None:
         render_room(path)

@@ -20,6 +20,7 @@ from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import LAG, System, TrackingState
 from tests.core.worlds import content, same
+from tests.systems.laser_worlds import laser, scans
 from tests.systems.mono_logs import SMALL, desk, without_known
 from tests.systems.plane_sequences import CAMERA, known_points, path, sequence, texture, view
 from tests.systems.stereo_sequences import errors_m, flat, missing, pairs
@@ -80,6 +81,7 @@ RESUMED = {
         lambda: stereo(map=MapConfig(kind="joint", active=30)), lambda: list(pairs(12).frames()), (0, 5, 7)
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
+    "scans": Case(lambda: laser(), lambda: scans(12), (0, 5, 6, 9), {TrackingState.TRACKED, TrackingState.PREDICTED}),
 }
 
 

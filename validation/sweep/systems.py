@@ -11,9 +11,17 @@ from typing import Any
 from rbpf.errors import InputError
 from rbpf.runs.folder import summarise
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import MonoRecording, Recording, RobotRecording, StereoRecording, filter_recording
+from rbpf.runs.recordings import (
+    LaserRecording,
+    MonoRecording,
+    Recording,
+    RobotRecording,
+    StereoRecording,
+    filter_recording,
+)
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space
+from rbpf.systems.laser.config import LaserConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
@@ -78,6 +86,7 @@ def _system(name: str, config: type, recording: Callable[..., Recording], *field
 
 SYSTEMS = {
     "range-bearing": _system("range-bearing", RangeBearingConfig, RobotRecording, "recording"),
+    "laser": _system("laser", LaserConfig, LaserRecording, "recording"),
     "mono": _system("mono", MonoConfig, MonoRecording, "recording", "known_points", "calibration"),
     "stereo": _system("stereo", StereoConfig, StereoRecording, "recording", "calibration"),
 }

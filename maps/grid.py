@@ -1,0 +1,258 @@
+"""Occupancy of the plane in cells, one grid per particle, in tiles that particles share and copy when they write.
+
+Each cell holds the log-odds that it is occupied (H. Moravec and A. Elfes 1985), given the particle's path, and the mean place
+of the beams that ended in it, which is finer than the cell. What a scan says of the state is the likelihood field of
+S. Thrun, W. Burgard, D. Fox 2005, §6.4: a beam's end is as likely as it is near to what is occupied.
+
+    log p(z | x, m) = Σ_k w_k log(1 + ρ exp(−d_k² / 2σ²)) + const
+
+with the distance d_k from the end of beam k to the nearest occupied cell's mean place, and the ratio ρ of a hit's density
+at d = 0 to that of an end anywhere. The weights w_k ≤ 1 are the sensor's: neighbouring beams are not independent.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, final
+
+import numba
+import numpy as np
+
+from rbpf.arrays import numbers as numbers_of
+from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Conditional, LogDensities, Observations, Part
+from rbpf.core.particles import Prior, Proposed
+from rbpf.errors import InputError
+from rbpf.maps import grid_kernels as cells
+from rbpf.ranges import Positive, Range, Ranged, require_memory
+
+_FIRST_TILES = 256
+_EVERY = 2
+"""Of so many beams one is looked at on the lattice of a search."""
+GRID = Part("occupancy grid")
+"""Its name in a filter."""
+
+
+@dataclass(frozen=True)
+class GridConfig(Ranged):
+    """Cells and the likelihood field."""
+
+    cell_m: Annotated[float, Range(ge=0.005, le=1.0)] = 0.05  #: side of a cell.
+    hit: Positive = 0.85  #: added to the log-odds of a cell in which a beam ends; p = 0.7.
+    miss: Positive = 0.4  #: subtracted where one passes; p = 0.4.
+    bound: Positive = 4.0  #: of the log-odds, so that what moves away is forgotten.
+    sigma_m: Positive = (
+        0.07  #: σ, of a beam's end about what is occupied: the scanner's noise, the map's, and the cells'.
+    )
+    hit_ratio: Positive = 20.0  #: ρ, how much likelier an end is at what is occupied than anywhere.
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One particle's grid: log-odds (H, W), row 0 at the lowest y, 0 where nothing is known; its corner's place [m]."""
+
+    log_odds: np.ndarray
+    cell_m: float
+    corner: np.ndarray  #: (2,) x and y of the outer corner of cell [0, 0].
+
+
+@final
+class GridMap(Conditional):
+    """Grids, given the sampled states in SE(2). Raw data of the part `GRID` are beams (K, 5), see `rbpf.maps.grid_kernels`."""
+
+    supplies, takes_raw = GRID, True
+
+    def __init__(self, config: GridConfig | None = None) -> None:
+        self.config = config or GridConfig()
+        side, sigma = self.config.cell_m, self.config.sigma_m
+        # As far as a hit is a twentieth as likely as an end anywhere.
+        half = int(np.ceil(sigma * np.sqrt(2.0 * np.log(20.0 * max(self.config.hit_ratio, 1.0))) / side))
+        # What an occupied cell whose mean place is at ((i + ½)/8, (j + ½)/8) gives the centres of the cells near it.
+        place = (np.arange(cells.FINE) + 0.5) / cells.FINE - 0.5
+        square = ((np.arange(-half, half + 1) - place[:, None]) * side) ** 2
+        distance = square[:, None, :, None] + square[None, :, None, :]
+        stamps = np.log1p(self.config.hit_ratio * np.exp(-0.5 * distance / sigma**2))
+        self._stamps = stamps.astype(np.float32)
+        self._marks, self._fields = np.zeros((0, 0, 0), dtype=bool), np.zeros((0, 0, 0), dtype=np.float32)
+        self._change = np.array([self.config.hit, self.config.miss, self.config.bound])
+        # Differences over these see the field's shape, not single cells: one σ, and so much at four metres.
+        self._steps = np.array([sigma / 4.0, sigma, sigma]) / 2.0
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        tile = cells.TILE
+        self.index = np.full((n, 1, 1), -1, dtype=np.int32)
+        self.origin = np.zeros(2, dtype=np.int64)
+        self.pool = np.zeros((_FIRST_TILES, cells.PLANES, tile, tile), dtype=np.float32)
+        self.users = np.zeros(_FIRST_TILES, dtype=np.int64)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles in use."""
+        return int(np.count_nonzero(self.users))
+
+    def match(self, prior: Prior, beams: np.ndarray, most: int = 20_000) -> tuple[Proposed, np.ndarray]:
+        """The Gaussian about the increment at which prior times likelihood of a scan (K, 5) is highest, and how well it fits.
+
+        Its covariance is that of the prior and of the field's curvature there; its look-ahead weight Laplace's integral. The
+        lattice of the search spans three standard deviations of the prior; with more than `most` points it is made wider.
+        The fit (N,) is the likelihood's logarithm over that of a scan all of whose beams end at occupied places' very middle.
+
+        Raises InputError: the prior's increment has a mean of its own, as of a motion that a substate drives.
+        """
+        if not prior.centred:
+            raise InputError(
+                "scans are matched about a motion whose noise has mean zero, not one that a substate drives"
+            )
+        n = prior.base.shape[0]
+        cov = (prior.factor @ np.swapaxes(prior.factor, -1, -2)).mean(axis=0)
+        radius = 3.0 * np.sqrt(np.diag(cov)) + 1e-9
+        reach = max(1.0, float(np.sqrt(np.square(beams[:, 2:4]).sum(axis=1).mean())) if beams.size else 0.0)
+        step = self.config.sigma_m
+        spacing = 2.0 * np.array([step / reach, step, step])
+        points = float(np.prod(2.0 * np.ceil(radius / spacing) + 1.0))
+        spacing *= max(1.0, (points / most) ** (1.0 / 3.0))
+        slack = float(np.hypot(radius[1], radius[2])) + float(spacing[1])
+        info = np.linalg.inv(cov + 1e-12 * np.eye(3))
+        found, value, hessian = np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3))
+        place = self._place(prior.base, beams, slack)
+        cells.search(*place, info, radius, spacing, self._steps, _EVERY, found, value, hessian)
+        factor = np.broadcast_to(prior.factor, (n, *prior.factor.shape[1:]))
+        curvature = np.swapaxes(factor, -1, -2) @ self._curvature(hessian) @ factor
+        root = np.linalg.cholesky(np.eye(factor.shape[2]) + curvature)
+        u = (np.linalg.pinv(factor) @ found[..., None])[..., 0]
+        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        log_w1 = value - 0.5 * (u * u).sum(axis=1) - log_det
+        fit = value / max(float(beams[:, 4].sum()) * np.log1p(self.config.hit_ratio), 1e-9)
+        # A field has no innovation, whose square would be a χ².
+        unknown = np.full(n, np.nan)
+        return Proposed(u, np.swapaxes(np.linalg.inv(root), -1, -2), log_w1, unknown, np.zeros(n)), fit
+
+    def _curvature(self, hessian: np.ndarray) -> np.ndarray:
+        """What falls off about a maximum (N, 3, 3), as information; in units in which the steps weigh the same."""
+        unit = self._steps
+        curve, axes = np.linalg.eigh(-hessian * unit[:, None] * unit)
+        scaled = axes / unit[:, None]
+        return (scaled * np.maximum(curve, 0.0)[:, None, :]) @ np.swapaxes(scaled, -1, -2)
+
+    def log_likelihood(self, state: np.ndarray, beams: np.ndarray) -> np.ndarray:
+        """(N,) log p(z | x, m) up to a constant, of a scan (K, 5) at the states (N, 3)."""
+        value = np.empty(state.shape[0])
+        cells.scores(*self._place(state, beams), value)
+        return value
+
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """The likelihood at the states; then the beams are written."""
+        scans = [beams_of(group) for group in groups]
+        total = sum((self.log_likelihood(state, beams) for beams in scans), np.zeros(state.shape[0]))
+        for beams in scans:
+            self.insert(state, beams)
+        return LogDensities(total, np.zeros_like(total))
+
+    def insert(self, state: np.ndarray, beams: np.ndarray) -> None:
+        """Writes a scan (K, 5) at the states (N, 3)."""
+        if not beams.shape[0]:
+            return
+        self._cover(state, beams)
+        touched = np.zeros(self.index.shape, dtype=bool)
+        side = self.config.cell_m
+        cells.touch(state, beams, side, self.origin, touched)
+        self._require(cells.count_shared(touched, self.index, self.users))
+        cells.own(touched, self.index, self.users, self.pool, np.flatnonzero(self.users == 0))
+        cells.insert(state, beams, side, self.origin, self.index, self.pool, self._change)
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        self.index = np.ascontiguousarray(self.index[ancestors])
+        used = self.index[self.index >= 0]
+        self.users = np.bincount(used, minlength=self.users.size).astype(np.int64)
+
+    def picture(self, particle: int) -> Picture:
+        """The grid of one particle, cut to what is known."""
+        tile, index = cells.TILE, self.index[particle]
+        held = np.argwhere(index >= 0)
+        low, high = (held.min(axis=0), held.max(axis=0) + 1) if held.size else (np.zeros(2, int), np.ones(2, int))
+        cut = index[low[0] : high[0], low[1] : high[1]]
+        found = np.where((cut >= 0)[:, :, None, None], self.pool[cut, cells.LOG_ODDS], 0.0)
+        height, width = cut.shape
+        log_odds = found.transpose(0, 2, 1, 3).reshape(height * tile, width * tile)
+        corner = (low + self.origin)[::-1] * (tile * self.config.cell_m)
+        return Picture(log_odds, self.config.cell_m, corner)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        # In the order in which the particles come by them, which does not depend on where in the pool they lie.
+        tiles, first = np.unique(self.index[self.index >= 0], return_index=True)
+        used = tiles[np.argsort(first)]
+        number = np.full(self.users.size + 1, -1)
+        number[used] = np.arange(used.size)
+        return {"grid/index": number[self.index], "grid/origin": self.origin, "grid/cells": self.pool[used]}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        n, tile = self.index.shape[0], cells.TILE
+        schema = {
+            "cells": numbers("tiles", cells.PLANES, tile, tile),
+            "index": integers(n, "height", "width", least=-1, below="tiles"),
+            "origin": integers(2),
+        }
+        found = read(arrays, schema, "grid/")
+        self.index, self.origin = found["index"].astype(np.int32), found["origin"]
+        self.pool = found["cells"].astype(np.float32)
+        self.users = np.bincount(self.index[self.index >= 0], minlength=len(self.pool)).astype(np.int64)
+
+    def options(self) -> dict[str, object]:
+        return {"grid": repr(self.config)}
+
+    def _place(self, state: np.ndarray, beams: np.ndarray, slack: float = 0.0) -> tuple:
+        """What the kernels of the field need; the window reaches `slack` [m] beyond the beams."""
+        side = self.config.cell_m
+        reach = float(np.hypot(beams[:, 2], beams[:, 3]).max(initial=0.0)) + slack + self._stamps.shape[2] * side
+        tiles = 2 * int(np.ceil(reach / (side * cells.TILE))) + 3
+        threads = min(numba.get_num_threads(), state.shape[0])
+        if self._marks.shape[0] != threads or self._marks.shape[1] < tiles:
+            cells_wide = tiles * cells.TILE + self._stamps.shape[2] - 1
+            require_memory(4.0 * threads * cells_wide**2, f"the likelihood field of a scan that reaches {reach:.0f} m")
+            self._fields = np.zeros((threads, cells_wide, cells_wide), dtype=np.float32)
+            self._marks = np.zeros((threads, tiles, tiles), dtype=bool)
+        fields = self._fields, self._marks
+        return (np.ascontiguousarray(state), beams, side, self.origin, self.index, self.pool, self._stamps, *fields)
+
+    def _cover(self, state: np.ndarray, beams: np.ndarray) -> None:
+        """Makes the index reach as far as the beams do."""
+        pitch = self.config.cell_m * cells.TILE
+        reach = float(np.hypot(beams[:, [0, 2]], beams[:, [1, 3]]).max()) + pitch
+        low = np.floor((state[:, :0:-1].min(axis=0) - reach) / pitch).astype(np.int64)
+        high = np.floor((state[:, :0:-1].max(axis=0) + reach) / pitch).astype(np.int64) + 1
+        n, *size = self.index.shape
+        if not (self.index >= 0).any():
+            before, after = np.array(low), np.array(high)
+            self.origin, old = low, np.zeros((n, 0, 0), dtype=np.int32)
+        else:
+            before, after = self.origin, self.origin + size
+            old = self.index
+        if (low >= before).all() and (high <= after).all() and old.size:
+            return
+        low, high = np.minimum(low, before), np.maximum(high, after)
+        height, width = (high - low).tolist()
+        require_memory(4.0 * n * height * width, f"a map of {height * pitch:.0f} m by {width * pitch:.0f} m")
+        self.index = np.full((n, height, width), -1, dtype=np.int32)
+        y, x = before - low
+        self.index[:, y : y + old.shape[1], x : x + old.shape[2]] = old
+        self.origin = low
+
+    def _require(self, count: int) -> None:
+        """Makes room for so many more tiles."""
+        free = int(np.count_nonzero(self.users == 0))
+        if free >= count:
+            return
+        more = max(count - free, self.users.size)
+        require_memory(4.0 * (self.users.size + more) * self.pool[0].size, f"{self.users.size + more} tiles of the map")
+        self.pool = np.concatenate([self.pool, np.zeros((more, *self.pool.shape[1:]), dtype=np.float32)])
+        self.users = np.concatenate([self.users, np.zeros(more, dtype=np.int64)])
+
+
+def beams_of(group: Observations) -> np.ndarray:
+    """The beams (K, 5) of a group. Raises InputError: the data are something else, or not finite."""
+    beams = numbers_of(np.asarray(group.data), "a scan")
+    if beams.ndim != 2 or beams.shape[1] != 5 or not np.isfinite(beams).all():
+        raise InputError(
+            f"a scan for a grid is beams (K, 5), finite: where each begins, where it ends, and its weight; got {beams.shape}"
+        )
+    return beams

@@ -1,0 +1,393 @@
+"""Numba only: beams written into the cells of many particles' grids, and the likelihood field of a scan.
+
+A grid is an index (N, H, W) of tiles, −1 where a particle has none, and a pool (tiles, PLANES, TILE, TILE) of their cells.
+Cell (x, y) of the world is floor(position / side); `origin` is the tile of index[:, 0, 0], as (y, x). A scan is `beams`
+(K, 5): where each begins and ends in the robot's frame [m], and its weight. States are (N, 3) elements of SE(2), [θ, x, y].
+"""
+
+import math
+
+import numpy as np
+from numba import boolean, float32, float64, int32, int64, njit, prange, types, void
+
+from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR
+
+TILE = 32
+"""Cells of a side of a tile."""
+PLANES = 4
+"""Of a tile: log-odds; how many beams ended in the cell, and their mean place in it, x and y in [0, 1)."""
+LOG_ODDS, ENDS, MEAN_X, MEAN_Y = range(PLANES)
+FINE = 8
+"""Places in a cell, along each axis, for which the field of one occupied cell is tabulated."""
+
+INDEX = types.Array(int32, 3, "C")
+POOL = types.Array(float32, 4, "C")
+STAMPS = types.Array(float32, 4, "C")
+FIELDS = types.Array(float32, 3, "C")
+TOUCHED = types.Array(boolean, 3, "C")
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _first(a, d, pitch):
+    """Along one axis: the cell of `a`, the parameter at which a step `d` leaves it, and that of one cell more."""
+    cell = math.floor(a / pitch)
+    if d > 0.0:
+        return cell, ((cell + 1) * pitch - a) / d, pitch / d
+    if d < 0.0:
+        return cell, (cell * pitch - a) / d, -pitch / d
+    return cell, np.inf, np.inf
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _ends(state, beam):
+    """Where a beam begins and ends in the world [m]."""
+    cos, sin = math.cos(state[0]), math.sin(state[0])
+    return (
+        state[1] + cos * beam[0] - sin * beam[1],
+        state[2] + sin * beam[0] + cos * beam[1],
+        state[1] + cos * beam[2] - sin * beam[3],
+        state[2] + sin * beam[2] + cos * beam[3],
+    )
+
+
+@njit(void(MATRIX, MATRIX, float64, INDICES, TOUCHED), cache=True, error_model="numpy")
+def touch(state, beams, side, origin, touched):
+    """Marks the tiles (N, H, W) that the beams cross, from end to end (J. Amanatides and A. Woo 1987)."""
+    pitch = side * TILE
+    for n in range(state.shape[0]):
+        for k in range(beams.shape[0]):
+            x0, y0, x1, y1 = _ends(state[n], beams[k])
+            x, next_x, more_x = _first(x0, x1 - x0, pitch)
+            y, next_y, more_y = _first(y0, y1 - y0, pitch)
+            steps = abs(math.floor(x1 / pitch) - x) + abs(math.floor(y1 / pitch) - y)
+            step_x, step_y = 1 if x1 > x0 else -1, 1 if y1 > y0 else -1
+            touched[n, int(y) - origin[0], int(x) - origin[1]] = True
+            for _ in range(int(steps)):
+                if next_x < next_y:
+                    x += step_x
+                    next_x += more_x
+                else:
+                    y += step_y
+                    next_y += more_y
+                touched[n, int(y) - origin[0], int(x) - origin[1]] = True
+
+
+@njit(int64(TOUCHED, INDEX, INDICES), cache=True, error_model="numpy")
+def count_shared(touched, index, users):
+    """How many tiles `own` will take from the pool."""
+    count = 0
+    for n in range(index.shape[0]):
+        for y in range(index.shape[1]):
+            for x in range(index.shape[2]):
+                if touched[n, y, x]:
+                    tile = index[n, y, x]
+                    if tile < 0 or users[tile] > 1:
+                        count += 1
+    return count
+
+
+@njit(void(TOUCHED, INDEX, INDICES, POOL, INDICES), cache=True, error_model="numpy")
+def own(touched, index, users, pool, free):
+    """Gives every particle a tile of its own wherever it will write: a copy of the one that it shares, or an empty one."""
+    taken = 0
+    for n in range(index.shape[0]):
+        for y in range(index.shape[1]):
+            for x in range(index.shape[2]):
+                if not touched[n, y, x]:
+                    continue
+                tile = index[n, y, x]
+                if tile >= 0 and users[tile] == 1:
+                    continue
+                new = free[taken]
+                taken += 1
+                if tile < 0:
+                    pool[new] = 0.0
+                else:
+                    pool[new] = pool[tile]
+                    users[tile] -= 1
+                users[new] = 1
+                index[n, y, x] = new
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _tile_of(index, n, origin, x, y):
+    """The tile of a cell, −1 where there is none."""
+    row, column = (y // TILE) - origin[0], (x // TILE) - origin[1]
+    if row < 0 or column < 0 or row >= index.shape[1] or column >= index.shape[2]:
+        return -1
+    return index[n, row, column]
+
+
+@njit(void(MATRIX, MATRIX, float64, INDICES, INDEX, POOL, VECTOR), parallel=True, cache=True, error_model="numpy")
+def insert(state, beams, side, origin, index, pool, change):
+    """Writes a scan into tiles that nobody shares; `change` is what the log-odds take: of an end, of a crossing, the bound."""
+    hit, miss, bound = change[0], change[1], change[2]
+    for n in prange(state.shape[0]):
+        # What is crossed comes first, so that a wall which a grazing beam passes by is a wall again after this scan.
+        for k in range(beams.shape[0]):
+            x0, y0, x1, y1 = _ends(state[n], beams[k])
+            x, next_x, more_x = _first(x0, x1 - x0, side)
+            y, next_y, more_y = _first(y0, y1 - y0, side)
+            steps = abs(math.floor(x1 / side) - x) + abs(math.floor(y1 / side) - y)
+            step_x, step_y = 1 if x1 > x0 else -1, 1 if y1 > y0 else -1
+            for _ in range(int(steps)):
+                cx, cy = int(x), int(y)
+                tile = _tile_of(index, n, origin, cx, cy)
+                if tile >= 0:
+                    cell = pool[tile, LOG_ODDS, cy % TILE, cx % TILE]
+                    pool[tile, LOG_ODDS, cy % TILE, cx % TILE] = max(cell - miss, -bound)
+                if next_x < next_y:
+                    x += step_x
+                    next_x += more_x
+                else:
+                    y += step_y
+                    next_y += more_y
+        for k in range(beams.shape[0]):
+            _, _, x1, y1 = _ends(state[n], beams[k])
+            cx, cy = math.floor(x1 / side), math.floor(y1 / side)
+            tile = _tile_of(index, n, origin, cx, cy)
+            if tile >= 0:
+                row, column = cy % TILE, cx % TILE
+                pool[tile, LOG_ODDS, row, column] = min(pool[tile, LOG_ODDS, row, column] + hit, bound)
+                count = pool[tile, ENDS, row, column] + 1.0
+                pool[tile, ENDS, row, column] = count
+                pool[tile, MEAN_X, row, column] += (x1 / side - cx - pool[tile, MEAN_X, row, column]) / count
+                pool[tile, MEAN_Y, row, column] += (y1 / side - cy - pool[tile, MEAN_Y, row, column]) / count
+
+
+@njit(cache=True, error_model="numpy")
+def _mark(marked, window, state, beams, side, turn, margin):
+    """Marks the window's tiles within `margin` [m] of where beams may end, if the heading errs by up to ±`turn`."""
+    pitch = side * TILE
+    reach = 0.0
+    for k in range(beams.shape[0]):
+        reach = max(reach, math.hypot(beams[k, 2], beams[k, 3]))
+    count = math.ceil(turn * reach / (0.5 * pitch))
+    guess = state.copy()
+    for j in range(-count, count + 1):
+        guess[0] = state[0] + turn * j / max(count, 1)
+        for k in range(beams.shape[0]):
+            _, _, x, y = _ends(guess, beams[k])
+            left, right = math.floor((x - margin) / pitch), math.floor((x + margin) / pitch)
+            low, high = math.floor((y - margin) / pitch), math.floor((y + margin) / pitch)
+            for row in range(max(low - window[0], 0), min(high - window[0] + 1, marked.shape[0])):
+                for column in range(max(left - window[1], 0), min(right - window[1] + 1, marked.shape[1])):
+                    marked[row, column] = True
+
+
+@njit(cache=True, error_model="numpy")
+def _build(field, marked, window, n, origin, index, pool, stamps):
+    """Fills the marked tiles of the field: at each cell's centre, the highest stamp of any occupied cell near it."""
+    width = stamps.shape[2]
+    for row in range(marked.shape[0]):
+        for column in range(marked.shape[1]):
+            y, x = row + window[0] - origin[0], column + window[1] - origin[1]
+            if not marked[row, column] or y < 0 or x < 0 or y >= index.shape[1] or x >= index.shape[2]:
+                continue
+            tile = index[n, y, x]
+            if tile < 0:
+                continue
+            for b in range(TILE):
+                for a in range(TILE):
+                    if pool[tile, LOG_ODDS, b, a] <= 0.0:
+                        continue
+                    fine_y = min(int(pool[tile, MEAN_Y, b, a] * FINE), FINE - 1)
+                    fine_x = min(int(pool[tile, MEAN_X, b, a] * FINE), FINE - 1)
+                    # The field has a border of half a stamp, so that one always fits.
+                    for v in range(width):
+                        target = field[row * TILE + b + v]
+                        for u in range(width):
+                            value = stamps[fine_y, fine_x, v, u]
+                            if value > target[column * TILE + a + u]:
+                                target[column * TILE + a + u] = value
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _prepare(n, state, beams, turn, margin, side, origin, index, pool, stamps, field, marked, window):
+    """The field about where the beams of one particle may end, in a window of tiles about its state."""
+    pitch, tiles = side * TILE, marked.shape[0]
+    window[0] = math.floor(state[2] / pitch) - tiles // 2
+    window[1] = math.floor(state[1] / pitch) - tiles // 2
+    _mark(marked, window, state, beams, side, turn, margin)
+    _build(field, marked, window, n, origin, index, pool, stamps)
+
+
+@njit(cache=True, error_model="numpy")
+def _clear(field, marked, border):
+    """Undoes `_mark` and `_build`."""
+    for row in range(marked.shape[0]):
+        for column in range(marked.shape[1]):
+            if marked[row, column]:
+                low, left = row * TILE, column * TILE
+                field[low : low + TILE + 2 * border, left : left + TILE + 2 * border] = 0.0
+                marked[row, column] = False
+
+
+@njit(cache=True, error_model="numpy")
+def _score(field, window, border, side, x, y, cos, sin, beams):
+    """Σ of weight · field at the beams' ends, interpolated between the centres of cells."""
+    rows, columns = field.shape
+    total = 0.0
+    left, low = window[1] * TILE - border + 0.5, window[0] * TILE - border + 0.5
+    for k in range(beams.shape[0]):
+        px = (x + cos * beams[k, 2] - sin * beams[k, 3]) / side - left
+        py = (y + sin * beams[k, 2] + cos * beams[k, 3]) / side - low
+        if px < 0.0 or py < 0.0 or px >= columns - 1 or py >= rows - 1:
+            continue
+        column, row = int(px), int(py)
+        u, v = px - column, py - row
+        below = (1.0 - u) * field[row, column] + u * field[row, column + 1]
+        above = (1.0 - u) * field[row + 1, column] + u * field[row + 1, column + 1]
+        total += beams[k, 4] * ((1.0 - v) * below + v * above)
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _retracted(base, increment, out):
+    """Base · Exp(increment) in SE(2)."""
+    half = 0.5 * increment[0]
+    sinc = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
+    cos, sin = sinc * math.cos(base[0] + half), sinc * math.sin(base[0] + half)
+    out[0] = base[0] + increment[0]
+    out[1] = base[1] + cos * increment[1] - sin * increment[2]
+    out[2] = base[2] + sin * increment[1] + cos * increment[2]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _penalty(info, increment):
+    """½ εᵀ info ε."""
+    total = 0.0
+    for a in range(3):
+        for b in range(3):
+            total += increment[a] * info[a, b] * increment[b]
+    return 0.5 * total
+
+
+@njit(cache=True, error_model="numpy")
+def _value(field, window, border, side, base, increment, beams, state):
+    _retracted(base, increment, state)
+    return _score(field, window, border, side, state[1], state[2], math.cos(state[0]), math.sin(state[0]), beams)
+
+
+@njit(cache=True, error_model="numpy")
+def _second_order(field, window, border, side, base, at, beams, steps, state, gradient, hessian):
+    """Value, gradient (3,) and Hessian (3, 3) of the score by differences over `steps` (3,), which see past single cells."""
+    there = at.copy()
+    value = _value(field, window, border, side, base, at, beams, state)
+    for a in range(3):
+        there[a] = at[a] + steps[a]
+        up = _value(field, window, border, side, base, there, beams, state)
+        there[a] = at[a] - steps[a]
+        down = _value(field, window, border, side, base, there, beams, state)
+        there[a] = at[a]
+        gradient[a] = (up - down) / (2.0 * steps[a])
+        hessian[a, a] = (up - 2.0 * value + down) / steps[a] ** 2
+    for a in range(3):
+        for b in range(a):
+            mixed = 0.0
+            for i in (-1, 1):
+                for j in (-1, 1):
+                    there[a], there[b] = at[a] + i * steps[a], at[b] + j * steps[b]
+                    mixed += i * j * _value(field, window, border, side, base, there, beams, state)
+            there[a], there[b] = at[a], at[b]
+            hessian[a, b] = hessian[b, a] = mixed / (4.0 * steps[a] * steps[b])
+    return value
+
+
+PLACE = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED
+"""Types of (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all zero."""
+
+
+@njit(void(*PLACE, VECTOR), parallel=True, cache=True, error_model="numpy")
+def scores(state, beams, side, origin, index, pool, stamps, fields, marks, value):
+    """Σ of weight · field (N,) at the states."""
+    border = stamps.shape[2] // 2
+    threads = fields.shape[0]
+    for thread in prange(threads):
+        field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
+        for n in range(thread, state.shape[0], threads):
+            margin = (border + 1) * side
+            _prepare(n, state[n], beams, 0.0, margin, side, origin, index, pool, stamps, field, marked, window)
+            cos, sin = math.cos(state[n, 0]), math.sin(state[n, 0])
+            value[n] = _score(field, window, border, side, state[n, 1], state[n, 2], cos, sin, beams)
+            _clear(field, marked, border)
+
+
+@njit(
+    void(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, int64, MATRIX, VECTOR, CUBE),
+    parallel=True,
+    cache=True,
+    error_model="numpy",
+)
+def search(
+    state, beams, side, origin, index, pool, stamps, fields, marks, info, radius, spacing, steps, every,
+    increment, value, hessian,
+):  # fmt: skip
+    """The increments (N, 3) at which score minus ½ εᵀ info ε is highest, within ±`radius` (3,) of the states.
+
+    First on a lattice of `spacing` (3,), by the nearest cells' values for each `every`-th beam; then, from its best
+    point, along the axes with steps that are halved (G. Grisetti et al. 2007).
+    """
+    border = stamps.shape[2] // 2
+    threads = fields.shape[0]
+    for thread in prange(threads):
+        field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
+        there, best, trial, gradient = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        counts = np.zeros(3, dtype=np.int64)
+        for a in range(3):
+            counts[a] = math.ceil(radius[a] / spacing[a])
+        count = (beams.shape[0] + every - 1) // every
+        ends = np.zeros((count, 2))
+        for n in range(thread, state.shape[0], threads):
+            base, turn = state[n], radius[0] + spacing[0]
+            margin = (border + 1) * side + math.hypot(radius[1] + spacing[1], radius[2] + spacing[2])
+            _prepare(n, base, beams, turn, margin, side, origin, index, pool, stamps, field, marked, window)
+            left, low = window[1] * TILE - border, window[0] * TILE - border
+            highest = -np.inf
+            for i in range(-counts[0], counts[0] + 1):
+                trial[0] = i * spacing[0]
+                cos, sin = math.cos(base[0] + trial[0]), math.sin(base[0] + trial[0])
+                for k in range(count):
+                    beam = beams[k * every]
+                    ends[k, 0] = (base[1] + cos * beam[2] - sin * beam[3]) / side - left
+                    ends[k, 1] = (base[2] + sin * beam[2] + cos * beam[3]) / side - low
+                # Shifts are along the axes of the robot half way through the turn, where Exp has its chord.
+                half = 0.5 * trial[0]
+                chord = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
+                cos, sin = chord * math.cos(base[0] + half) / side, chord * math.sin(base[0] + half) / side
+                for j in range(-counts[1], counts[1] + 1):
+                    trial[1] = j * spacing[1]
+                    for m in range(-counts[2], counts[2] + 1):
+                        trial[2] = m * spacing[2]
+                        shift_x = cos * trial[1] - sin * trial[2]
+                        shift_y = sin * trial[1] + cos * trial[2]
+                        total = 0.0
+                        for k in range(count):
+                            column, row = int(ends[k, 0] + shift_x), int(ends[k, 1] + shift_y)
+                            if 0 <= column < field.shape[1] and 0 <= row < field.shape[0]:
+                                total += every * beams[k * every, 4] * field[row, column]
+                        total -= _penalty(info, trial)
+                        if total > highest:
+                            highest = total
+                            best[:] = trial
+            # Uphill from there.
+            highest = _value(field, window, border, side, base, best, beams, there) - _penalty(info, best)
+            scale = 0.5
+            while scale > 0.01:
+                moved = False
+                for a in range(3):
+                    for sign in (-1.0, 1.0):
+                        trial[:] = best
+                        trial[a] += sign * scale * spacing[a]
+                        if abs(trial[a]) > radius[a] + spacing[a]:
+                            continue
+                        total = _value(field, window, border, side, base, trial, beams, there) - _penalty(info, trial)
+                        if total > highest:
+                            highest = total
+                            best[:] = trial
+                            moved = True
+                if not moved:
+                    scale *= 0.5
+            increment[n] = best
+            value[n] = _second_order(field, window, border, side, base, best, beams, steps, there, gradient, hessian[n])
+            _clear(field, marked, border)

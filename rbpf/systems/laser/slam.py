@@ -1,0 +1,250 @@
+"""Grid SLAM with a laser scanner, by the method of GMapping.
+
+G. Grisetti, C. Stachniss, W. Burgard, "Improved techniques for grid mapping with Rao-Blackwellized particle filters", 2007.
+
+    slam = LaserSlam(log.scanner)
+    for scan in log.frames:
+        frame = slam.track(scan.ranges, scan.odometry, scan.stamp_ns)
+
+Each particle searches its own grid for the pose that explains the scan best, and is sampled from the Gaussian about it; then
+the filter corrects by the exact ratio w₂ = p(z|x) p(x|x⁻) / (q(x) w₁). A scan is used when the robot has moved since the last
+one that was; the pose of every other one is that of the odometry from there on.
+"""
+
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.core.checkpoint import elements, fitting, integers, numbers, read
+from rbpf.core.filter import Filter
+from rbpf.core.models import LineariseAt, Proposal
+from rbpf.core.particles import Prior, Proposed
+from rbpf.core.proposals import PriorProposal
+from rbpf.errors import InputError
+from rbpf.lie import SE2
+from rbpf.maps.grid import GRID, GridMap, Picture
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.sensors.laser import BeamSensor, Scan, Scanner
+from rbpf.systems.laser.config import LaserConfig
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.system import DIAGNOSTICS, FILTER_COLUMNS, Column, Recorded, System, Tracked, TrackingState
+
+BARELY = 0.1
+"""A scan that fits its map less than this, of 1, says nothing of where the robot is."""
+
+_STATE = {
+    "pose": elements(SE2),
+    "cov": numbers(3, 3),
+    "since": elements(SE2),
+    "moved": numbers(3, least=0),
+    "odometry": elements(SE2),
+    "measured": numbers(3, values="any"),
+    "twist": numbers(3),
+    "stamps": integers(2),
+    "counts": integers(1, least=0),
+    "ess": numbers(),
+}
+
+
+@final
+class ScanMatching(Proposal):
+    """The Gaussian about the pose at which a scan's beams (K, 5) fit each particle's own grid best, see `GridMap.match`."""
+
+    def __init__(self, grid: GridMap, beams: np.ndarray) -> None:
+        self.grid, self.beams = grid, beams
+        self.fit = 0.0
+        """How well the scan fits there, of 1, a mean over the particles."""
+
+    def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
+        proposed, fit = self.grid.match(prior, self.beams)
+        self.fit = float(fit.mean())
+        return proposed
+
+
+@final
+class LaserSlam(System):
+    """Grid SLAM.
+
+    Args:
+        scanner: where its beams point, and where it sits on the robot.
+        config: all settings.
+    """
+
+    name = "laser"
+    frame_word = "scan"
+    space = SE2
+
+    def __init__(self, scanner: Scanner, config: LaserConfig | None = None) -> None:
+        self.scanner, self.config = scanner, (config := config or LaserConfig())
+        self.grid = GridMap(config.grid)
+        self.filter = Filter(
+            OdometryMotion(SE2),
+            BeamSensor(GRID),
+            self.grid,
+            resampler=config.resampling.build(),
+            n=config.particles,
+            rng=np.random.default_rng(config.seed),
+            lag=self.lag,
+        )
+        self.columns = (
+            *FILTER_COLUMNS,
+            Column("fit", "how well the scan fits the map, of 1; NaN where it was not matched", table=DIAGNOSTICS),
+            Column("beams", "readings that came back", kind=int, table=DIAGNOSTICS),
+            Column("odometry", "world_from_robot by odometry alone", shape=(3,)),
+        )
+        # The last step's pose, and what has moved since: by odometry, how far, how much it turned, how long without any.
+        self._pose, self._cov = SE2.identity(), np.zeros((3, 3))
+        self._since, self._moved = SE2.identity(), np.zeros(3)
+        # Odometry composed, its last reading (NaN where there is none), the speed between the last two steps.
+        self._odometry, self._measured = SE2.identity(), np.full(3, np.nan)
+        self._twist = np.zeros(3)
+        # Times of the last scan and of the last step, −1 before the first; scans that were used.
+        self._stamps, self._used, self._ess = [-1, -1], 0, float(config.particles)
+
+    def track(self, ranges: np.ndarray, odometry: np.ndarray | None = None, stamp_ns: int | None = None) -> Tracked:
+        """A scan, and what it says of where the robot is.
+
+        Args:
+            ranges: (B,) [m]; inf where nothing came back, NaN where a reading is not valid.
+            odometry: (E,) world_from_robot by odometry; None where there is none: the motion then goes on as before.
+            stamp_ns: time; by default a second after the last scan.
+
+        Raises InputError: time runs backwards, there are not as many readings as beams, or the map outgrows the memory.
+        """
+        previous = self._stamps[0]
+        stamp_ns = previous + 1_000_000_000 if stamp_ns is None else int(stamp_ns)
+        if self._used and stamp_ns < previous:
+            raise InputError(f"time runs backwards: a scan has stamp {stamp_ns} ns after {previous} ns")
+        beams, messages = self.scanner.beams(ranges, self.config.correlation_m), list[str]()
+        seconds = (stamp_ns - previous) * 1e-9 if self._used else 0.0
+        self._move(odometry, seconds, messages)
+        self._stamps[0] = stamp_ns
+
+        # Use the scan if there is something in it, and if the robot has moved.
+        state, fit, resampled = TrackingState.PREDICTED, float("nan"), False
+        if len(beams) < self.config.least_beams:
+            messages.append(f"{len(beams)} of {len(ranges)} readings came back: the pose is predicted")
+        elif not self._used or self._is_due(stamp_ns):
+            proposal = ScanMatching(self.grid, beams) if self._used else None
+            resampled, state = self._step(beams, stamp_ns, proposal), TrackingState.TRACKED
+            if proposal is not None:
+                fit = proposal.fit
+            if fit < BARELY:
+                state = TrackingState.LOST
+                messages.append(f"the scan hardly fits the map ({100 * fit:.0f} %): where the robot is, is not known")
+        # Between two steps the pose is where the odometry has come to from the last one.
+        now = Odometry(self._pose, self._cov).then(self._moved_since(), SE2)
+        nothing = {"log_evidence": float("nan"), "nis": float("nan"), "nis_dof": 0.0}
+        own = {"fit": fit, "beams": len(beams), "odometry": self._odometry}
+        values = {"ess": self._ess, "resampled": resampled, **nothing, **own}
+        return Tracked(stamp_ns, now.delta, now.cov, state, values, messages=tuple(messages))
+
+    def take(self, frame: Scan) -> Tracked:
+        return self.track(frame.ranges, frame.odometry, frame.stamp_ns)
+
+    def map(self) -> MapEstimate:
+        """No landmarks; the grid is `picture`."""
+        return MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+    def picture(self) -> Picture:
+        """The grid of the particle of highest weight."""
+        return self.grid.picture(int(np.argmax(self.filter.particles.log_weights)))
+
+    def measurements(self, name: str, log: Recorded) -> None:
+        """Scans are not measurements of landmarks: there is no batch problem of them."""
+
+    def particle_poses(self) -> np.ndarray:
+        return SE2.compose(self.filter.particles.state, self._since)
+
+    def summary(self, log: Recorded) -> dict[str, Any]:
+        picture, fits = self.picture(), log["fit"][np.isfinite(log["fit"])]
+        return {
+            "scans_used": self._used,
+            "fit_mean": float(fits.mean()) if fits.size else None,
+            "map_known_m2": round(float((picture.log_odds != 0.0).sum()) * picture.cell_m**2, 2),
+            "map_tiles": self.grid.tiles,
+            "map_share_of_dense": round(self.grid.tiles / max(1, int((self.grid.index >= 0).sum())), 4),
+            "ancestors_of_first_generation": self.filter.history.distinct_first(),
+        }
+
+    def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
+        picture = self.picture()
+        return {
+            "grid.npz": {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner}
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        values = (
+            self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist,
+            np.array(self._stamps), np.array([self._used]), np.array(self._ess),
+        )  # fmt: skip
+        return {f"laser/{name}": value for name, value in zip(_STATE, values, strict=True)}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        found = list(read(arrays, _STATE, "laser/").values())
+        self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist = found[:7]
+        self._stamps, self._used, self._ess = found[7].tolist(), int(found[8][0]), float(found[9])
+
+    def load(self, path: Path | str) -> dict[str, np.ndarray]:
+        arrays = self.filter.load(path)
+        with fitting(Path(path)):
+            self.restore(arrays)
+        return arrays
+
+    def _move(self, odometry: np.ndarray | None, seconds: float, messages: list[str]) -> None:
+        """Takes in the motion since the last scan, as the odometry says it, or as it was between the last two steps."""
+        fastest = self.config.motion.fastest
+        now = np.full(3, np.nan) if odometry is None else np.asarray(odometry, dtype=float)
+        if now.shape != (3,):
+            raise InputError(f"odometry is world_from_robot (3,), an element of SE2, got {now.shape}")
+        if odometry is not None and not np.isfinite(now).all():
+            messages.append("the odometry is not finite: the motion is assumed to go on as before")
+            now = np.full(3, np.nan)
+        delta, has_delta = SE2.identity(), False
+        if np.isfinite(now).all() and np.isfinite(self._measured).all():
+            delta = SE2.between(self._measured, now)
+            way, turned = float(np.hypot(delta[1], delta[2])), float(abs(delta[0]))
+            has_delta = max(way, turned) <= fastest * max(seconds, 0.1)
+            if not has_delta:
+                told = f"{way:.1f} m and {np.degrees(turned):.0f} degrees in {seconds:.2f} s"
+                messages.append(f"the odometry jumps by {told}: the motion is assumed to go on as before")
+        if has_delta:
+            self._moved += [way, turned, 0.0]
+        elif self._used:
+            delta = SE2.exp(self._twist * seconds)
+            self._moved[2] += seconds
+        self._measured = now
+        if self._used:
+            self._since, self._odometry = SE2.compose(self._since, delta), SE2.compose(self._odometry, delta)
+        else:
+            self._moved[:] = 0.0
+
+    def _moved_since(self) -> Odometry:
+        """The motion since the last step."""
+        way, turned, without = self._moved.tolist()
+        if not self._moved.any():
+            return Odometry(self._since, np.zeros((3, 3)))
+        motion = self.config.motion
+        cov = motion.cov(way, turned) + (motion.cov_without(without) if without else 0.0)
+        return Odometry(self._since, cov)
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        way, turned, without = self._moved.tolist()
+        seconds = (stamp_ns - self._stamps[1]) * 1e-9
+        far = way >= self.config.distance_m or turned >= self.config.angle_rad
+        return far or without > 0.0 or seconds >= self.config.seconds
+
+    def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
+        """A step of the filter; whether it resampled."""
+        moved = self._moved_since() if self._used else None
+        if proposal is None or not self._moved.any():  # nothing has moved: nothing is to be found
+            proposal = PriorProposal()
+        report = self.filter.step(beams, moved, stamp_ns, proposal)
+        seconds, before = (stamp_ns - self._stamps[1]) * 1e-9, self._pose
+        self._pose, self._cov, self._ess = report.estimate.mean, report.estimate.cov, report.ess
+        if self._used and seconds > 0.0:
+            self._twist = SE2.log(SE2.between(before, self._pose)) / seconds
+        self._since, self._moved, self._stamps[1] = SE2.identity(), np.zeros(3), stamp_ns
+        self._used += 1
+        return report.resampled
