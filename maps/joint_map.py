@@ -33,7 +33,6 @@ from rbpf.core.models import (
     Belief,
     Jacobians,
     Landmark,
-    Likelihood,
     LogDensities,
     Map,
     NewLandmarks,
@@ -45,48 +44,24 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
-from rbpf.kernels.dense import product
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
 from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
+from rbpf.maps.joint_rows import (
+    Group,
+    Rows,
+    beyond_gaussian,
+    diagonal_blocks,
+    log_det,
+    log_odds_of,
+    multiplied,
+    spread_of,
+    whitened,
+)
 from rbpf.maps.point import Point
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
-QUICK = 30_000_000
-"""Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
 GAUSSIAN = Gaussian()
-TINY = float(np.finfo(float).tiny)
-
-
-class _Group(NamedTuple):
-    """Observations of a step that are weighed alike: their rows (K, p) among all, and the log-odds (K,) of an inlier."""
-
-    likelihood: Likelihood
-    rows: np.ndarray
-    log_odds: np.ndarray
-
-
-class _Rows(NamedTuple):
-    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S (R, R).
-
-    `considered` are columns that the rows count with, but do not change.
-    """
-
-    nu: np.ndarray
-    by_state: np.ndarray
-    by_marginal: np.ndarray
-    columns: np.ndarray
-    cov: np.ndarray
-    groups: list[_Group]
-    log_factor: float
-    considered: np.ndarray
-
-    def inliers(self) -> np.ndarray:
-        """The rows that update, those of the surest observations first."""
-        if all(group.likelihood.kernel_id == 0 for group in self.groups):
-            return np.arange(self.nu.shape[1])
-        found = [(-odds, *rows) for _, *part in self.groups for rows, odds in zip(*part, strict=True) if odds >= 0.0]
-        return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
 
 class _Table(NamedTuple):
@@ -209,7 +184,7 @@ class JointMap(Map):
         nu = weighted_mean(rows.nu, weights)
         apart = rows.nu - nu
         chosen = iter(
-            _log_odds(nu, rows.cov + spread @ spread.T + _product((weights[:, None] * apart).T, apart), rows.groups)
+            log_odds_of(nu, rows.cov + spread @ spread.T + multiplied((weights[:, None] * apart).T, apart), rows.groups)
         )
         decided = []
         for group in groups:
@@ -222,7 +197,7 @@ class JointMap(Map):
         rows = self._seen_through(state, groups, prior)
         inside = rows.inliers()
         chol = gaussian.cholesky(rows.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
-        white = _whitened(chol, np.concatenate([rows.nu[..., None], rows.by_state], axis=2)[:, inside])
+        white = whitened(chol, np.concatenate([rows.nu[..., None], rows.by_state], axis=2)[:, inside])
         nu, by_state = white[..., 0], white[..., 1:]
         turned = np.swapaxes(by_state, 1, 2)
         total = Information.zeros(*by_state.shape[::2])
@@ -236,7 +211,7 @@ class JointMap(Map):
             count = int((log_odds >= 0.0).sum())
             total.log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
             is_density[own] = likelihood.normalised
-        total.log_det += _log_det(chol[np.ix_(kept := is_density[inside], kept)])
+        total.log_det += log_det(chol[np.ix_(kept := is_density[inside], kept)])
         return total
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -248,18 +223,18 @@ class JointMap(Map):
         rows = self._rows(state, self.mean, self.cov, groups)
         inside = rows.inliers()
         chol = gaussian.cholesky(rows.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
-        nu = _whitened(chol, rows.nu[:, inside, None])[..., 0]
-        total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + _log_det(chol))
-        total += _beyond_gaussian(rows, inside, chol, nu)
-        slope = _product(rows.by_marginal[inside], self.cov[rows.columns])
+        nu = whitened(chol, rows.nu[:, inside, None])[..., 0]
+        total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(chol))
+        total += beyond_gaussian(rows, inside, chol, nu)
+        slope = multiplied(rows.by_marginal[inside], self.cov[rows.columns])
         half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        moves, cov = _product(nu, half), self.cov - _product(half.T, half)
+        moves, cov = multiplied(nu, half), self.cov - multiplied(half.T, half)
         fixed = rows.considered
         if fixed.size:
             # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
             # are wider apart than they are uncertain would take more out of it than there is: they are off, not informative.
             moves[:, fixed] -= moves[:, fixed].mean(axis=0)
-            values, vectors = np.linalg.eigh(_spread(nu, np.full(self.n, 1.0 / self.n)))
+            values, vectors = np.linalg.eigh(spread_of(nu, np.full(self.n, 1.0 / self.n)))
             root = np.sqrt(np.clip(values, 0.0, 1.0))[:, None] * vectors.T @ half[:, fixed]
             at = np.ix_(fixed, fixed)
             cov[at] = self.cov[at] - gaussian.symmetrise(root.T @ root)
@@ -283,7 +258,7 @@ class JointMap(Map):
         d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
         origin, turn = self.space.mean(world, weights), self._turn(particles)
         within = turn @ self.cov[:d, :d] @ turn.T
-        between = _spread(self.space.local(origin, world), weights)
+        between = spread_of(self.space.local(origin, world), weights)
         return Estimate(origin, gaussian.symmetrise(within + between))
 
     def in_world(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
@@ -299,7 +274,7 @@ class JointMap(Map):
                 [self._by_turn(points), np.broadcast_to(np.eye(dim), (*points.shape, dim))], axis=-1
             )
             columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
-            blocks = _blocks(cov, np.concatenate(columns, axis=1))
+            blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
             by_all = turn @ np.concatenate([by_frame, slope], axis=-1)
             means[kind.rows] = self.space.transform(origin, points)
             covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
@@ -342,7 +317,7 @@ class JointMap(Map):
                 out[columns] = slope @ rows[columns]
             return out
 
-        cov = turned(turned(self.cov).T) + _spread(moved, weights)
+        cov = turned(turned(self.cov).T) + spread_of(moved, weights)
         return origin, clones, mean, gaussian.symmetrise(cov)
 
     def _turn(self, particles: Particles) -> np.ndarray:
@@ -357,7 +332,7 @@ class JointMap(Map):
             return self.mean, self.cov
         return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
 
-    def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> _Rows:
+    def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Rows:
         """The rows at predicted states; what has been seen through the increment of a substate moves with the state."""
         increment = None if self._gain is None else self.space.local(prior.base, state)
         rows = self._rows(state, *self._given(increment), groups)
@@ -366,12 +341,12 @@ class JointMap(Map):
         slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
         return rows._replace(by_state=rows.by_state + rows.by_marginal @ slope)
 
-    def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> _Rows:
+    def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
         """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
         d, n = self.space.dim, mean.shape[1]
         nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
         by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
-        considered, used, parts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], list[_Group]()
+        considered, used, parts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], list[Group]()
         for group in groups:
             model, z, noise, ids = group.model, group.z, group.cov, self._checked_ids(group)
             log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
@@ -400,7 +375,7 @@ class JointMap(Map):
                 slope = jac.landmark.mean(axis=0)
                 np.put_along_axis(block, np.repeat(kind.columns[:, None], p, axis=1), slope, axis=2)
                 used.append(kind.columns.ravel())
-                considered.append(kind.columns[kind.landmark.considered(slope, _blocks(cov, kind.columns))])
+                considered.append(kind.columns[kind.landmark.considered(slope, diagonal_blocks(cov, kind.columns))])
             if kind is not None and anchors is not None and jac.state is not None:
                 # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
                 turn = self.space.adjoint(self.space.between(state[:, None], anchors))
@@ -421,17 +396,17 @@ class JointMap(Map):
             by_states.append(np.broadcast_to(by_state, (self.n, count, p, d)).reshape(self.n, -1, d))
             by_marginal.append(block.reshape(-1, n))
             first = sum(len(each) for each in noises)
-            parts.append(_Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
+            parts.append(Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
             noises.extend(noise)
         columns = np.unique(np.concatenate(used))
         slope = np.concatenate(by_marginal)[:, columns]
-        innovation = gaussian.symmetrise(_product(_product(slope, cov[np.ix_(columns, columns)]), slope.T))
+        innovation = gaussian.symmetrise(multiplied(multiplied(slope, cov[np.ix_(columns, columns)]), slope.T))
         end = 0
         for noise in noises:
             rows = slice(end, end := end + noise.shape[0])
             innovation[rows, rows] += noise
         nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
-        return _Rows(nu, by_state, slope, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
+        return Rows(nu, by_state, slope, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
 
     def _checked_ids(self, group: Observations) -> np.ndarray | None:
         """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
@@ -523,7 +498,7 @@ class JointMap(Map):
         """Means and covariances in the frame; of what is anchored those in the anchor's, whose clone is the constant."""
         kind = self._kind_of(np.asarray(ids))
         own = self.mean[particles]
-        mean, blocks = own[:, kind.columns], _blocks(self.cov, kind.columns)
+        mean, blocks = own[:, kind.columns], diagonal_blocks(self.cov, kind.columns)
         const = None
         if kind.landmark.anchored:
             const = self._poses(own, kind.clones, self.clones[kind.by_clone])
@@ -702,101 +677,3 @@ class JointMap(Map):
             return -skew(points)
         columns = np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
         return columns if isinstance(self.space, SE2Group) else np.zeros((*points.shape, 0))
-
-
-def _log_det(chol: np.ndarray) -> float:
-    """Log |2πS| of S = L Lᵀ."""
-    return 2.0 * float(np.log(np.diagonal(chol)).sum()) + len(chol) * float(np.log(2.0 * np.pi))
-
-
-def _blocks(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The blocks (K, p, p) on the diagonal that belong to rows and columns (K, p)."""
-    return matrix[rows[:, :, None], rows[:, None, :]]
-
-
-def _log_odds(nu: np.ndarray, cov: np.ndarray, groups: list[_Group]) -> list[np.ndarray]:
-    """Log-odds (K,) of every group's observations, each given all others that are inliers, of which no change of one adds.
-
-    Begins with those that are inliers when seen alone; then the one that is most at odds with its place changes it.
-    """
-    alone = [likelihood.log_odds(nu[rows], _blocks(cov, rows)) for likelihood, rows, _ in groups]
-    taken = [odds >= 0.0 for odds in alone]
-    inside = np.concatenate([rows[took].ravel() for (_, rows, _), took in zip(groups, taken, strict=True)])
-    given = _swept(np.concatenate([cov, nu[:, None]], axis=1), inside, False)
-    for _ in range(2 * sum(len(each) for each in taken) + 1):
-        found = []
-        for (likelihood, rows, _), took in zip(groups, taken, strict=True):
-            # An inlier is left out of what it is judged by: ν = Π⁻¹ (S⁻¹ν) with covariance Π⁻¹, Π its block of S⁻¹.
-            own, spread = given[rows, -1], _blocks(given, rows)
-            spread[took] = -np.linalg.inv(spread[took])
-            own[took] = (spread[took] @ own[took][..., None])[..., 0]
-            found.append(likelihood.log_odds(own, gaussian.symmetrise(spread)))
-        amiss = [np.where(took, -odds, odds) for took, odds in zip(taken, found, strict=True)]
-        worst = max(range(len(groups)), key=lambda g: amiss[g].max(initial=-np.inf))
-        if not amiss[worst].max(initial=-np.inf) > 0.0:
-            break
-        which = amiss[worst].argmax()
-        given = _swept(given, groups[worst].rows[which], bool(taken[worst][which]))
-        taken[worst][which] ^= True
-    return [
-        np.where(took, np.maximum(odds, 0.0), np.minimum(odds, -TINY)) for took, odds in zip(taken, found, strict=True)
-    ]
-
-
-def _swept(given: np.ndarray, rows: np.ndarray, back: bool) -> np.ndarray:
-    """[S | ν] (R, R + 1) swept by some rows k, or `back`: what is given all rows U that it is swept by.
-
-    Then it has −S_UU⁻¹ in U, S_UU⁻¹ν beside it, and elsewhere covariance and innovation given U (J. Goodnight 1979).
-    """
-    inverse, sign = np.linalg.inv(given[np.ix_(rows, rows)]), -1.0 if back else 1.0
-    gain, beside = given[:, rows] @ inverse, given[rows]
-    given = given - gain @ beside
-    given[rows], given[:, rows] = sign * (inverse @ beside), sign * gain
-    given[np.ix_(rows, rows)] = -inverse
-    return given
-
-
-def _beyond_gaussian(rows: _Rows, inside: np.ndarray, chol: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """What likelihoods other than the Gaussian add to log N (N,) of the inliers, Mathematics (joint-outliers).
-
-    Each inlier's own log-density in place of the Gaussian, given the inliers before it; and each outlier's, given all inliers.
-    """
-    total, place = np.zeros(len(white)), np.empty(rows.nu.shape[1], dtype=np.int64)
-    place[inside] = np.arange(inside.size)
-    for likelihood, own, log_odds in rows.groups:
-        if likelihood.kernel_id == 0:
-            continue
-        at = place[own[log_odds >= 0.0]]
-        lower = _blocks(chol, at)
-        nu, cov = (lower @ white[:, at][..., None])[..., 0], gaussian.gram(lower)
-        total += (likelihood.log_density(nu, cov) - gaussian.log_density(nu, cov)).sum(axis=1)
-        out = own[log_odds < 0.0]
-        half = _whitened(chol, rows.cov[np.ix_(inside, out.ravel())][None])[0]
-        nu = (rows.nu[:, out.ravel()] - white @ half).reshape(len(white), *out.shape)
-        explained = _blocks(half.T @ half, np.arange(out.size).reshape(out.shape))
-        total += likelihood.log_density(nu, _blocks(rows.cov, out) - explained).sum(axis=1)
-    return total
-
-
-def _whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """L⁻¹ of rows (N, R, k), with one L (R, R) for all."""
-    n, count, k = rows.shape
-    if not rows.size:
-        return rows
-    flat = rows.transpose(1, 0, 2).reshape(count, -1)
-    solved = solve_triangular(chol, flat, lower=True, check_finite=False)
-    return np.asarray(solved).reshape(count, n, k).transpose(1, 0, 2)
-
-
-def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Left (m, k) times right (k, n)."""
-    if left.size * right.shape[1] > QUICK:
-        return left @ right
-    return np.asarray(product(np.ascontiguousarray(left), np.ascontiguousarray(right)))
-
-
-def _spread(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Covariance (k, k) that weighted values (N, k) are a sample of: Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
-    offset = np.sqrt(weights)[:, None] * (values - weighted_mean(values, weights))
-    left = 1.0 - float(np.square(weights).sum())
-    return _product(offset.T, offset) / left if left > 0.0 else np.zeros((values.shape[1],) * 2)
