@@ -37,7 +37,7 @@ def resample(landmark_map: LandmarkMap, lineage: Lineage, rng: np.random.Generat
 def test_kinds_side_by_side_follow_their_particles():
     rng = np.random.default_rng(0)
     landmark_map, lineage = filled()
-    plane, mixture = points(rng, 2), ring(rng.normal(size=(N, 2)), np.array([4.0]), 0.1, 5)
+    plane, mixture = points(rng, 2), ring(rng.normal(size=(N, 2)), np.array([4.0]), 2.0, 5)
     free = points(rng, 1)
     anchors = Records(free.mean, free.cov, SE2.exp(rng.normal(size=(N, 1, 3))))
     ids = [
@@ -64,7 +64,7 @@ def test_a_ring_promotes_to_its_moments():
     rng = np.random.default_rng(2)
     landmark_map, _ = filled()
     centre = rng.normal(size=(N, 2))
-    mixture = ring(centre, np.array([4.0]), 0.1, 9)
+    mixture = ring(centre, np.array([4.0]), 0.5, 9)
     ids = landmark_map.add_records(mixture, MixturePoint(9))
     landmark_map.promote(ids)
     assert isinstance(landmark_map.landmark_of(0), Point)
@@ -77,7 +77,7 @@ def test_a_ring_promotes_to_its_moments():
 
 def test_ready_when_enough_of_the_weight_says_so():
     landmark_map, _ = filled()
-    mixture = ring(np.zeros((N, 2)), np.array([4.0]), 0.1, 4)
+    mixture = ring(np.zeros((N, 2)), np.array([4.0]), 2.1, 4)
     dominant = np.log(np.array([0.997, 0.001, 0.001, 0.001]))
     log_weights = np.where(np.arange(N)[:, None, None] < N // 2, dominant, np.log(0.25))
     landmark_map.add_records(points(np.random.default_rng(0), 1), Point(2))
@@ -92,7 +92,7 @@ def test_log_odds_follow_their_particle_outlast_promotion_and_end_what_nobody_ho
     rng = np.random.default_rng(4)
     landmark_map, lineage = filled(evidence=True)
     log_odds = rng.normal(size=(N, 3))
-    mixtures = ring(rng.normal(size=(N, 2)), np.array([4.0, 5.0, 6.0]), 0.1, 4)
+    mixtures = ring(rng.normal(size=(N, 2)), np.array([4.0, 5.0, 6.0]), 3.1, 4)
     ids = landmark_map.add_records(mixtures, MixturePoint(4), log_odds)
     landmark_map.promote(ids)
     np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds)
@@ -109,10 +109,10 @@ def test_log_odds_follow_their_particle_outlast_promotion_and_end_what_nobody_ho
 
 def test_ring_covers_the_circle():
     """Each component has σ_r along the radius and half a step across it; neighbours meet at one sigma."""
-    mixture = ring(np.array([[1.0, 2.0]]), np.array([3.0, 5.0]), 0.2, 8)
-    assert mixture.mean.shape == (1, 2, 8, 2)
+    mixture = ring(np.array([[1.0, 2.0]]), np.array([3.0, 5.0]), 0.2, 16)
+    assert mixture.mean.shape == (1, 2, 16, 2)
     offset = mixture.mean[0] - np.array([1.0, 2.0])
-    np.testing.assert_allclose(np.linalg.norm(offset, axis=-1), [[3.0] * 8, [5.0] * 8])
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=-1), [[3.0] * 16, [5.0] * 16])
     np.testing.assert_allclose(np.exp(np.asarray(mixture.log_weights)).sum(axis=-1), 1.0)
     for k, radius in enumerate((3.0, 5.0)):
         along = offset[k] / radius

@@ -13,7 +13,7 @@ The evidence is that of all measurements given each landmark's first one, with a
 filter sums up that begins landmarks by their first sighting. E|∂l/∂z|, over the noise of that sighting, is the density of the
 first ones themselves.
 
-Draws that are nearer to the posterior than those of N(0, H⁻¹), at no cost in exactness:
+That is Mathematics (batch-weight). Draws that are nearer to the posterior than those of N(0, H⁻¹), at no cost in exactness:
 
 - Densities of motions are those of e_t, so that each pose comes with |J_r(ξ_t)| / |J_r(e_t)|. A robot that hardly slips
   sideways follows a curve that no chart of single poses follows: where e_t bends by more than `BENT` of its noise, the linear
