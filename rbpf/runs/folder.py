@@ -14,10 +14,13 @@ summary.json             the figures
 *.png, annotated.mp4     pictures; every frame with what was looked for in it
 report.html              one page with all figures and pictures
 
-What else a system leaves stands in its `files`; of the monocular one
+What else a system leaves stands in its `files`; of the monocular one and the laser's
 
-posterior.npz            the paths (T, N, 7) of the last frame's particles, and the particles' log-weights
+posterior.npz            the paths (T, N, E) of the last frame's particles, and the particles' log-weights
 posterior.tum            their weighted mean, which later frames have sharpened
+
+of the monocular one
+
 known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
 
 and of the laser's
@@ -39,13 +42,12 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays
-from rbpf.lie import SE3
 from rbpf.runs.files import GRID, MAP, POSTERIOR, SUMMARY, TRAJECTORY, VERSION, prepare_folder, write_csv, write_text
 from rbpf.runs.grid_files import write_grid
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.run import Run
-from rbpf.runs.trajectory import Trajectory, in_space, write_tum
+from rbpf.runs.trajectory import in_space, write_tum
 from rbpf.runs.truth import write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
@@ -79,8 +81,9 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
         if name == POSTERIOR:
             # The mean over the last frame's particles of their whole paths.
             weights = np.exp(arrays["log_weights"])
-            mean = np.array([SE3.mean(poses, weights) for poses in arrays["world_from_camera"]])
-            write_tum(out / "posterior.tum", Trajectory(arrays["stamps_ns"], mean))
+            (paths,) = (array for key, array in arrays.items() if key.startswith("world_from_"))
+            mean = np.array([system.space.mean(poses, weights) for poses in paths])
+            write_tum(out / "posterior.tum", in_space(arrays["stamps_ns"], mean))
         if name == GRID:
             write_grid(out, arrays)
     write_config(out, system.name, sources, asdict(system.config))

@@ -75,6 +75,16 @@ def test_bad_scans_and_odometry_are_survived_and_said():
         slam.track(frames[0].ranges[1:], None, 10**12)
 
 
+def test_odometry_counts_before_the_first_scan_with_returns():
+    truth, frames = driven(12)
+    slam = laser()
+    tracked = [slam.take(f if t > 5 else f._replace(ranges=np.full(91, np.inf))) for t, f in enumerate(frames)]
+    odometry = np.array([frame.odometry for frame in frames])
+    np.testing.assert_allclose(tracked[5].pose, SE2.between(odometry[0], odometry[5]), atol=1e-12)
+    assert np.linalg.norm(tracked[5].pose[1:]) > 0.5
+    assert errors_m([t.pose for t in tracked], truth).max() < 0.3
+
+
 def test_scans_that_show_another_place_are_lost():
     frames, slam = scans(3), laser()
     slam.take(frames[0])
@@ -117,7 +127,7 @@ def test_a_run_leaves_a_map_that_map_server_reads(tmp_path: Path):
     assert summary["system"] == "laser" and summary["fit_mean"] > 0.5 and (out / "map.png").stat().st_size > 10_000
     assert "report.html" in {path.name for path in out.iterdir()}
     assert main(["run", "--from", str(out / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
-    for name in ("trajectory.tum", "grid.npz"):
+    for name in ("trajectory.tum", "posterior.tum", "grid.npz"):
         assert (out / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 

@@ -114,10 +114,11 @@ class LaserSlam(System):
         """
         previous = self._stamps[0]
         stamp_ns = previous + 1_000_000_000 if stamp_ns is None else int(stamp_ns)
-        if self._used and stamp_ns < previous:
+        begun = previous >= 0
+        if begun and stamp_ns < previous:
             raise InputError(f"time runs backwards: a scan has stamp {stamp_ns} ns after {previous} ns")
         beams, messages = self.scanner.beams(ranges, self.config.correlation_m), list[str]()
-        seconds = (stamp_ns - previous) * 1e-9 if self._used else 0.0
+        seconds = (stamp_ns - previous) * 1e-9 if begun else 0.0
         self._move(odometry, seconds, messages)
         self._stamps[0] = stamp_ns
 
@@ -169,9 +170,19 @@ class LaserSlam(System):
         }
 
     def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
-        picture = self.picture()
+        """The particles' paths at every scan since their first kept step, by odometry between steps; and the grid."""
+        picture, history, odometry = self.picture(), self.filter.history, log["odometry"]
+        step = np.searchsorted(history.stamps_ns, log.stamps_ns, side="right") - 1
+        scans = step >= 0
+        at_step = odometry[np.searchsorted(log.stamps_ns, history.stamps_ns)]
+        since = SE2.between(at_step[step[scans]], odometry[scans])
         return {
-            "grid.npz": {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner}
+            "posterior.npz": {
+                "stamps_ns": log.stamps_ns[scans],
+                "world_from_robot": SE2.compose(history.paths()[step[scans]], since[:, None]),
+                "log_weights": self.filter.particles.log_weights,
+            },
+            "grid.npz": {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner},
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -211,14 +222,11 @@ class LaserSlam(System):
                 messages.append(f"the odometry jumps by {told}: the motion is assumed to go on as before")
         if has_delta:
             self._moved += [way, turned, 0.0]
-        elif self._used:
+        elif self._used:  # before, the world begins where the first scan is taken
             delta = SE2.exp(self._twist * seconds)
             self._moved[2] += seconds
         self._measured = now
-        if self._used:
-            self._since, self._odometry = SE2.compose(self._since, delta), SE2.compose(self._odometry, delta)
-        else:
-            self._moved[:] = 0.0
+        self._since, self._odometry = SE2.compose(self._since, delta), SE2.compose(self._odometry, delta)
 
     def _moved_since(self) -> Odometry:
         """The motion since the last step."""
@@ -237,7 +245,7 @@ class LaserSlam(System):
 
     def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
         """A step of the filter; whether it resampled."""
-        moved = self._moved_since() if self._used else None
+        moved = self._moved_since() if self._moved.any() or self._used else None
         if proposal is None or not self._moved.any():  # nothing has moved: nothing is to be found
             proposal = PriorProposal()
         report = self.filter.step(beams, moved, stamp_ns, proposal)
