@@ -41,9 +41,8 @@ class GridConfig(Ranged):
     hit: Positive = 0.85  #: added to the log-odds of a cell in which a beam ends; p = 0.7.
     miss: Positive = 0.4  #: subtracted where one passes; p = 0.4.
     bound: Positive = 4.0  #: of the log-odds, so that what moves away is forgotten.
-    sigma_m: Positive = (
-        0.07  #: σ, of a beam's end about what is occupied: the scanner's noise, the map's, and the cells'.
-    )
+    #: σ, of a beam's end about what is occupied: the scanner's noise, the map's, and the cells'.
+    sigma_m: Positive = 0.05
     hit_ratio: Positive = 20.0  #: ρ, how much likelier an end is at what is occupied than anywhere.
 
 
