@@ -19,9 +19,8 @@ class MotionConfig(Ranged):
     turn_per_rad: NotNegative = 0.2  #: of the turn, rad per radian turned.
     shift_m: Positive = 0.01  #: of the shift, at rest too.
     turn_rad: Positive = 0.01  #: of the turn, at rest too.
-    #: without odometry the motion goes on as before: of the change of speed, m/s and rad/s.
-    speed_m_s: Positive = 0.5
-    speed_rad_s: Positive = 0.5
+    speed_m_s: Positive = 0.5  #: of the change of speed, m/s, where without odometry the motion goes on as before.
+    speed_rad_s: Positive = 0.5  #: of the change of turning rate, rad/s, likewise.
     #: odometry that says more than this, m/s or rad/s, jumps: it is taken for none.
     fastest: Positive = 10.0
 
