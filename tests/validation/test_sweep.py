@@ -106,7 +106,7 @@ def test_a_run_that_is_not_possible_does_not_stop_the_others(config, tmp_path, c
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"system": "sonar"}, "range-bearing, mono, stereo"),
+        ({"system": "sonar"}, "range-bearing, laser, mono, stereo"),
         ({"sequences": ["nowhere"]}, "no sequence"),
         ({"seeds": [1, 1]}, "same run twice"),
         ({"particles": [0]}, "particles must be a whole number, at least 1"),
