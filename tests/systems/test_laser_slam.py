@@ -85,6 +85,15 @@ def test_odometry_counts_before_the_first_scan_with_returns():
     assert errors_m([t.pose for t in tracked], truth).max() < 0.3
 
 
+def test_a_log_without_returns_leaves_the_path_of_the_odometry(tmp_path: Path):
+    log, out, nothing = tmp_path / "robot.clf", tmp_path / "out", " ".join(["99.0"] * 91)
+    lines = [f"FLASER 91 {nothing} {x} 0 0 {x} 0 0 {t} robot {t}" for t, x in enumerate((0.0, 0.4, 0.8))]
+    log.write_text("\n".join(lines) + "\n")
+    assert main(["run", "laser", str(log), "--max-range", "20", "--particles", "3", "--out", str(out)]) == 0
+    np.testing.assert_allclose(read_tum(out / "trajectory.tum").world_from_body[:, 4], [0.0, 0.4, 0.8], atol=1e-9)
+    assert not (out / "posterior.tum").exists()
+
+
 def test_scans_that_show_another_place_are_lost():
     frames, slam = scans(3), laser()
     slam.take(frames[0])

@@ -170,20 +170,21 @@ class LaserSlam(System):
         }
 
     def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
-        """The particles' paths at every scan since their first kept step, by odometry between steps; and the grid."""
+        """The grid; and the particles' paths at every scan since their first kept step, by odometry between steps."""
         picture, history, odometry = self.picture(), self.filter.history, log["odometry"]
+        grid = {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner}
         step = np.searchsorted(history.stamps_ns, log.stamps_ns, side="right") - 1
         scans = step >= 0
+        if not scans.any():  # none came back with anything in it
+            return {"grid.npz": grid}
         at_step = odometry[np.searchsorted(log.stamps_ns, history.stamps_ns)]
         since = SE2.between(at_step[step[scans]], odometry[scans])
-        return {
-            "posterior.npz": {
-                "stamps_ns": log.stamps_ns[scans],
-                "world_from_robot": SE2.compose(history.paths()[step[scans]], since[:, None]),
-                "log_weights": self.filter.particles.log_weights,
-            },
-            "grid.npz": {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner},
+        paths = {
+            "stamps_ns": log.stamps_ns[scans],
+            "world_from_robot": SE2.compose(history.paths()[step[scans]], since[:, None]),
+            "log_weights": self.filter.particles.log_weights,
         }
+        return {"posterior.npz": paths, "grid.npz": grid}
 
     def arrays(self) -> dict[str, np.ndarray]:
         values = (
