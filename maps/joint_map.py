@@ -17,7 +17,7 @@ Gaussian, too: a *clone*, C = K Exp(δ) in F, which moves with F as landmarks do
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -46,10 +46,12 @@ from rbpf.core.particles import Estimate, Information, Particles, Prior, take, u
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
 from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
+from rbpf.maps.joint_columns import JointColumns, Kind, Table
 from rbpf.maps.joint_rows import (
     Group,
     Rows,
     beyond_gaussian,
+    checked_ids,
     diagonal_blocks,
     log_det,
     log_odds_of,
@@ -62,25 +64,6 @@ from rbpf.maps.point import Point
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
 GAUSSIAN = Gaussian()
-
-
-class _Table(NamedTuple):
-    """What is held of landmarks (M,): names, kinds by number, first columns, and rows of the clones they are anchored at."""
-
-    ids: np.ndarray
-    kind: np.ndarray
-    first: np.ndarray
-    clone: np.ndarray  #: −1 where they are not.
-
-
-class _Kind(NamedTuple):
-    """Landmarks of one kind, K of them, as rows of the table (K,)."""
-
-    landmark: Landmark
-    rows: np.ndarray
-    columns: np.ndarray  #: (K, D) of their means.
-    clones: np.ndarray  #: (K, d) columns of what they are anchored at; (K, 0) where they are not.
-    by_clone: np.ndarray  #: (K,) which clones these are.
 
 
 @final
@@ -117,7 +100,7 @@ class JointMap(Map):
         self.space = space
         self.compiled = compiled
         self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
-        self._kinds: list[Landmark] = [self.point]
+        self._held = JointColumns(space.dim, [self.point])
         mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
@@ -133,9 +116,7 @@ class JointMap(Map):
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
-        none = np.zeros(0, dtype=np.int64)
-        self.clones, self._clone_first = np.zeros((0, self.space.size)), none
-        self._hold(_Table(none, none, none, none))
+        self.clones, self._held = np.zeros((0, self.space.size)), JointColumns(d, self._held.kinds)
         self._next_id = 0
         self._gain: np.ndarray | None = None
 
@@ -265,9 +246,9 @@ class JointMap(Map):
         """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`."""
         origin, clones, mean, cov = self._consolidated(particles)
         d, dim = self.space.dim, self.point.dim
-        means, covs = np.empty((self._table.ids.size, dim)), np.empty((self._table.ids.size, dim, dim))
+        means, covs = np.empty((self._held.table.ids.size, dim)), np.empty((self._held.table.ids.size, dim, dim))
         turn = self.space.rotation(origin)
-        for kind in self._by_kind():
+        for kind in self._held.by_kind():
             points, slope = self._points(kind, mean, clones)
             # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
             by_frame = np.concatenate(
@@ -296,14 +277,14 @@ class JointMap(Map):
         moved = self.mean.copy()
         moved[:, :d] = space.local(origin, world)
         slopes = [(np.arange(d), self._turn(particles))]
-        for kind in self._by_kind():
+        for kind in self._held.by_kind():
             if not kind.landmark.anchored:
                 moved[:, kind.columns] = kind.landmark.seen_from(space, state[:, None], self.mean[:, kind.columns])[0]
                 slopes.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
         clones = self.clones
         if len(clones):
             # Mathematics (clone), with K' what the mean of the particles sees.
-            at = self._clone_columns(np.arange(len(clones)))
+            at = self._held.clone_columns(np.arange(len(clones)))
             clones = space.between(centre, space.retract(clones, before[at]))
             moved[:, at] = space.local(clones, space.between(state[:, None], self._poses(self.mean, at, self.clones)))
         mean = weighted_mean(moved, weights)
@@ -348,13 +329,13 @@ class JointMap(Map):
         by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
         considered, used, parts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], list[Group]()
         for group in groups:
-            model, z, noise, ids = group.model, group.z, group.cov, self._checked_ids(group)
+            model, z, noise, ids = group.model, group.z, group.cov, checked_ids(group)
             log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
             at, kind, landmarks, anchors, substate = state[:, None], None, None, None, None
             if ids is not None:
                 log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
                 z, noise, log_odds, ids = z[ids >= 0], noise[ids >= 0], log_odds[ids >= 0], ids[ids >= 0]
-                kind = self._kind_of(ids)
+                kind = self._held.of_one_kind(ids)
                 landmarks = mean[:, kind.columns]
                 if kind.landmark.anchored:
                     anchors = self._poses(mean, kind.clones, self.clones[kind.by_clone])
@@ -408,60 +389,11 @@ class JointMap(Map):
         nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
         return Rows(nu, by_state, slope, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
 
-    def _checked_ids(self, group: Observations) -> np.ndarray | None:
-        """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
-        name, ids = type(group.model).__name__, group.ids
-        if group.updates != frozenset({Part.STATE, Part.LANDMARK}):
-            raise InputError(f"a joint map's observations update state and landmarks, {name}'s do not")
-        if Part.LANDMARK not in group.model.reads:
-            return None
-        if ids is None or ids.shape != (group.z.shape[0],):
-            shape = None if ids is None else ids.shape
-            raise InputError(
-                f"a joint map takes one association for all particles: {name} needs ids ({group.z.shape[0]},), "
-                f"got {shape}"
-            )
-        return ids
-
-    def _hold(self, table: _Table) -> None:
-        self._table = table
-        self._row_of = {landmark: row for row, landmark in enumerate(table.ids.tolist())}
-
-    def _rows_of(self, ids: np.ndarray) -> np.ndarray:
-        """Rows (K,) of landmarks in the table. Raises InputError: the map does not hold one of them."""
-        try:
-            return np.array([self._row_of[landmark] for landmark in np.asarray(ids).tolist()], dtype=np.int64)
-        except KeyError as error:
-            raise InputError(f"the map holds no landmark {error.args[0]}") from error
-
-    def _kind_of(self, ids: np.ndarray) -> _Kind:
-        """Landmarks (K,) of one kind, in their order. Raises InputError: the map does not hold one, or their kinds differ."""
-        rows = self._rows_of(ids)
-        kinds = np.unique(self._table.kind[rows])
-        if kinds.size > 1:
-            raise InputError("a joint map is asked for landmarks of one parametrisation at a time: see `landmark_of`")
-        return self._of_kind(int(kinds[0]) if kinds.size else 0, rows)
-
-    def _by_kind(self) -> list[_Kind]:
-        """All landmarks."""
-        numbers = np.unique(self._table.kind).tolist()
-        return [self._of_kind(number, np.flatnonzero(self._table.kind == number)) for number in numbers]
-
-    def _of_kind(self, number: int, rows: np.ndarray) -> _Kind:
-        landmark, clones = self._kinds[number], self._table.clone[rows]
-        columns = self._table.first[rows, None] + np.arange(landmark.dim)
-        at = self._clone_columns(clones) if landmark.anchored else np.zeros((rows.size, 0), dtype=np.int64)
-        return _Kind(landmark, rows, columns, at, clones)
-
-    def _clone_columns(self, clones: np.ndarray) -> np.ndarray:
-        """Columns (K, d) of clones (K,)."""
-        return self._clone_first[clones, None] + np.arange(self.space.dim)
-
     def _poses(self, mean: np.ndarray, columns: np.ndarray, clones: np.ndarray) -> np.ndarray:
         """Clones (…, K, E) in the frame, of means (…, n), by their columns (K, d) and origins (K, E)."""
         return self.space.retract(clones, mean[..., columns])
 
-    def _points(self, kind: _Kind, mean: np.ndarray, clones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _points(self, kind: Kind, mean: np.ndarray, clones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Landmarks as points (…, M, dim) in the frame, of means (…, n), and how they move by their columns and clones."""
         landmark, space = kind.landmark, self.space
         if not landmark.anchored:
@@ -476,27 +408,27 @@ class JointMap(Map):
 
     @property
     def ids(self) -> np.ndarray:
-        return self._table.ids.copy()
+        return self._held.table.ids.copy()
 
     @property
     def stored_fraction(self) -> float:
-        sizes = np.array([kind.dim * (kind.dim + 3) // 2 for kind in self._kinds])
-        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * int(sizes[self._table.kind].sum()), 1)
+        sizes = np.array([kind.dim * (kind.dim + 3) // 2 for kind in self._held.kinds])
+        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * int(sizes[self._held.table.kind].sum()), 1)
 
     def holds(self, ids: np.ndarray) -> np.ndarray:
-        return np.array([landmark in self._row_of for landmark in np.asarray(ids).tolist()], dtype=bool)
+        return self._held.holds(ids)
 
     def landmark_of(self, landmark_id: int) -> Landmark:
-        return self._kinds[self._table.kind[self._rows_of(np.array([landmark_id]))[0]]]
+        return self._held.kinds[self._held.table.kind[self._held.rows_of(np.array([landmark_id]))[0]]]
 
     def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
-        held, number = self.holds(ids), self._number(landmark)
-        held[held] = self._table.kind[self._rows_of(np.asarray(ids)[held])] == number
+        held, number = self.holds(ids), self._held.number(landmark)
+        held[held] = self._held.table.kind[self._held.rows_of(np.asarray(ids)[held])] == number
         return held
 
     def read(self, ids: np.ndarray, particles: np.ndarray | slice = slice(None)) -> Records:
         """Means and covariances in the frame; of what is anchored those in the anchor's, whose clone is the constant."""
-        kind = self._kind_of(np.asarray(ids))
+        kind = self._held.of_one_kind(np.asarray(ids))
         own = self.mean[particles]
         mean, blocks = own[:, kind.columns], diagonal_blocks(self.cov, kind.columns)
         const = None
@@ -540,15 +472,15 @@ class JointMap(Map):
         self.mean = np.concatenate([self.mean, places.reshape(self.n, -1), mean], axis=1)
         cov = np.zeros((grown, grown))
         cov[:size, :size] = self.cov
-        self._clone_first = np.append(self._clone_first, size + d * np.arange(len(origins)))
+        self._held.clone_first = np.append(self._held.clone_first, size + d * np.arange(len(origins)))
         first = size + places.shape[1] * d + dim * np.arange(count)
         columns = first[:, None] + np.arange(dim)
         cov[columns[:, :, None], columns[:, None, :]] = records.cov.mean(axis=0)
         self.cov = cov
         clone = np.where(clone < 0, -1, clone + len(self.clones))
         self.clones = np.concatenate([self.clones, origins])
-        new = _Table(ids, np.full(count, self._number(landmark)), first, clone)
-        self._hold(_Table(*(np.concatenate(pair) for pair in zip(self._table, new, strict=True))))
+        new = Table(ids, np.full(count, self._held.number(landmark)), first, clone)
+        self._held.hold(Table(*(np.concatenate(pair) for pair in zip(self._held.table, new, strict=True))))
         self._next_id = max(self._next_id, int(ids.max(initial=-1)) + 1)
         return ids
 
@@ -558,7 +490,7 @@ class JointMap(Map):
         The filter that saves and the one that loads name the same ones in the same order. Raises InputError: it has
         components, constants that are no anchor, or does not say how it moves with the frame.
         """
-        if self._number(landmark) >= 0:
+        if self._held.number(landmark) >= 0:
             return
         space, anchor = self.space, self.space.identity() if landmark.anchored else None
         fits = landmark.components == 1 and landmark.constants == (0 if anchor is None else space.size)
@@ -568,39 +500,36 @@ class JointMap(Map):
                 f"not {type(landmark).__name__}"
             )
         landmark.seen_from(space, space.identity(), np.zeros(landmark.dim))
-        self._kinds.append(landmark)
-
-    def _number(self, landmark: Landmark) -> int:
-        """Of a parametrisation; −1 for one that the map does not know."""
-        for number, held in enumerate(self._kinds):
-            if type(held) is type(landmark) and vars(held) == vars(landmark):
-                return number
-        return -1
+        self._held.kinds.append(landmark)
 
     def remove(self, ids: np.ndarray) -> None:
-        rows = self._rows_of(ids)
-        gone = [kind.columns[np.isin(kind.rows, rows)].ravel() for kind in self._by_kind()]
-        self._hold(_Table(*(np.delete(column, rows) for column in self._table)))
+        rows = self._held.rows_of(ids)
+        gone = [kind.columns[np.isin(kind.rows, rows)].ravel() for kind in self._held.by_kind()]
+        self._held.hold(Table(*(np.delete(column, rows) for column in self._held.table)))
         self._drop(gone)
 
     def _drop(self, gone: list[np.ndarray]) -> None:
         """Removes columns, and clones at which nothing is anchored any more."""
-        used = np.isin(np.arange(len(self.clones)), self._table.clone)
+        used = np.isin(np.arange(len(self.clones)), self._held.table.clone)
         kept = np.ones(self.mean.shape[1], dtype=bool)
-        kept[np.concatenate([*gone, self._clone_columns(np.flatnonzero(~used)).ravel()])] = False
+        kept[np.concatenate([*gone, self._held.clone_columns(np.flatnonzero(~used)).ravel()])] = False
         self.mean, self.cov = self.mean[:, kept], self.cov[np.ix_(kept, kept)]
         place, number = np.cumsum(kept) - 1, np.append(np.cumsum(used) - 1, -1)
-        self.clones, self._clone_first = self.clones[used], place[self._clone_first[used]]
-        table = self._table
-        self._hold(table._replace(first=place[table.first], clone=number[table.clone]))
+        self.clones, self._held.clone_first = self.clones[used], place[self._held.clone_first[used]]
+        table = self._held.table
+        self._held.hold(table._replace(first=place[table.first], clone=number[table.clone]))
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
         """Turns anchored landmarks into points of the frame, to first order: with all that they are correlated with."""
         ids = np.asarray(ids, dtype=np.int64)
         if not ids.size:
             return
-        kind = self._kind_of(ids)
-        if not kind.landmark.anchored or self._number(to or self.point) != 0 or kind.landmark.dim != self.point.dim:
+        kind = self._held.of_one_kind(ids)
+        if (
+            not kind.landmark.anchored
+            or self._held.number(to or self.point) != 0
+            or kind.landmark.dim != self.point.dim
+        ):
             raise InputError(f"a joint map turns what is anchored into Point({self.point.dim})")
         points, slopes = self._points(kind, self.mean, self.clones)
         slope, columns = slopes.mean(axis=0), np.concatenate([kind.columns, kind.clones], axis=1)
@@ -610,9 +539,9 @@ class JointMap(Map):
             self.cov = self.cov.T
         self.cov = gaussian.symmetrise(self.cov)
         self.mean[:, kind.columns] = points
-        kinds, clones = self._table.kind.copy(), self._table.clone.copy()
+        kinds, clones = self._held.table.kind.copy(), self._held.table.clone.copy()
         kinds[kind.rows], clones[kind.rows] = 0, -1
-        self._hold(self._table._replace(kind=kinds, clone=clones))
+        self._held.hold(self._held.table._replace(kind=kinds, clone=clones))
         self._drop([])
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
@@ -640,15 +569,15 @@ class JointMap(Map):
 
     def arrays(self) -> dict[str, np.ndarray]:
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}
-        named |= {"clones": self.clones, "clone_first": self._clone_first, **self._table._asdict()}
+        named |= {"clones": self.clones, "clone_first": self._held.clone_first, **self._held.table._asdict()}
         return {f"joint/{name}": array for name, array in named.items()}
 
     def options(self) -> dict[str, object]:
-        kinds = [type(kind).__name__ for kind in self._kinds]
+        kinds = [type(kind).__name__ for kind in self._held.kinds]
         return {"joint substate": self._first - self.space.dim, "joint kinds": kinds}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        rows, kinds = checkpoint.integers("landmarks", least=0), len(self._kinds)
+        rows, kinds = checkpoint.integers("landmarks", least=0), len(self._held.kinds)
         schema = {
             "ids": rows, "first": rows, "kind": checkpoint.integers("landmarks", least=0, below=kinds),
             "clones": checkpoint.elements(self.space, "clones"), "clone_first": checkpoint.integers("clones", least=0),
@@ -657,17 +586,17 @@ class JointMap(Map):
             "origin": checkpoint.elements(self.space),
         }  # fmt: skip
         found = checkpoint.read(arrays, schema, "joint/", n=self.n)
-        table, self._next_id = _Table(*(found[name] for name in _Table._fields)), int(found["next"][0])
+        table, self._next_id = Table(*(found[name] for name in Table._fields)), int(found["next"][0])
         if np.unique(table.ids).size < table.ids.size or table.ids.max(initial=-1) >= self._next_id:
             raise InputError("the array joint/ids names a landmark twice, or one that was never started")
-        anchored = np.array([kind.anchored for kind in self._kinds])[table.kind]
+        anchored = np.array([kind.anchored for kind in self._held.kinds])[table.kind]
         if ((table.clone >= 0) != anchored).any():
             raise InputError("the array joint/clone does not fit the landmarks' kinds")
-        self._hold(table)
+        self._held.hold(table)
         self.mean, self.cov, self.origin = found["mean"], found["cov"], found["origin"]
-        self.clones, self._clone_first = found["clones"], found["clone_first"]
-        own = [kind.columns.ravel() for kind in self._by_kind()]
-        own.append(self._clone_columns(np.arange(len(self.clones))).ravel())
+        self.clones, self._held.clone_first = found["clones"], found["clone_first"]
+        own = [kind.columns.ravel() for kind in self._held.by_kind()]
+        own.append(self._held.clone_columns(np.arange(len(self.clones))).ravel())
         if not np.array_equal(np.sort(np.concatenate(own)), np.arange(self._first, self.mean.shape[1])):
             raise InputError("the arrays joint/first and joint/clone_first do not share the columns of joint/mean out")
 

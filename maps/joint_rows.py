@@ -9,8 +9,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rbpf import gaussian
-from rbpf.core.models import Likelihood
+from rbpf.core.models import Likelihood, Observations, Part
 from rbpf.core.particles import weighted_mean
+from rbpf.errors import InputError
 from rbpf.kernels.dense import product
 
 QUICK = 30_000_000
@@ -47,6 +48,21 @@ class Rows(NamedTuple):
             return np.arange(self.nu.shape[1])
         found = [(-odds, *rows) for _, *part in self.groups for rows, odds in zip(*part, strict=True) if odds >= 0.0]
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
+
+
+def checked_ids(group: Observations) -> np.ndarray | None:
+    """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
+    name, ids = type(group.model).__name__, group.ids
+    if group.updates != frozenset({Part.STATE, Part.LANDMARK}):
+        raise InputError(f"a joint map's observations update state and landmarks, {name}'s do not")
+    if Part.LANDMARK not in group.model.reads:
+        return None
+    if ids is None or ids.shape != (group.z.shape[0],):
+        shape = None if ids is None else ids.shape
+        raise InputError(
+            f"a joint map takes one association for all particles: {name} needs ids ({group.z.shape[0]},), got {shape}"
+        )
+    return ids
 
 
 def log_det(chol: np.ndarray) -> float:

@@ -236,11 +236,11 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
 def test_depth_without_parallax_is_considered():
     joint, _ = rays(5)
     ids, z = np.array([20, 21]), np.full((2, 2), 300.0)
-    joint._kinds[1] = InverseDepth(0.1, least_parallax=1e9)
+    joint._held.kinds[1] = InverseDepth(0.1, least_parallax=1e9)
     state = SE3.retract(
-        joint._poses(joint.mean, joint._clone_columns(np.array([0])), joint.clones)[:, 0], np.full(6, 0.01)
+        joint._poses(joint.mean, joint._held.clone_columns(np.array([0])), joint.clones)[:, 0], np.full(6, 0.01)
     )
-    depth = joint._kind_of(ids).columns[:, 2]
+    depth = joint._held.of_one_kind(ids).columns[:, 2]
     before = joint.mean.copy(), joint.cov.copy()
     joint.correct(
         state, np.zeros((5, 6)), [Observations(z, np.repeat(np.eye(2)[None], 2, axis=0), CameraRay(CAMERA), ids=ids)]
@@ -254,7 +254,7 @@ def test_depth_without_parallax_is_considered():
 def test_particles_that_are_far_off_leave_a_covariance():
     """Innovations of many standard deviations: what is considered is not told to be better known than that allows."""
     joint, _ = rays(5)
-    joint._kinds[1] = InverseDepth(0.1, least_parallax=1e9)
+    joint._held.kinds[1] = InverseDepth(0.1, least_parallax=1e9)
     joint.mean[:, :6] = 0.0
     state, ids = SE3.exp(0.2 * np.random.default_rng(3).normal(size=(5, 6))), np.array([20, 21, 22, 23])
     z, cov = np.full((4, 2), 300.0), np.repeat(np.eye(2)[None], 4, axis=0)
