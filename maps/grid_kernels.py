@@ -39,6 +39,19 @@ def _first(a, d, pitch):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def _walk(x0, y0, x1, y1, pitch):
+    """From cell to cell along a line (J. Amanatides and A. Woo 1987).
+
+    Along each axis the first cell, the direction, where the line enters the next one and how much of it is in each; and how
+    many cells follow the first.
+    """
+    x, next_x, more_x = _first(x0, x1 - x0, pitch)
+    y, next_y, more_y = _first(y0, y1 - y0, pitch)
+    steps = int(abs(math.floor(x1 / pitch) - x) + abs(math.floor(y1 / pitch) - y))
+    return x, 1 if x1 > x0 else -1, next_x, more_x, y, 1 if y1 > y0 else -1, next_y, more_y, steps
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _ends(state, beam):
     """Where a beam begins and ends in the world [m]."""
     cos, sin = math.cos(state[0]), math.sin(state[0])
@@ -52,17 +65,14 @@ def _ends(state, beam):
 
 @njit(void(MATRIX, MATRIX, float64, INDICES, TOUCHED), cache=True, error_model="numpy")
 def touch(state, beams, side, origin, touched):
-    """Marks the tiles (N, H, W) that the beams cross, from end to end (J. Amanatides and A. Woo 1987)."""
+    """Marks the tiles (N, H, W) that the beams cross, from end to end."""
     pitch = side * TILE
     for n in range(state.shape[0]):
         for k in range(beams.shape[0]):
             x0, y0, x1, y1 = _ends(state[n], beams[k])
-            x, next_x, more_x = _first(x0, x1 - x0, pitch)
-            y, next_y, more_y = _first(y0, y1 - y0, pitch)
-            steps = abs(math.floor(x1 / pitch) - x) + abs(math.floor(y1 / pitch) - y)
-            step_x, step_y = 1 if x1 > x0 else -1, 1 if y1 > y0 else -1
+            x, step_x, next_x, more_x, y, step_y, next_y, more_y, steps = _walk(x0, y0, x1, y1, pitch)
             touched[n, int(y) - origin[0], int(x) - origin[1]] = True
-            for _ in range(int(steps)):
+            for _ in range(steps):
                 if next_x < next_y:
                     x += step_x
                     next_x += more_x
@@ -126,11 +136,8 @@ def insert(state, beams, side, origin, index, pool, change):
         # What is crossed comes first, so that a wall which a grazing beam passes by is a wall again after this scan.
         for k in range(beams.shape[0]):
             x0, y0, x1, y1 = _ends(state[n], beams[k])
-            x, next_x, more_x = _first(x0, x1 - x0, side)
-            y, next_y, more_y = _first(y0, y1 - y0, side)
-            steps = abs(math.floor(x1 / side) - x) + abs(math.floor(y1 / side) - y)
-            step_x, step_y = 1 if x1 > x0 else -1, 1 if y1 > y0 else -1
-            for _ in range(int(steps)):
+            x, step_x, next_x, more_x, y, step_y, next_y, more_y, steps = _walk(x0, y0, x1, y1, side)
+            for _ in range(steps):
                 cx, cy = int(x), int(y)
                 tile = _tile_of(index, n, origin, cx, cy)
                 if tile >= 0:
