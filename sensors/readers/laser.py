@@ -75,7 +75,7 @@ class LaserOptions(Ranged):
     part: Part = WHOLE  #: which of its scans.
 
 
-class Scan(NamedTuple):
+class ScanOfFile(NamedTuple):
     """One scan as it stands in a file."""
 
     place: str  #: where, for messages.
@@ -85,7 +85,7 @@ class Scan(NamedTuple):
 
 
 @dataclass
-class Scans:
+class ScansOfFile:
     """All scans of one scanner, in the order of the file."""
 
     angles: Array  #: (B,) of the beams, from one side to the other.
@@ -93,7 +93,7 @@ class Scans:
     max_range_m: float | None  #: None where the log does not say.
     robot_from_sensor: Array = field(default_factory=SE2.identity)  #: (E,).
     upside_down: bool = False
-    scans: list[Scan] = field(default_factory=list)
+    scans: list[ScanOfFile] = field(default_factory=list)
 
 
 class LaserFormat(ABC):
@@ -107,7 +107,7 @@ class LaserFormat(ABC):
         """Whether a file or folder is meant to be of this format."""
 
     @abstractmethod
-    def read(self, path: Path, options: LaserOptions) -> Scans:
+    def read(self, path: Path, options: LaserOptions) -> ScansOfFile:
         """At least one scan, each with odometry or none with it.
 
         Raises:
@@ -164,7 +164,7 @@ def _kinds() -> str:
     return "; or ".join(one.kind for one in LASERS)
 
 
-def _in_order(path: Path, scans: list[Scan]) -> list[Scan]:
+def _in_order(path: Path, scans: list[ScanOfFile]) -> list[ScanOfFile]:
     """Scans of ascending times; those that come a little late are left out."""
     kept = scans[:1]
     for scan in scans[1:]:
@@ -179,7 +179,7 @@ def _in_order(path: Path, scans: list[Scan]) -> list[Scan]:
     return kept
 
 
-def _tell_jumps(path: Path, scans: list[Scan], odometry: Array) -> None:
+def _tell_jumps(path: Path, scans: list[ScanOfFile], odometry: Array) -> None:
     moved = SE2.between(odometry[:-1], odometry[1:])
     seconds = np.diff([scan.stamp_ns for scan in scans]) * 1e-9
     size = np.maximum(np.abs(moved[:, 0]), np.hypot(moved[:, 1], moved[:, 2]))
@@ -191,7 +191,7 @@ def _tell_jumps(path: Path, scans: list[Scan], odometry: Array) -> None:
         )  # fmt: skip
 
 
-def _interpolated(path: Path, scans: list[Scan], stamps_ns: list[int], poses: list[Array]) -> list[Scan]:
+def _interpolated(path: Path, scans: list[ScanOfFile], stamps_ns: list[int], poses: list[Array]) -> list[ScanOfFile]:
     """Scans with odometry of other times than theirs; those before it begins and after it ends are left out."""
     if not poses:
         return scans
@@ -219,7 +219,7 @@ class Carmen(LaserFormat):
     def recognises(self, path: Path) -> bool:
         return not path.is_dir()
 
-    def read(self, path: Path, options: LaserOptions) -> Scans:
+    def read(self, path: Path, options: LaserOptions) -> ScansOfFile:
         lines = [(number, line.split()) for number, line in enumerate(read_lines(path, self.kind), 1)]
         lines = [(number, words) for number, words in lines if words and not words[0].startswith("#")]
         there = dict.fromkeys(words[0] for _, words in lines)
@@ -250,18 +250,18 @@ class Carmen(LaserFormat):
                 poses.append(np.array([theta, x, y]))
             elif words[0] == name:
                 found.append((number, _Line.parse(path, number, words)))
-        (line, first), scans = found[0], list[Scan]()
+        (line, first), scans = found[0], list[ScanOfFile]()
         for number, one in found:
             if one.beams != first.beams:
                 raise line_error(path, number, f"expected {first.beams} as in line {line}, found {one.beams}")
-            scans.append(Scan(f"line {number}", one.stamp_ns, one.ranges, one.odometry))
+            scans.append(ScanOfFile(f"line {number}", one.stamp_ns, one.ranges, one.odometry))
             if one.odometry is not None and one.laser is not None:
                 mounts.append(SE2.between(one.odometry, one.laser))
         if scans[0].odometry is None:
             scans = _interpolated(path, scans, stamps, poses)
         mount = _mount(path, name, mounts, np.array([params.get(key, 0.0) for key in offsets]), rear)
         farthest = first.head[4] if first.head else min(params.get(f"robot_{side}_laser_max", 0.0), _FAR_M)
-        return Scans(first.angles(path, line), 0.0, farthest if farthest > 0.0 else None, mount, scans=scans)
+        return ScansOfFile(first.angles(path, line), 0.0, farthest if farthest > 0.0 else None, mount, scans=scans)
 
 
 class _Line(NamedTuple):
@@ -380,7 +380,7 @@ class LaserBag(LaserFormat):
     def recognises(self, path: Path) -> bool:
         return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
 
-    def read(self, path: Path, options: LaserOptions) -> Scans:
+    def read(self, path: Path, options: LaserOptions) -> ScansOfFile:
         with opened(path) as bag:
             topics = bag.of_type(SCAN)
             if not topics or options.scanner not in (None, *topics):
@@ -389,7 +389,7 @@ class LaserBag(LaserFormat):
             topic = options.scanner or topics[0]
             if len(topics) > 1:
                 _log.warning("%s: the scans are those of %s, of %s.", path, topic, ", ".join(topics))
-            where, first, scans, damaged = f"{path}, {topic}", None, list[Scan](), 0
+            where, first, scans, damaged = f"{path}, {topic}", None, list[ScanOfFile](), 0
             for number, raw in enumerate(bag.messages(topic)):
                 try:
                     message = bag.message(raw)
@@ -399,7 +399,7 @@ class LaserBag(LaserFormat):
                 first = first or message
                 if _beams(message) != _beams(first):
                     raise InputError(f"{where}, scan {number}: expected beams as in the scans before, found others.")
-                scans.append(Scan(f"scan {number}", raw.stamp_ns, np.array(message.ranges, dtype=float), None))
+                scans.append(ScanOfFile(f"scan {number}", raw.stamp_ns, np.array(message.ranges, dtype=float), None))
             if first is None:
                 raise InputError(f"{where}: no scan can be read.")
             if damaged:
@@ -415,7 +415,7 @@ class LaserBag(LaserFormat):
             _log.warning("%s: nothing says where the scanner sits; taken as in the robot's middle.", where)
         else:
             turned, upside_down = _planar(mount), bool(SE3.rotation(mount)[2, 2] < 0.0)
-        return Scans(
+        return ScansOfFile(
             np.asarray(start + step * np.arange(count), dtype=float),
             nearest if np.isfinite(nearest) and nearest > 0.0 else 0.0,
             farthest if np.isfinite(farthest) and farthest > 0.0 else None,
