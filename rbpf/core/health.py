@@ -29,7 +29,7 @@ class HealthWarning(UserWarning):
 
 
 class Health:
-    """What the last steps show. `findings` holds the sentences; each kind is told once, as a `HealthWarning`.
+    """What the last steps show. `findings` holds the sentences; each kind is told once, as a `HealthWarning` unless `silent`.
 
     Args:
         n: number of particles.
@@ -39,6 +39,7 @@ class Health:
     def __init__(self, n: int, space: LieGroup) -> None:
         self.n = n
         self.findings = dict[str, str]()
+        self.silent = False
         self._few = max(2.0, FEW * n)
         self._ratios, self._ess, self._parents = (deque[float](maxlen=WINDOW) for _ in range(3))
         self._recent = deque[float](maxlen=WINDOW)
@@ -122,7 +123,8 @@ class Health:
     def _tell(self, kind: str, sentence: str) -> None:
         if kind not in self.findings:
             self.findings[kind] = sentence
-            warnings.warn(sentence, HealthWarning, stacklevel=4)
+            if not self.silent:
+                warnings.warn(sentence, HealthWarning, stacklevel=4)
 
 
 def _lasting(values: deque[float], step: int) -> float:

@@ -10,7 +10,6 @@ the run and what `track` returned, after each frame.
 
 import json
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +18,6 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from rbpf.core.checkpoint import fitting, load_arrays, read_one, text
-from rbpf.core.health import HealthWarning
 from rbpf.errors import InputError, printable
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.provenance import decisive_settings, require_same
@@ -73,17 +71,15 @@ class Run(Generic[SystemT]):
 
         Errors as `System.take`.
         """
+        # What the filter warns of stands among a run's messages instead.
+        health = self.system.filter.health
+        health.silent, known = True, len(health.findings)
         started = time.perf_counter()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", HealthWarning)
-            tracked = self.system.take(frame)
+        tracked = self.system.take(frame)
         seconds = time.perf_counter() - started
         self.frame = frame
         place = f"{self.system.frame_word} {len(self.log)}"
-        for warning in caught:
-            if not issubclass(warning.category, HealthWarning):
-                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-        doubts = [str(warning.message) for warning in caught if issubclass(warning.category, HealthWarning)]
+        doubts = list(self.system.filter.health.findings.values())[known:]
         self.messages += [f"{place}: {printable(words)}" for words in (*tracked.messages, *doubts)]
         self.log.append(tracked, seconds, waiting)
         return tracked
