@@ -44,7 +44,7 @@ from rbpf.core.particles import (
     reweight,
     uniform_log_weights,
 )
-from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import Consolidation, EssTriggered, Systematic
 from rbpf.errors import InputError
 from rbpf.kernels.increment import are_sound
@@ -216,7 +216,7 @@ class Filter:
             log_weights = uniform_log_weights(self.n)
             self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
             self.marginals.resample(ancestors)
-            if self._draws and isinstance(proposal, PriorProposal):
+            if self._draws and proposed.nis is None:
                 # Nothing has looked at what was drawn: each descendant draws anew.
                 self.particles = Particles(self.particles.state[ancestors], log_weights)
                 prior = self._predict(control, dt)

@@ -20,6 +20,7 @@ import numpy as np
 from rbpf.arrays import Float, Int
 from rbpf.core.checkpoint import fitting
 from rbpf.core.filter import Filter
+from rbpf.core.models import Map, Part
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.ranges import require_memory
 from rbpf.sensors.feature_log import FeatureLog
@@ -214,7 +215,7 @@ class System(ABC):
 
         Raises InputError: the file is missing or damaged, or belongs to another system or other settings.
         """
-        arrays = self.filter.load(path)
+        arrays, held = self.filter.load(path), self.filter.marginals.parts.get(Part.LANDMARK)
         with fitting(Path(path)):
-            self.restore(arrays | {MAP_IDS: self.filter.belief().map.ids})
+            self.restore(arrays | ({MAP_IDS: held.ids} if isinstance(held, Map) else {}))
         return arrays

@@ -11,12 +11,11 @@ the filter corrects by the exact ratio w₂ = p(z|x) p(x|x⁻) / (q(x) w₁). A 
 one that was; the pose of every other one is that of the odometry from there on.
 """
 
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import elements, fitting, integers, numbers, read
+from rbpf.core.checkpoint import elements, integers, numbers, read
 from rbpf.core.filter import Filter
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Prior, Proposed
@@ -197,12 +196,6 @@ class LaserSlam(System):
         found = list(read(arrays, _STATE, "laser/").values())
         self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist = found[:7]
         self._stamps, self._used, self._ess = found[7].tolist(), int(found[8][0]), float(found[9])
-
-    def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        arrays = self.filter.load(path)
-        with fitting(Path(path)):
-            self.restore(arrays)
-        return arrays
 
     def _move(self, odometry: np.ndarray | None, seconds: float, messages: list[str]) -> None:
         """Takes in the motion since the last scan, as the odometry says it, or as it was between the last two steps."""
