@@ -6,10 +6,16 @@ storage in the particle filter" (2015), give the expected size, T + C·N log N n
 """
 
 import numpy as np
-from numba import njit
+from numba import boolean, int64, njit, types
+
+from rbpf.kernels.signature import INDICES
+
+# Compiled as they are loaded, as the other drivers: the first history that is bounded need not wait for it.
+_NODES = (INDICES,) * 4
+_FLAGS = types.Array(boolean, 1, "C")
 
 
-@njit(cache=True)
+@njit(int64(*_NODES, INDICES, int64, INDICES, INDICES, int64), cache=True)
 def advance(parent, children, generation, row, free, n_free, leaves, ancestors, now):
     """Makes a node for each descendant and frees the lineages without one; returns the free-list's length."""
     n = leaves.size
@@ -37,7 +43,7 @@ def advance(parent, children, generation, row, free, n_free, leaves, ancestors, 
     return n_free
 
 
-@njit(cache=True)
+@njit(INDICES(INDICES, INDICES, INDICES, INDICES, int64, INDICES, INDICES, int64), cache=True)
 def rows_at(parent, generation, row, leaves, wanted, found, stamp, mark):
     """Row of each particle's ancestor in generation `wanted`; each node of the way is climbed once.
 
@@ -57,7 +63,7 @@ def rows_at(parent, generation, row, leaves, wanted, found, stamp, mark):
     return out
 
 
-@njit(cache=True)
+@njit(int64(INDICES, INDICES, INDICES, INDICES, int64, INDICES, _FLAGS, INDICES, int64), cache=True)
 def splice(parent, children, generation, free, n_free, leaves, needed, stamp, mark):
     """Removes nodes with a single child that are not needed themselves; returns the free-list's length."""
     for i in range(leaves.size):

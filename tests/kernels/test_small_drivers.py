@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rbpf.kernels import forest
 from rbpf.kernels.dense import product
 from rbpf.kernels.increment import are_sound, conditioned
 from rbpf.kernels.robust_fit import robust_fit
@@ -92,3 +93,8 @@ def test_soundness(rng):
 def test_a_product_is_numpys(m, k, n, rng):
     left, right = rng.normal(size=(m, k)), rng.normal(size=(k, n))
     np.testing.assert_allclose(product(left, right), left @ right, rtol=1e-12, atol=1e-14)
+
+
+def test_the_forest_is_compiled_as_it_is_loaded():
+    """Setting up filters nothing for long enough to call it: a user's first run would be told of compiling again."""
+    assert not any(function._can_compile for function in (forest.advance, forest.rows_at, forest.splice))
