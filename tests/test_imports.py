@@ -54,6 +54,15 @@ def test_importing_the_package_imports_hardly_anything_else():
     assert imported_by("import rbpf") == {"rbpf", "lazy_loader"}
 
 
+def test_the_command_line_keeps_blas_on_one_thread_before_numpy_is_there():
+    """Which reads it as it is imported; who has set it otherwise is heeded."""
+    early = "import sys, tyro; assert 'numpy' not in sys.modules"
+    said = "import os, rbpf.cli; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    without = "import os; os.environ.pop('OPENBLAS_NUM_THREADS', None)"
+    assert run_python(f"{without}\n{early}\n{said}").strip() == "1"
+    assert run_python(f"import os; os.environ['OPENBLAS_NUM_THREADS'] = '3'\n{said}").strip() == "3"
+
+
 @pytest.mark.slow
 def test_the_public_names_need_neither_pictures_nor_what_only_tests_use():
     unwanted = {"matplotlib", "PIL", "rich", "tyro", "joblib", "jaxtyping", "pytest", "rerun", *HEAVY}
