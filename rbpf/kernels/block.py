@@ -335,3 +335,26 @@ def _innovation(jac, cov, noise, count, cross, total):
             for c in range(last, end):
                 for i in range(count):
                     total[a, b, i] += cross[a, c, i] * jac[b, c, i]
+
+
+@njit(cache=True, error_model="numpy")
+def add_spread(jac, factor, start, count, column, total):
+    """Total += H L (H L)ᵀ, its lower triangle."""
+    p, dim = jac.shape[0], factor.shape[1]
+    shared = factor.shape[0] == 1
+    for r in range(factor.shape[2]):
+        for a in range(p):
+            for i in range(count):
+                column[a, i] = 0.0
+            for e in range(dim):
+                if shared:
+                    weight = factor[0, e, r]
+                    for i in range(count):
+                        column[a, i] += jac[a, e, i] * weight
+                else:
+                    for i in range(count):
+                        column[a, i] += jac[a, e, i] * factor[start + i, e, r]
+        for a in range(p):
+            for b in range(a + 1):
+                for i in range(count):
+                    total[a, b, i] += column[a, i] * column[b, i]

@@ -7,14 +7,21 @@ from numba import njit
 
 
 @njit(cache=True, error_model="numpy")
-def factor(matrix):
-    """Replaces the lower triangle of a positive definite matrix by its Cholesky factor."""
+def factor(matrix, least=0.0):
+    """Replaces the lower triangle of a positive definite matrix by its Cholesky factor.
+
+    Returns whether it is definite: every pivot is above the fraction `least` of its variance.
+    """
+    definite = True
     for a in range(matrix.shape[0]):
         for b in range(a + 1):
             rest = matrix[a, b]
             for c in range(b):
                 rest -= matrix[a, c] * matrix[b, c]
+            if a == b:
+                definite = definite and rest > least * matrix[a, a]
             matrix[a, b] = math.sqrt(rest) if a == b else rest / matrix[b, b]
+    return definite
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rbpf.kernels.block import add_squares, cholesky, whiten_vector
+from rbpf.kernels.block import add_spread, add_squares, cholesky, whiten_vector
 from rbpf.kernels.signature import BLOCK
 
 
@@ -22,7 +22,7 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
     """
     if kernel_id == 0:
         return
-    p, dim, rank = nu.shape[0], jac_state.shape[1], factor.shape[2]
+    p = nu.shape[0]
     spread = np.empty((p, p, BLOCK))
     white = np.empty((p, BLOCK))
     column = np.empty((p, BLOCK))
@@ -30,17 +30,7 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
     scale = np.ones(BLOCK)
     spread[:, :, :count] = total[:, :, :count]
     white[:, :count] = nu[:, :count]
-    shared = factor.shape[0] == 1
-    for r in range(rank):
-        for a in range(p):
-            for i in range(count):
-                column[a, i] = 0.0
-                for e in range(dim):
-                    column[a, i] += jac_state[a, e, i] * factor[0 if shared else start + i, e, r]
-        for a in range(p):
-            for b in range(a + 1):
-                for i in range(count):
-                    spread[a, b, i] += column[a, i] * column[b, i]
+    add_spread(jac_state, factor, start, count, column, spread)
     cholesky(spread, count, scale)
     whiten_vector(spread, count, white)
     add_squares(white, count, squared)
@@ -61,13 +51,7 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
                 penalty[i] -= 2.0 * params[0]
         else:
             weight[i] = 0.0
-            penalty[i] -= 2.0 * outlier_log_density(kernel_id, params)
-
-
-@njit(cache=True, error_model="numpy")
-def outlier_log_density(kernel_id, params):
-    """Log-density that an observation gets where it is taken as an outlier."""
-    return params[1] if kernel_id == 2 else -0.5 * params[0]
+            penalty[i] -= 2.0 * (params[1] if kernel_id == 2 else -0.5 * params[0])
 
 
 @njit(cache=True, error_model="numpy")

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import boolean, njit, prange, void
 
+from rbpf.kernels import dense
 from rbpf.kernels.block import add_squares, cholesky, packed, whiten_vector
 from rbpf.kernels.signature import BLOCK, CUBE, MATRIX, READ_ONLY, READ_ONLY_CUBE, VECTOR
 
@@ -138,43 +139,6 @@ def _joint(stack, cov, noise, half, joint):
 
 
 @njit(cache=True, error_model="numpy")
-def _cholesky(joint, factor):
-    """Lower factor of the leading block; whether it is definite."""
-    d = factor.shape[0]
-    factor[:] = 0.0
-    for j in range(d):
-        pivot = joint[j, j]
-        for k in range(j):
-            pivot -= factor[j, k] * factor[j, k]
-        if not pivot > _SINGULAR * joint[j, j]:
-            return False
-        factor[j, j] = math.sqrt(pivot)
-        for i in range(j + 1, d):
-            rest = joint[i, j]
-            for k in range(j):
-                rest -= factor[i, k] * factor[j, k]
-            factor[i, j] = rest / factor[j, j]
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def _solve(joint, factor, gain):
-    """Gain = C L⁻ᵀ L⁻¹ of the cross-covariance C."""
-    d, m = factor.shape[0], gain.shape[0]
-    for a in range(m):
-        for j in range(d):
-            total = joint[d + a, j]
-            for k in range(j):
-                total -= factor[j, k] * gain[a, k]
-            gain[a, j] = total / factor[j, j]
-        for j in range(d - 1, -1, -1):
-            total = gain[a, j]
-            for k in range(j + 1, d):
-                total -= factor[k, j] * gain[a, k]
-            gain[a, j] = total / factor[j, j]
-
-
-@njit(cache=True, error_model="numpy")
 def _condition(joint, gain, half, rest):
     """Rest = [−G I] J [−G I]ᵀ, which rounding cannot make indefinite."""
     m, d = gain.shape
@@ -200,45 +164,35 @@ def conditioned(stack, cov, noise, joint, factor, gain, rest):
     cov(s, ε) cov(ε)⁻¹ and `rest` (J, m, m) = cov(s | ε), from `stack` S (J or 1, d+m, m), `cov` P (J or 1, m, m) and
     `noise` L (J or 1, d+m, r). Returns whether every cov(ε) is definite; what depends on it is void where one is not.
     """
-    half = np.empty(stack.shape[1:])
-    definite = True
+    m, d = gain.shape[1:]
+    half, definite = np.empty(stack.shape[1:]), True
     for j in range(joint.shape[0]):
         of_stack, of_cov, of_noise = (min(j, stack.shape[0] - 1), min(j, cov.shape[0] - 1), min(j, noise.shape[0] - 1))
         _joint(stack[of_stack], cov[of_cov], noise[of_noise], half, joint[j])
-        definite = _cholesky(joint[j], factor[j]) and definite
+        for a in range(d):
+            for b in range(d):
+                factor[j, a, b] = joint[j, a, b] if b <= a else 0.0
+        definite = dense.factor(factor[j], _SINGULAR) and definite
         if definite:
-            _solve(joint[j], factor[j], gain[j])
+            for a in range(m):
+                gain[j, a] = joint[j, d + a, :d]
+                dense.solve(factor[j], gain[j, a])
             _condition(joint[j], gain[j], half, rest[j])
     return definite
-
-
-@njit(cache=True, error_model="numpy")
-def _is_definite(cov, factor):
-    """Whether a matrix is finite, symmetric to the bit and positive definite."""
-    for a in range(cov.shape[0]):
-        for b in range(a + 1):
-            if cov[a, b] != cov[b, a] or not math.isfinite(cov[a, b]):
-                return False
-            rest = cov[a, b]
-            for c in range(b):
-                rest -= factor[a, c] * factor[b, c]
-            if b < a:
-                factor[a, b] = rest / factor[b, b]
-            elif rest > 0.0:
-                factor[a, a] = math.sqrt(rest)
-            else:
-                return False
-    return True
 
 
 @njit(boolean(READ_ONLY, READ_ONLY_CUBE), cache=True, error_model="numpy")
 def are_sound(z, cov):
     """Whether z (K, p) is finite and every cov (K, p, p) finite, symmetric to the bit and positive definite."""
-    factor = np.empty(cov.shape[1:])
+    chol = np.empty(cov.shape[1:])
     for k in range(z.shape[0]):
         for a in range(z.shape[1]):
             if not math.isfinite(z[k, a]):
                 return False
-        if not _is_definite(cov[k], factor):
+            for b in range(a + 1):
+                if cov[k, a, b] != cov[k, b, a] or not math.isfinite(cov[k, a, b]):
+                    return False
+        chol[:] = cov[k]
+        if not dense.factor(chol):
             return False
     return True

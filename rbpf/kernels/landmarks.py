@@ -11,6 +11,7 @@ from numba import int64, njit, prange, void
 
 from rbpf.kernels.block import (
     add_gram,
+    add_spread,
     add_squares,
     add_transposed_product,
     cholesky,
@@ -208,29 +209,6 @@ def update(
 
 
 @njit(cache=True, error_model="numpy")
-def _add_spread(jac, factor, start, count, column, total):
-    """Total += H L (H L)ᵀ, its lower triangle."""
-    p, dim = jac.shape[0], factor.shape[1]
-    shared = factor.shape[0] == 1
-    for r in range(factor.shape[2]):
-        for a in range(p):
-            for i in range(count):
-                column[a, i] = 0.0
-            for e in range(dim):
-                if shared:
-                    weight = factor[0, e, r]
-                    for i in range(count):
-                        column[a, i] += jac[a, e, i] * weight
-                else:
-                    for i in range(count):
-                        column[a, i] += jac[a, e, i] * factor[start + i, e, r]
-        for a in range(p):
-            for b in range(a + 1):
-                for i in range(count):
-                    total[a, b, i] += column[a, i] * column[b, i]
-
-
-@njit(cache=True, error_model="numpy")
 def _add_between(weights, offset, mean, cov):
     """Mean = Σ W o and cov += Σ W (o − mean)(o − mean)ᵀ, of one landmark."""
     p, n = offset.shape
@@ -273,7 +251,7 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
             load_record(pool, slabs[k], maps[which[k]], start, count, record, packed_cov, const)
             kernel(x, record, const, anchor[k], params, count, nu, jac_state, jac_map)
             innovation_covariance(jac_map, packed_cov, nothing, count, cross, total)
-            _add_spread(jac_state, factor, start, count, column, total)
+            add_spread(jac_state, factor, start, count, column, total)
             for a in range(p):
                 for i in range(count):
                     offset[a, start + i] = -nu[a, i]

@@ -11,25 +11,19 @@ _GIVEN = READ_ONLY_CUBE, READ_ONLY_CUBE, READ_ONLY, READ_ONLY_CUBE, READ_ONLY
 
 
 @njit(cache=True, error_model="numpy")
-def _jacobian(q, jac):
-    """[[q]× | −I] (3, 6), the derivative of T⁻¹p = q by T Exp(ξ)."""
-    jac[:] = 0.0
-    jac[0, 1], jac[0, 2], jac[1, 2] = -q[2], q[1], -q[0]
-    jac[1, 0], jac[2, 0], jac[2, 1] = q[2], -q[1], q[0]
-    jac[0, 3] = jac[1, 4] = jac[2, 5] = -1.0
-
-
-@njit(cache=True, error_model="numpy")
 def _linearise(quat, shift, world, shape, weight, weighed, info, vector):
     """Fills JᵀW (M, 6, 3), the lower triangle of Σ JᵀWJ (6, 6) and Σ JᵀW r (6,), r = T⁻¹p − k."""
-    jac = np.empty((3, 6))
+    jac = np.zeros((3, 6))
     back = (-quat[0], -quat[1], -quat[2], quat[3])
     info[:], vector[:] = 0.0, 0.0
     for m in range(world.shape[0]):
         apart = (world[m, 0] - shift[0], world[m, 1] - shift[1], world[m, 2] - shift[2])
         q = turned(back, apart)
         rest = (q[0] - shape[m, 0], q[1] - shape[m, 1], q[2] - shape[m, 2])
-        _jacobian(q, jac)
+        # [[q]× | −I], the derivative of T⁻¹p = q by T Exp(ξ).
+        jac[0, 1], jac[0, 2], jac[1, 2] = -q[2], q[1], -q[0]
+        jac[1, 0], jac[2, 0], jac[2, 1] = q[2], -q[1], q[0]
+        jac[0, 3] = jac[1, 4] = jac[2, 5] = -1.0
         for e in range(6):
             for a in range(3):
                 row = jac[0, e] * weight[m, 0, a] + jac[1, e] * weight[m, 1, a] + jac[2, e] * weight[m, 2, a]
