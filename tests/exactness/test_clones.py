@@ -19,9 +19,9 @@ from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraPoint, CameraRay
 from rbpf.sensors.range_bearing import RelativePosition
-from tests.exactness.models import Frame, Kalman, Scripted
+from tests.exactness.models import Kalman, Scripted
 from tests.exactness.slam import ALONG, NOISE, STEP, TURNED, Q, turned
-from tests.exactness.test_joint_map import assert_same, told
+from tests.exactness.test_joint_map import assert_same
 
 CAMERA = Pinhole(640, 480, 400.0, 380.0, 319.5, 239.5)
 
@@ -260,41 +260,6 @@ def test_particles_that_are_far_off_leave_a_covariance():
     z, cov = np.full((4, 2), 300.0), np.repeat(np.eye(2)[None], 4, axis=0)
     joint.correct(state, np.zeros((5, 6)), [Observations(z, cov, CameraRay(CAMERA), ids=ids)])
     assert np.linalg.eigvalsh(joint.cov).min() > -1e-15
-
-
-def test_a_checkpoint_with_clones(tmp_path):
-    frames = turned().frames(FromAnchor(SE2))
-    ends = []
-    for resumed in (False, True):
-        filter_ = filtered_part(frames, 2)
-        if resumed:
-            filter_.save(tmp_path / "half.npz")
-            filter_ = filtered_part(frames, 0)
-            filter_.load(tmp_path / "half.npz")
-        for frame in frames[2:]:
-            filter_.step(frame, ALONG)
-        ends.append((*told(filter_)[1], filter_.belief().map.mean))
-    for first, second in zip(*ends, strict=True):
-        assert first.tobytes() == second.tobytes()
-    joint = filter_.belief().map
-    arrays = joint.arrays()
-    for name, wrong in (("clone", arrays["joint/clone"] * 0 - 1), ("first", arrays["joint/first"] + 1)):
-        with pytest.raises(InputError, match=name):
-            joint.restore(arrays | {f"joint/{name}": wrong})
-
-
-def filtered_part(frames, count: int) -> Filter:
-    """As `filtered`, in the middle of a window; the kinds are named beforehand."""
-    joint = JointMap(SE2)
-    joint.register(AnchoredPoint(SE2))
-    options = {"n": 12, "start": TURNED, "lag": 1, "consolidation": Consolidation(3), "rng": np.random.default_rng(0)}
-    filter_ = Filter(OdometryMotion(SE2), Scripted(), joint, **options)
-    for k, frame in enumerate(frames):
-        born = [replace(new, landmark=AnchoredPoint(SE2)) for new in frame.new_landmarks]
-        frames[k] = Frame(frame.groups, born)
-        if k < count:
-            filter_.step(frames[k], ALONG)
-    return filter_
 
 
 def test_kinds_that_a_joint_map_does_not_hold():

@@ -115,19 +115,3 @@ def test_information_of_a_frame_has_the_frames_uncertainty(errors):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     known = H.T @ np.linalg.solve(R, H)
     assert np.linalg.eigvalsh(known - found).min() > 0.0
-
-
-@every_group
-def test_errors_are_as_large_as_stated(errors):
-    """NEES of the landmark over drawn worlds, within four standard errors of its dimension."""
-    scores = []
-    for seed in range(200):
-        world = World(errors, seed)
-        held = world.map(1, True)
-        for t, pose in enumerate(world.path):
-            held.correct(pose[None], np.zeros((1, 6)), [world.observed(t)])
-        records = held.read(held.ids)
-        error = world.true - records.mean[0, 0]
-        scores.append(error @ np.linalg.solve(records.cov[0, 0], error))
-    dim = world.group.dim
-    assert abs(np.mean(scores) - dim) < 4.0 * np.sqrt(2.0 * dim / len(scores))

@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.models import Observations, Part, Records
-from rbpf.core.particles import Prior, SecondWeight, mixture_estimate
+from rbpf.core.particles import Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE2, SE3, Euclidean
@@ -79,21 +79,6 @@ def test_in_a_linear_model_the_estimate_has_no_noise_of_sampling():
         assert report.second is not None and report.second.trust == 0.0
         np.testing.assert_allclose(report.estimate.mean, [1.0 / 1.5, 0.0], atol=1e-12)
         np.testing.assert_allclose(report.estimate.cov, np.diag([0.5 / 1.5, 1.0]), atol=1e-12)
-
-
-def test_how_far_the_second_weight_is_trusted():
-    n, rng = 100, np.random.default_rng(6)
-    state, before = rng.normal(size=(n, 2)), np.full(n, -np.log(n))
-    one = np.full(n, -np.inf)
-    one[0] = 0.0
-    assert SecondWeight(state, before, before).trust == 0.0
-    assert SecondWeight(state, before, one).trust == pytest.approx((n - 1) / n)
-    assert SecondWeight(state, one, one).trust == 0.0
-    weights = rng.dirichlet(np.full(n, 400.0))
-    little = SecondWeight(state, before, np.log(weights))
-    moved = n * np.square(weights).sum() - 1.0
-    assert little.trust == pytest.approx(moved / (moved + np.square(weights).sum()))
-    assert 0.05 < little.trust < 0.5
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["one noise", "noise per particle"])

@@ -8,7 +8,6 @@ import pytest
 
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.genealogy import Lineage
-from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.models import Observations, Part, Records
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
@@ -110,23 +109,6 @@ def test_for_the_landmarks_alone(space, proposal, compiled):
     np.testing.assert_array_equal(landmarks(alone).mean, expected.read(expected.ids).mean)
     np.testing.assert_array_equal(landmarks(alone).cov, expected.read(expected.ids).cov)
     assert np.abs(landmarks(alone).mean - world.records.mean).max() > 1e-3
-
-
-@every_path
-@pytest.mark.parametrize(
-    "likelihood",
-    [Gaussian(), TruncatedMahalanobis(4.0), GaussianWithOutliers(0.05, 30.0)],
-    ids=lambda x: type(x).__name__,
-)
-def test_density_does_not_depend_on_what_is_updated(likelihood, compiled):
-    """log p(z | x), with one measurement far off."""
-    world, (groups, *_) = scene(SE2)
-    group = replace(groups[0], likelihood=likelihood)
-    group.z[1] += 1.0
-    zero = np.zeros((PARTICLES, SE2.dim))
-    both = world.map(compiled).correct(world.state, zero, [group]).all
-    alone = world.map(compiled).correct(world.state, zero, [replace(group, updates=STATE)]).all
-    np.testing.assert_allclose(alone, both, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -232,32 +232,6 @@ def test_draws_have_the_moments_of_independent_ones():
     np.testing.assert_allclose((weights[:, None] * noise).T @ noise, expected, atol=1e-13)
 
 
-def test_a_checkpoint_in_the_middle_of_a_window(world, tmp_path):
-    frames = world.frames(Relative())
-    whole, second = plane(Consolidation(3), seed=1), plane(Consolidation(3), seed=2)
-    for frame in frames[:2]:
-        whole.step(frame)
-    whole.save(tmp_path / "half.npz")
-    second.load(tmp_path / "half.npz")
-    for filter_ in (whole, second):
-        for frame in frames[2:]:
-            filter_.step(frame)
-    assert second.log_evidence == whole.log_evidence
-    for name, array in whole.belief().map.arrays().items():
-        assert array.tobytes() == second.belief().map.arrays()[name].tobytes()
-    with pytest.raises(InputError, match="consolidation"):
-        plane(Consolidation(4)).load(tmp_path / "half.npz")
-
-
-def test_a_landmark_that_is_dropped_leaves_the_rest_as_it_is():
-    joint, particles = held(SE3, 10, 4)
-    joint.remove(np.array([1]))
-    kept = held(SE3, 10, 4)[0].in_world(particles)
-    np.testing.assert_array_equal(joint.ids, [0, 2, 3])
-    for whole, rest in zip(kept, joint.in_world(particles), strict=True):
-        np.testing.assert_allclose(whole[[0, 2, 3]], rest, atol=1e-12)
-
-
 def test_sensors_read_it_as_any_map():
     """With the same Gaussians a map of the particles' own says the same."""
     joint, particles = held(SE2, 15, 3)

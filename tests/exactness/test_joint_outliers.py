@@ -98,19 +98,6 @@ def test_the_order_of_the_rows_and_groups_does_not_matter():
     np.testing.assert_allclose(held_.correct(state, np.zeros_like(state), decided).all, density, rtol=1e-9)
 
 
-def test_an_update_is_that_of_the_inliers_alone():
-    joint = corrected(SOME)[2]
-    inside = [0, 2, 3, 4]
-    alone, state = held()
-    alone.correct(
-        state,
-        np.zeros_like(state),
-        [replace(SOME, z=SOME.z[inside], cov=SOME.cov[inside], likelihood=None, ids=SOME.ids[inside])],
-    )
-    np.testing.assert_allclose(joint.mean, alone.mean, atol=1e-12)
-    np.testing.assert_allclose(joint.cov, alone.cov, atol=1e-12)
-
-
 @pytest.mark.parametrize("n", [1, 6])
 def test_nothing_but_outliers_updates_nothing(n):
     joint, state = held(n)
@@ -150,18 +137,6 @@ def test_landmarks_that_are_independent_weigh_as_in_a_map_of_the_particles_own(l
         for held in (joint, own)
     ]
     np.testing.assert_allclose(*found, rtol=1e-9)
-
-
-def test_the_density_is_continuous_in_the_state():
-    """From where every row is right to where none is."""
-    joint, _ = held(801)
-    joint.mean = np.repeat(joint.mean[:1], 801, axis=0)
-    state = np.linspace([-10.0, 4.0], [10.0, -2.0], 801)
-    decided = joint.decided([SOME], belief(joint, state))
-    density = joint.correct(state, np.zeros_like(state), decided).all
-    assert np.ptp(density) > 20.0
-    assert np.abs(np.diff(density)).max() < 1.0
-    assert np.abs(np.diff(density, 2)).max() < 0.05
 
 
 def bank(world: LinearSlam, wrong: dict[tuple[int, int], np.ndarray]) -> list[tuple[float, Kalman]]:

@@ -65,14 +65,6 @@ def test_densities_integrate_to_one_over_the_measurement_space(likelihood, p, rn
     assert abs(truncated - 1.0) > 1.0
 
 
-def test_outliers_take_over_far_from_the_prediction():
-    likelihood = GaussianWithOutliers(0.1, 50.0)
-    far = likelihood.log_density(np.array([40.0]), np.eye(1))
-    assert far == pytest.approx(np.log(0.1 / 50.0), abs=1e-12)
-    near = likelihood.log_density(np.array([0.0]), np.eye(1))
-    assert near == pytest.approx(np.log(0.9 / np.sqrt(2 * np.pi) + 0.1 / 50.0), abs=1e-12)
-
-
 @pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal()], ids=["prior", "ekf"])
 def test_without_a_density_there_is_no_evidence(proposal):
     """Null, not a number that a comparison of models could mistake for one; the weights are still right."""

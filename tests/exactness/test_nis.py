@@ -9,7 +9,7 @@ from rbpf.core.models import NEW, NULL, Observations, Records
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
+from tests.exactness.models import Frame, LinearMotion, Relative, Scripted
 
 N = 40
 PLANE = Euclidean(2)
@@ -63,26 +63,3 @@ def test_rows_count_by_the_weight_of_the_particles_that_use_them(outcome, compil
     fraction = known / (known + 0.25 * np.exp(-1.0))
     assert found.rows == pytest.approx(2.0 * fraction, rel=1e-9)
     assert found.nis == pytest.approx(one.nis * fraction, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_a_filter_that_is_right_has_a_ratio_of_one_whatever_is_gated_or_split():
-    """Measurements of a known landmark, some of which are wrong; half of the particles take its twin."""
-    rng, steps = np.random.default_rng(5), 600
-    cov = 0.15 * np.eye(2) + 0.09 * np.eye(2)
-    z = LANDMARKS[0] + rng.multivariate_normal(np.zeros(2), cov, size=steps)
-    z[::5] += 20.0
-    reports = [report(z[t], np.array([0]), TruncatedMahalanobis(4.0, 16.3)) for t in range(steps)]
-    ratio = sum(r.nis for r in reports) / sum(r.rows for r in reports)
-    assert ratio == pytest.approx(1.0, abs=3.5 * np.sqrt(1.0 / (0.8 * steps)))
-    assert sum(r.rows for r in reports) == pytest.approx(2.0 * 0.8 * steps, abs=4.0)
-
-
-def test_a_single_association_that_is_not_gated_has_all_its_rows():
-    found = report(np.array([[3.0, 1.1], [3.1, 0.8]]), np.array([0, 1]))
-    assert found.rows == 4.0
-    filter_ = Filter(LinearMotion(np.eye(1), np.eye(1)), Scripted(), n=7, rng=np.random.default_rng(1))
-    fix = filter_.step(Frame([single(np.array([0.4]), 0.3, LinearObservation(by_state=[[1.0]]))]))
-    assert fix.rows == 1.0
-    assert fix.nis == pytest.approx(0.16 / 1.3, rel=1e-12)
-    assert filter_.step(Frame([])).rows == 0.0

@@ -171,12 +171,3 @@ def _chart_ekf(scene, group, factor, base, mean, at, particle) -> Kalman:
         spread = slope @ records.cov[particle, landmark] @ slope.T
         kalman.update(nu + G @ (at - mean), G, R + spread)
     return kalman
-
-
-def test_observing_nothing_leaves_the_prior(rng):
-    scene = Scene.random(SE2, rng)
-    prior = scene.prior(2, shared=True)
-    proposed = refined(prior, Marginals(SE2, [scene.map()]).information(scene.state, [], prior))
-    np.testing.assert_array_equal(proposed.mean, 0.0)
-    np.testing.assert_array_equal(proposed.root, np.tile(np.eye(2), (scene.n, 1, 1)))
-    np.testing.assert_array_equal(proposed.log_w1, 0.0)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.trajectory import Similarity, Trajectory, associate, read_kitti, read_tum
+from rbpf.runs.trajectory import Similarity, Trajectory, read_kitti
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
 FRAMES, METRES = metrics.Unit.frames, metrics.Unit.meters
@@ -80,23 +80,6 @@ def test_kitti_00_has_the_published_errors(data_dir):
     by_path = rpe(estimate, truth, 100, "metres")
     assert len(by_path) == 36
     assert by_path.translation_rmse == pytest.approx(1.193976, abs=1e-5)
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize(("name", "rotation_deg"), [("rgbdslam", 0.353613), ("rgbdslam_drift", 0.353614)])
-def test_freiburg1_xyz_has_the_published_errors(data_dir, name, rotation_deg):
-    folder = data_dir / "evo_reference"
-    estimate, truth = associate(
-        read_tum(folder / f"freiburg1_xyz-{name}.txt"), read_tum(folder / "freiburg1_xyz-groundtruth.txt")
-    )
-    assert len(estimate) == 785
-    assert ate(estimate, truth, "rigid").rmse == pytest.approx(0.013470, abs=1e-6)
-    with_scale = ate(estimate, truth, "similarity")
-    assert with_scale.rmse == pytest.approx(0.013389, abs=1e-6)
-    assert with_scale.alignment.scale == pytest.approx(1.008001, abs=1e-6)
-    by_frame = rpe(estimate, truth, 1, "frames")
-    assert by_frame.translation_rmse == pytest.approx(0.005764, abs=1e-6)
-    assert by_frame.rotation_rmse_deg == pytest.approx(rotation_deg, abs=1e-6)
 
 
 def test_landmarks_that_both_maps_have_are_compared():

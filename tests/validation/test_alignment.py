@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.trajectory import Similarity, align, fit
+from rbpf.runs.trajectory import Similarity, align
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -77,27 +77,6 @@ def test_points_on_a_line_turn_by_the_angle_between_the_lines(seed):
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("count", [1, 5])
-def test_points_in_one_place_are_moved_without_turning(dim, count):
-    place = 1234.567 * np.arange(1.0, dim + 1.0)
-    found = align(np.tile(place, (count, 1)), np.tile(place / 3.0, (count, 1)), with_scale=True)
-    assert not found.unique
-    assert found.scale == 1.0
-    np.testing.assert_allclose(found.rotation, np.eye(dim), atol=1e-15)
-    np.testing.assert_allclose(found.transform(place), place / 3.0)
-
-
-def test_two_points_fix_the_rotation_in_the_plane_only():
-    x, y = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[5.0, 5.0, 0.0], [5.0, 6.0, 0.0]])
-    quarter_turn = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    in_plane, in_space = align(x[:, :2], y[:, :2]), align(x, y)
-    assert in_plane.unique
-    assert not in_space.unique
-    np.testing.assert_allclose(in_space.rotation, quarter_turn, atol=1e-12)
-    np.testing.assert_allclose(in_plane.rotation, np.array(quarter_turn)[:2, :2], atol=1e-12)
-
-
 def test_poses_move_as_the_points_of_their_body_do():
     rng = np.random.default_rng(5)
     moved = Similarity(2.5, random_rotation(rng, 3), rng.normal(size=3))
@@ -119,8 +98,3 @@ def test_poses_move_as_the_points_of_their_body_do():
 def test_what_cannot_be_aligned_is_said(x, y, words):
     with pytest.raises(InputError, match=words):
         align(x, y)
-
-
-def test_an_unknown_alignment_is_refused():
-    with pytest.raises(InputError, match="'sim3'"):
-        fit("sim3", np.zeros((3, 3)), np.zeros((3, 3)))  # type: ignore[arg-type]

@@ -6,19 +6,14 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 
-from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
 from rbpf.validation.simulation import lab as lab_plan
 from rbpf.validation.simulation.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, world_from_camera
-from rbpf.validation.simulation.paths import Drive, Move, WheelOdometer, along_corners
+from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners
 from rbpf.validation.simulation.textured_scene import stamps_ns
 
 CORNERS = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (1.0, 5.0)]
-
-
-def driven(moves: list[Move], seconds: float = 40.0, start: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Drive:
-    return Drive(np.array(start), moves, seconds, arm_m=0.5, ramp_s=1.0)
 
 
 def test_a_polyline_is_followed_but_for_its_corners() -> None:
@@ -48,31 +43,6 @@ def test_it_goes_where_it_faces(drive: Drive) -> None:
         gone = cumulative_trapezoid(part, path.way_m, initial=0.0)
         np.testing.assert_allclose(path.world_from_robot[:, axis] - path.world_from_robot[0, axis], gone, atol=1e-6)
     assert (np.diff(path.way_m) >= -1e-12).all()
-
-
-def test_a_turn_on_the_spot_and_a_rest_leave_the_place() -> None:
-    drive = driven([Move(1.0), Move(turn_rad=2.0), Move(turn_rad=-2.0, rest_s=5.0), Move(1.0)], seconds=30.0)
-    path = drive(np.linspace(0.0, 30.0, 3001))
-    turned = np.abs(path.heading_rad) > 1e-9
-    np.testing.assert_allclose(path.world_from_robot[turned, 1:], [[1.0, 0.0]] * turned.sum(), atol=1e-12)
-    away = path.heading_rad > 2.0 - 1e-9
-    assert 5.0 <= 0.01 * away.sum() < 5.5
-    np.testing.assert_allclose(path.world_from_robot[-1], [0.0, 2.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(path.world_from_robot[0], 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("corners", "bend_m"), [(CORNERS, 1.6), ([(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)], 0.1)], ids=["near", "back"]
-)
-def test_impossible_ways_are_refused(corners: list[tuple[float, float]], bend_m: float) -> None:
-    with pytest.raises(InputError, match="too near"):
-        along_corners(corners, bend_m)
-
-
-@pytest.mark.parametrize("seconds", [0.5, 1.9, 6.0])
-def test_too_little_time_is_refused(seconds: float) -> None:
-    with pytest.raises(InputError, match="more time"):
-        driven([Move(1.0), Move(turn_rad=0.1), Move(1.0, rest_s=1.0)], seconds)
 
 
 EXACT = WheelOdometer(scale=0.0, inequality=0.0, wheelbase_error=0.0, slip_m=0.0)

@@ -3,21 +3,16 @@
 import re
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 
-from examples.studies.joint_ekf import joint_ekf
 from rbpf.errors import InputError
-from rbpf.lie import SE2, SE3
+from rbpf.lie import SE2
 from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
-from rbpf.validation.gtsam.robot import CHUNK, Problem, solve, solve_online
-from rbpf.validation.gtsam.solvers import PLANAR, SPATIAL
-from tests.validation.factors import check_derivatives
+from rbpf.validation.gtsam.robot import CHUNK, solve, solve_online
 from tests.validation.numeric import assert_same_covariances
 from tests.validation.worlds import seen, solve_by_scipy, world
 
-CHARTS = [(SE2, PLANAR), (SE3, SPATIAL)]
 WORLDS = [
     (2, "range_bearing", False),
     (2, "position", False),
@@ -25,28 +20,6 @@ WORLDS = [
     (3, "range_bearing", False),
     (3, "position", True),
 ]
-
-
-@pytest.mark.parametrize(("space", "chart"), CHARTS)
-def test_gtsam_retracts_by_the_exponential_map_in_another_order(space, chart):
-    rng = np.random.default_rng(1)
-    for scale in (1e-9, 0.1, 1.0):
-        x, xi = space.exp(rng.normal(size=space.dim)), scale * rng.normal(size=space.dim)
-        moved = chart.pose(x).retract(xi[chart.order])
-        values = gtsam.Values()
-        values.insert(0, moved)
-        assert np.abs(space.local(space.retract(x, xi), chart.storage(values, 0))).max() < 1e-14
-        np.testing.assert_allclose(chart.pose(x).localCoordinates(moved), xi[chart.order], atol=1e-14)
-
-
-@pytest.mark.parametrize("soft", [False, True])
-@pytest.mark.parametrize(("dim", "kind", "singular"), WORLDS)
-def test_derivatives_of_every_factor_are_those_of_its_residual(dim, kind, singular, soft):
-    m = world(dim, kind, singular)
-    problem = Problem(m)
-    graph, values = problem.graph(soft), problem.values(initial_estimate(m))
-    for i in range(graph.size()):
-        check_derivatives(graph.at(i), values, rtol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [1.0, 1e-3])
@@ -72,20 +45,6 @@ def test_the_start_is_known_and_a_robot_that_cannot_slip_does_not():
     slip = np.linalg.eigh(m.covs[0])[1][:, 0]
     slipped = m.space.local(predicted, found.world_from_robot[1:]) @ slip
     assert np.abs(slipped).max() < 1e-9
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_the_joint_ekf_ends_where_the_batch_does_if_the_noise_is_small(dim):
-    m = world(dim, "position", noise=0.003)
-    found, filtered = solve(m), joint_ekf(m)
-    error = m.space.local(found.world_from_robot[-1], filtered.world_from_robot[-1])
-    assert error @ np.linalg.solve(found.cov_poses[-1], error) < 1e-4
-    scale = np.sqrt(np.diag(found.cov_poses[-1]))
-    correlated = (filtered.cov_poses[-1] - found.cov_poses[-1]) / scale / scale[:, None]
-    assert np.abs(correlated).max() < 1e-2
-    for name, point in found.landmarks.items():
-        np.testing.assert_allclose(filtered.landmarks[name], point, atol=1e-2 * scale[-1])
-    assert filtered.log_evidence == pytest.approx(solve_by_scipy(m).log_evidence, abs=0.05)
 
 
 @pytest.mark.slow

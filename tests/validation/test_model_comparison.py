@@ -56,14 +56,6 @@ def test_named_landmarks_and_gaussian_noise_are_compared_in_batch(tmp_path):
     assert abs(found.difference - sharp.difference) < 4.0 * found.error + 1.0
 
 
-def test_two_ways_of_computing_the_same_model_are_equal_within_the_error():
-    log = simulated_log(RobotWorld(steps=10), 1)
-    once = replace(CONFIG, proposal=ProposalConfig(iterations=1))
-    found = compare_evidence(CONFIG, once, log, range(8))
-    assert abs(found.difference) < 4.0 * found.error
-    assert 0.0 < found.error < 2.0
-
-
 def test_a_likelihood_that_is_no_density_is_refused_with_the_reason():
     log = simulated_log(RobotWorld(steps=12), 0)
     truncated = replace(CONFIG, likelihood=LikelihoodConfig(kind="truncated"))

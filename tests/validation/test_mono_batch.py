@@ -78,14 +78,6 @@ def test_frames_that_share_nothing_with_the_known_points_or_the_first_frame_are_
         assert connected_frames(one).tolist() == list(range(20))
 
 
-def test_a_landmark_of_one_frame_connects_nothing(log):
-    single = {t: renamed(log.frames[t], 1000 * (t + 1)) for t in range(FRAMES)}
-    lonely = replace(changed(log, single), known=None)
-    assert connected_frames(lonely).size == 0
-    with pytest.raises(InputError, match="no two frames share the 4 landmarks"):
-        adjusted(lonely, rough(log))
-
-
 def test_it_tells_how_far_it_is_and_gives_up_after_so_much_work(log):
     told = []
     adjusted(log, rough(log), on_iteration=lambda count, error: told.append((count, error)))

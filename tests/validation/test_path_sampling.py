@@ -13,7 +13,7 @@ from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.gtsam import path_sampling
 from rbpf.validation.gtsam.path_sampling import draw_posterior
-from rbpf.validation.gtsam.robot import Sensor, solve
+from rbpf.validation.gtsam.robot import solve
 from tests.validation.linear_worlds import linear_log
 from tests.validation.worlds import seen, world
 
@@ -111,25 +111,3 @@ def test_whichever_way_a_pose_is_drawn_the_evidence_is_that_of_draws_from_the_pr
     found = drawn(m, 10_000)
     assert np.hypot(found.error, error) < 0.03
     assert found.log_evidence == pytest.approx(np.log(ratio.mean()), abs=4 * np.hypot(found.error, error))
-
-
-@pytest.mark.parametrize(
-    ("dim", "kind"), [(2, "range_bearing"), (2, "position"), (3, "range_bearing"), (3, "position")]
-)
-def test_the_batchs_own_sensor_measures_what_the_filters_does(dim, kind):
-    m, rng = world(dim, kind), np.random.default_rng(2)
-    model, sensor = m.model(), Sensor(m)
-    pose, point = m.space.exp(rng.normal(size=(50, m.space.dim))), 3.0 * rng.normal(size=(50, dim))
-    z = model.predict(pose, point) + rng.normal(size=(50, dim))
-    np.testing.assert_allclose(
-        sensor.residual(pose, point, z), -model.residual(z, model.predict(pose, point)), atol=1e-12
-    )
-    for found, expected in zip(sensor.slopes(pose, point), model.jacobians(pose, point)[:2], strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_without_sightings_the_evidence_is_one():
-    m = world(2, "position")
-    found = drawn(seen(m, m.steps[:0], m.landmarks[:0], m.z[:0], m.cov_z[:0]), 200)
-    assert found.landmarks.shape == (200, 0, 2)
-    assert found.log_evidence == pytest.approx(0.0, abs=4 * found.error)

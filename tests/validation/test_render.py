@@ -70,21 +70,6 @@ def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
             assert np.abs(shift).max() < 0.05
 
 
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
-def test_depth_is_that_of_the_plane(camera: Pinhole) -> None:
-    sides = np.array([[40.0, 0.0, 9.0], [0.0, 40.0, -8.0]])
-    tilted = Rectangle(np.array([-20.0, -20.0, 6.0]), sides[0], sides[1], noise(64))
-    pose = SE3.exp([0.1, -0.2, 0.3, 0.2, 0.1, -0.4])
-    depth, rows = Renderer([tilted], camera).depth(pose)
-    px = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1)
-    ray = np.concatenate([camera.unproject(px), np.ones((120, 160, 1))], axis=-1)
-    normal = np.cross(tilted.across, tilted.down)
-    turned = ray @ SE3.matrix(pose)[:3, :3].T
-    expected = normal @ (tilted.corner - pose[4:]) / (turned @ normal)
-    assert (rows == 0).all()
-    np.testing.assert_allclose(depth, expected, rtol=1e-12)
-
-
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED, FISHEYE])
 @pytest.mark.parametrize("size", [0.1, 1.0])
 def test_the_nearest_of_many_rectangles_is_seen(camera: Pinhole, size: float) -> None:

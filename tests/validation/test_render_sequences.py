@@ -86,8 +86,7 @@ def test_two_cameras_that_distort_are_read_as_a_rectified_pair(lens: Pinhole, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("world", [DESK, ROOM])
+@pytest.mark.parametrize(("world", "exact"), [(DESK, True), (ROOM, False)])
 def test_known_points_are_corners_seen_in_the_first_image(world: ImageWorld, exact: bool, tmp_path: Path) -> None:
     imaging = Imaging(known=8, known_std_m=0.02, known_exact=exact, noise_std=1.0, depth=True)
     simulate_images(world, imaging, BENT, tmp_path / "run", 1)

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.studies.point_worlds import LabWorld, Measuring, simulate_features
-from rbpf.lie import SE2, SE3
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.lie import SE2
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -51,23 +50,6 @@ def test_the_renderer_sees_what_single_rays_see() -> None:
         np.testing.assert_allclose(depth[row, column], expected, rtol=1e-12)
         # Where two boxes touch, two faces are at the same place.
         assert (seen[row, column] == rows).mean() > 0.99 and np.isfinite(expected).all()
-
-
-def test_the_twin_in_points_is_seen_as_the_images_are() -> None:
-    """A point measured in the world of points is what a ray hits in that of images; posters hang 1 cm before walls."""
-    scene, stereo = drawn(), RectifiedStereo(CAMERA, 0.12)
-    world = LabWorld(LabDrive(every=400), points=4000)
-    measuring = Measuring(noise_px=1e-6, measurements=150, new_per_frame=150, known=0, dropout=0.0)
-    log = simulate_features(world, measuring, stereo, 0)
-    assert log.truth is not None
-    np.testing.assert_array_equal(log.truth.world_from_camera, scene.world_from_camera)
-    for frame, pose in zip(log.frames, scene.world_from_camera, strict=True):
-        points = np.array([log.truth.landmarks[name] for name in frame.landmarks.tolist()])
-        local = SE3.inverse_transform(pose, points)
-        depth, _ = cast(scene.rectangles, pose, CAMERA.unproject(frame.z[:, :2]))
-        assert (np.abs(depth - local[:, 2]) < 0.03).mean() > 0.97
-        np.testing.assert_allclose(stereo.project(local), frame.z, atol=1e-4)
-        assert len(points) > 15
 
 
 def test_the_folder_holds_what_the_wheels_say(tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evo.core import sync
-from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -65,22 +63,6 @@ def test_pairs_are_close_in_order_and_one_to_one(first, second, limit_ms):
     assert (paired <= limit_ms * MS).all()
     np.testing.assert_array_equal(paired, gaps[rows(left)].min(1))
     assert paired.min() == gaps.min()
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_pairs_are_those_of_evo_where_none_is_contested(seed):
-    rng = np.random.default_rng(seed)
-    reference = at_times(np.cumsum(rng.uniform(9.0, 11.0, size=400)).tolist())
-    estimate = at_times(np.cumsum(rng.uniform(30.0, 60.0, size=90)).tolist())
-    left, right = associate(estimate, reference, 4 * MS)
-    evo_right, evo_left = sync.associate_trajectories(in_evo(reference), in_evo(estimate), max_diff=0.004)
-    assert rows(left) == evo_left.positions_xyz[:, 0].astype(int).tolist()
-    assert rows(right) == evo_right.positions_xyz[:, 0].astype(int).tolist()
-
-
-def in_evo(trajectory: Trajectory) -> PoseTrajectory3D:
-    quat_wxyz = trajectory.world_from_body[:, [3, 0, 1, 2]]
-    return PoseTrajectory3D(trajectory.positions, quat_wxyz, trajectory.stamps_ns * 1e-9)
 
 
 @pytest.mark.parametrize(

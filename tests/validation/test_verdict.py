@@ -14,7 +14,7 @@ from rbpf.runs.results import Results
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
 from rbpf.validation.consistency.comparison import INNOVATIONS, compare_with_itself, innovation_statistics, noise_advice
 from rbpf.validation.consistency.statistic import coverage, step_ratio, variance_ratio, whitened_errors
-from rbpf.validation.consistency.verdict import PathGrade, Verdict, grade_path, judge
+from rbpf.validation.consistency.verdict import Verdict, grade_path, judge
 from rbpf.validation.report.page import verdict_of
 from tests.validation.fixes import Receiver, Walk
 
@@ -106,21 +106,6 @@ def test_the_path_has_a_light_of_its_own():
     assert (verdict.path.grade, verdict.leaning) == ("good", "over-confident")
     assert [grade_path("", e, 1.0).grade for e in (0.03, 0.05, 0.2)] == ["good", "fair", "poor"]
     assert grade_path("", None, None).grade == "not known"
-
-
-def test_frames_that_were_lost_are_told_and_count():
-    assert grade_path("", 0.01, 1.0, 10, 100).grade == "fair"
-    for error in (0.01, None):
-        lost = grade_path("It is near.", error, error and 1.0, 7, 11)
-        assert lost.grade == "poor" and "7 of 11 frames were lost" in lost.sentence
-
-
-def test_a_run_of_few_independent_samples_cannot_be_told():
-    statistic = variance_ratio("poses", 1.0, 2.0, 2.0)
-    verdict = judge([statistic], ["poses"], PathGrade("good", "It is near."))
-    assert verdict.trust == "cannot tell"
-    assert verdict.sentences[0] == "It is near."
-    assert "2 independent samples" in verdict.sentences[1]
 
 
 def record(system: str, **config: object) -> Results:
