@@ -8,12 +8,12 @@ import pytest
 from rbpf.cli import main
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers import open_images, open_stereo
+from rbpf.sensors.readers import open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.cli import stereo_sequences
-from tests.cli.mono_sequences import FRAMES, run, sentence, summary
+from tests.cli.mono_sequences import FRAMES, run, summary
 
 pytestmark = pytest.mark.slow
 
@@ -68,13 +68,3 @@ def test_two_cameras_are_rectified_and_as_near_to_the_truth(tmp_path):
     assert rig == RectifiedStereo(Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5), 0.12)
     assert stereo_sequences.run(tmp_path / "room", tmp_path / "run", "--no-video", "--no-batch") == 0
     assert summary(tmp_path / "run")["ate_rmse_m"] < 0.01
-
-
-def test_a_desk_is_rendered_through_such_a_lens(tmp_path, capsys):
-    small = ["--frames", "2", "--width", "80", "--height", "60", "--focal-px", "33", "--known", "0"]
-    asked = ["simulate", "desk", "--out", str(tmp_path / "desk"), *small, "--fisheye", "0.1", "0", "0", "0"]
-    assert main(asked) == 0
-    camera = Pinhole(80, 60, 33.0, 33.0, 39.5, 29.5, (0.1, 0.0, 0.0, 0.0), "equidistant")
-    assert open_images(tmp_path / "desk").camera == camera
-    assert main([*asked, "--distortion", "0.1", "0", "0", "0", "0"]) == 2
-    assert "either --distortion or --fisheye: leave out one of them" in sentence(capsys)

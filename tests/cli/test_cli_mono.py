@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from rbpf.cli import main
-from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.recordings import filter_features as filter_log
@@ -17,7 +16,6 @@ from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.readers import open_images
 from rbpf.systems.mono.config import MonoConfig
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
-from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow
 
@@ -124,25 +122,6 @@ def test_the_video_has_every_frame(finished):
     assert frames[0].shape[1] == 2 * CAMERA.width
     green = (frames[8][..., 1].astype(int) - frames[8][..., 2] > 60).sum()
     assert green > 200
-
-
-def test_a_resumed_run_is_identical(desk, finished, tmp_path, monkeypatch):
-    step = Filter.step
-
-    def interrupted(self, *args, **kwargs):
-        if self.steps == 11:
-            raise KeyboardInterrupt
-        return step(self, *args, **kwargs)
-
-    often = ("--video", "--set", "checkpoint_every=5")
-    monkeypatch.setattr(Filter, "step", interrupted)
-    assert run(desk, tmp_path, *often) == 130
-    monkeypatch.setattr(Filter, "step", step)
-    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint.npz"}
-    assert run(desk, tmp_path, *often, "--resume") == 0
-    again, whole = outputs(tmp_path), outputs(finished)
-    again.pop("config.yaml"), whole.pop("config.yaml")
-    assert again == whole
 
 
 def test_a_checkpoint_of_another_run_is_refused(desk, folder, tmp_path, capsys):

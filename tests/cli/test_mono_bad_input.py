@@ -23,29 +23,6 @@ def image_path(folder, number):
     return folder / "images" / f"{number:06d}.png"
 
 
-@pytest.mark.parametrize("spoil", ["missing", "cut", "other size"])
-def test_one_bad_image_is_noted_and_survived(folder, tmp_path, spoil):
-    path = image_path(folder, 8)
-    if spoil == "missing":
-        (folder / "rgb.txt").write_text("".join(f"{k / 30:.6f} images/{k:06d}.png\n" for k in range(FRAMES)))
-        path.unlink()
-    elif spoil == "cut":
-        path.write_bytes(path.read_bytes()[:200])
-    else:
-        cv2.imwrite(str(path), np.zeros((90, 120), dtype=np.uint8))
-    entries = survived(folder, tmp_path / "run")
-    assert any("frame 8" in note and path.name in note for note in entries["problems"])
-    assert entries["frames_tracked"] == FRAMES
-
-
-@pytest.mark.parametrize("frozen", [False, True])
-def test_darkness_and_a_frozen_camera_are_survived(folder, tmp_path, frozen):
-    still = cv2.imread(str(image_path(folder, 4)), cv2.IMREAD_GRAYSCALE)
-    for number in range(5, 13):
-        cv2.imwrite(str(image_path(folder, number)), still if frozen else np.zeros_like(still))
-    assert survived(folder, tmp_path / "run")["problems"]
-
-
 def test_darkness_from_the_start_is_said_and_no_frame_of_it_counts_as_tracked(folder, tmp_path):
     for number in range(FRAMES):
         if number < 9:
@@ -70,13 +47,6 @@ def test_a_video_that_ends_in_mid_frame_keeps_what_it_showed(desk, tmp_path):
     entries = summary(tmp_path / "run")
     assert 5 <= entries["frames"] < FRAMES
     assert any("the video ends after" in note for note in entries["problems"])
-
-
-def test_equal_stamps_are_survived(folder, tmp_path):
-    times = (folder / "times.txt").read_text().splitlines()
-    times[5] = times[4]
-    (folder / "times.txt").write_text("\n".join(times) + "\n")
-    assert survived(folder, tmp_path / "run")["frames_tracked"] == FRAMES
 
 
 def test_backward_stamps_name_the_line(folder, tmp_path, capsys):

@@ -6,13 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.core.filter import Filter
-from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Residual
 from rbpf.errors import InputError
-from tests.core.worlds import STEP_NS, Recipe, World, content, drive, planar_world, same
-from tests.exactness.models import Frame, LinearMotion, LinearObservation, Scripted, single
+from tests.core.worlds import Recipe, World, content, drive, planar_world, same
 
 STEPS = 30
 RECIPES = {
@@ -74,34 +71,6 @@ def test_every_random_generator(generator, tmp_path):
     resumed.rng = np.random.Generator(generator(4))
     resumed.load(tmp_path / "run.npz")
     np.testing.assert_array_equal(resumed.rng.random(20), filter_.rng.random(20))
-
-
-def test_with_a_substate(tmp_path):
-    """A position driven by a velocity that is marginalised, and measurements of both."""
-    one = np.eye(1)
-    motion, model = (
-        LinearMotion(one, np.diag([0.1, 0.05]), 0.1 * one, one, np.zeros(1)),
-        LinearObservation([[1.0], [0.0]], [[0.0], [1.0]]),
-    )
-    z = np.stack([np.linspace(0, 3, 25), np.ones(25)], axis=-1) + 0.2 * np.random.default_rng(5).normal(size=(25, 2))
-
-    def driven(seed: int) -> Filter:
-        substate = KalmanSubstate(motion.space, np.zeros(1), one)
-        return Filter(motion, Scripted(), substate, n=20, rng=np.random.default_rng(seed))
-
-    def step(filter_: Filter, t: int) -> None:
-        filter_.step(Frame([single(z[t], 0.04 * np.eye(2), model)]), None, t * STEP_NS)
-
-    uninterrupted = driven(1)
-    for t in range(25):
-        step(uninterrupted, t)
-        uninterrupted.save(tmp_path / f"{t}.npz")
-    for t in (0, 9, 20):
-        resumed = driven(2)
-        resumed.load(tmp_path / f"{t}.npz")
-        for late in range(t + 1, 25):
-            step(resumed, late)
-        assert same(content(resumed), content(uninterrupted))
 
 
 def test_arrays_of_the_caller_come_back(world, tmp_path):

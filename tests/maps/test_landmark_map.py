@@ -107,22 +107,6 @@ def test_log_odds_follow_their_particle_outlast_promotion_and_end_what_nobody_ho
     assert landmark_map.ids.tolist() == [1, 2]
 
 
-def test_ring_covers_the_circle():
-    """Each component has σ_r along the radius and half a step across it; neighbours meet at one sigma."""
-    mixture = ring(np.array([[1.0, 2.0]]), np.array([3.0, 5.0]), 0.2, 16)
-    assert mixture.mean.shape == (1, 2, 16, 2)
-    offset = mixture.mean[0] - np.array([1.0, 2.0])
-    np.testing.assert_allclose(np.linalg.norm(offset, axis=-1), [[3.0] * 16, [5.0] * 16])
-    np.testing.assert_allclose(np.exp(np.asarray(mixture.log_weights)).sum(axis=-1), 1.0)
-    for k, radius in enumerate((3.0, 5.0)):
-        along = offset[k] / radius
-        variance = np.einsum("ca,cab,cb->c", along, mixture.cov[0, k], along)
-        np.testing.assert_allclose(variance, 0.04)
-        chord = np.linalg.norm(offset[k, 1] - offset[k, 0])
-        values = np.linalg.eigvalsh(mixture.cov[0, k])
-        np.testing.assert_allclose(values[:, 1], (0.5 * chord) ** 2)
-
-
 def sighting(landmark_id: int) -> list[Observations]:
     z, cov = np.array([[5.0, 0.1]]), 0.01 * np.eye(2)[None]
     return [Observations(z, cov, RangeBearing(SE2), ids=np.array([landmark_id]))]

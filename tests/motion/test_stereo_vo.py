@@ -10,18 +10,8 @@ from scipy.stats import chi2
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.least_squares import Rule
-from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.motion.stereo_vo import (
-    MotionEstimate,
-    MotionPrior,
-    VisualOdometry,
-    VoConfig,
-    estimate_motion,
-    fit,
-    pixel_gains,
-    trimming,
-)
+from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit, trimming
 from rbpf.sensors.camera import RectifiedStereo
 from tests.motion.stereo_pairs import (
     CAR,
@@ -240,19 +230,6 @@ def test_nees(world, count, noise_px):
     assert 5.67 < mean_nees(errors, covs) < 6.35
     planar = [1, 3, 5]
     assert 2.77 < mean_nees(errors[:, planar], covs[:, planar][:, :, planar]) < 3.25
-
-
-@pytest.mark.parametrize("world", [ROAD, ROOM, FAR_ROAD], ids=["road", "room", "far"])
-@pytest.mark.parametrize("points", ["adjusted", "propagated", "exact"])
-def test_the_noise_of_the_pixels_is_the_covariance(world, points):
-    """The gains hand each pixel's noise on to the estimate."""
-    matches, config = simulate(world, 60, np.random.default_rng(0)).matches, VoConfig(points, gate=100.0)
-    found = estimated(matches, config=config)
-    motion = Odometry(found.previous_camera_from_camera, found.cov)
-    earlier, later = pixel_gains(matches, motion, config)
-    noise = later @ matches.cov_now @ later.mT + earlier @ matches.cov_prev @ earlier.mT
-    std = np.sqrt(np.diagonal(found.cov))
-    np.testing.assert_allclose(noise.sum(axis=0) / np.outer(std, std), found.cov / np.outer(std, std), atol=0.01)
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_ma
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.comparison import read_comparisons
-from rbpf.validation.report.page import write_report
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
 from tests.properties.mutations import damaged, read_or_refused, restored
@@ -99,15 +98,6 @@ def test_run_folders(run, data):
 def read_all(run: Path) -> None:
     record = load(run)
     record.path, record.truth, record.map.points(), record.table("diagnostics.csv")
-
-
-@settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
-@given(data=st.data())
-def test_the_report_of_a_damaged_run(run, data):
-    path = run / data.draw(st.sampled_from(READ))
-    with restored(path) as whole:
-        path.write_bytes(data.draw(damaged(whole)))
-        read_or_refused(lambda: write_report(run))
 
 
 @FEW

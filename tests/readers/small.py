@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.lie import SE3
-
 QUARTER = np.pi / 2
 
 MRCLAM = {
@@ -67,19 +65,6 @@ CARMEN = {
     "SYNC something else\nFLASER 5 1 2 3 4 5 1.5 0 0 1 0 0 10.4 robot 0.4\n"
 }
 
-SECOND = SE3.exp(np.array([0.1, -0.2, 0.05, 1.0, 2.0, 3.0]))
-
-
-def _matrix(step: int, matrix: np.ndarray) -> str:
-    return " ".join([str(step), *(f"{entry:.6g}" for entry in matrix.ravel())]) + "\n"
-
-
-TRACKS = {
-    "VO_calibration.txt": "700.0 710.0 0.0 600.0 180.0 0.5\n",
-    "VO_camera_poses.txt": _matrix(0, np.eye(4)) + _matrix(1, SE3.matrix(SECOND)),
-    "VO_stereo_factors.txt": "0 7 620.0 600.0 200.0 0.5 0.5 17.5\n0 3 500.0 450.0 100.0 -1.0 -0.8 7.0\n"
-    "1 7 630.0 605.0 210.0 0.6 0.6 14.0\n",
-}
 WHEELS = {
     "odometry.csv": "#stamp_ns,dx_m,dy_m,dyaw_rad,sigma_x_m,sigma_y_m,sigma_yaw_rad\n100,0,0,0,0,0,0\n"
     f"200,1.0,0.0,{QUARTER!r},0.1,0.2,0.3\n300,2,0.5,0,0.1,0.2,0.3\n",

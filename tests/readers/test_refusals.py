@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.sensors.readers import open_images, open_log, read_known_points
 from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from tests.readers.small import CARMEN, GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, TRACKS, WHEELS, write
+from tests.readers.small import CARMEN, GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, WHEELS, write
 
 FORMATS = {
     "MRCLAM": (MRCLAM, open_log),
@@ -19,7 +18,6 @@ FORMATS = {
     "space": (MRPT_IN_SPACE, open_log),
     "graph": (GRAPH, lambda folder: open_log(folder / "graph.txt")),
     "CARMEN": (CARMEN, lambda folder: read_laser_log(folder / "robot.clf")),
-    "tracks": (TRACKS, read_stereo_tracks),
     "wheels": (WHEELS, read_wheel_odometry),
     "known": (KNOWN, lambda folder: read_known_points(folder / "known_points.csv")),
 }
@@ -70,13 +68,6 @@ CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 nan 0 10.1 | expected odomet
 CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 5e9 | expected the time in seconds, within 4e+09 of zero
 CARMEN | robot.clf | 7 | FLASER 4 1 2 3 4 0 0 0 0 0 0 10.5 | expected 5 readings as in line 4, found 4 readings
 CARMEN | robot.clf | 7 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 9.2 | the time runs backwards by 1.100 s, expected scans in order
-tracks | VO_calibration.txt | 1 | 700 710 0.1 600 180 0.5 | expected no skew
-tracks | VO_calibration.txt | 1 | 700 710 0 600 180 -0.5 | the stereo baseline must be positive
-tracks | VO_camera_poses.txt | 1 | 1 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1 | expected frame to be the line's number
-tracks | VO_camera_poses.txt | 1 | 0 1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1 | expected a rotation
-tracks | VO_stereo_factors.txt | 1 | 2 7 620 600 200 0.5 0.5 17.5 | expected frame to be that of a pose
-tracks | VO_stereo_factors.txt | 2 | 0 7 620 600 200 0.5 0.5 17.5 | landmark 7 comes a second time in frame 0
-tracks | VO_stereo_factors.txt | 1 | 0 7 600 620 200 1 1 1 | expected u_left to be greater
 wheels | odometry.csv | 4 | 150,0,0,0,0,0,0 | time runs backwards
 wheels | odometry.csv | 4 | 200,0,0,0,0,0,0 | expected a later time
 wheels | odometry.csv | 2 | 100,1,0,0,0,0,0 | expected no motion on the first line
@@ -102,8 +93,6 @@ FILES = [
     ("CARMEN", {"robot.clf": "ODOM 0 0 0 0 0 0 1\n"}, "robot.clf: expected a CARMEN log (a text file with lines FLASER"),
     ("CARMEN", {"robot.clf": gzip.compress(CARMEN["robot.clf"].encode())[:-9]}, "packed by gzip and cut off"),
     ("CARMEN", {"robot.clf": b"\x1f\x8b" + bytes(20)}, "robot.clf: it is packed by gzip and damaged"),
-    ("tracks", {"VO_calibration.txt": 2 * TRACKS["VO_calibration.txt"]}, "VO_calibration.txt, line 2: expected one line"),
-    ("tracks", {"VO_calibration2.txt": "1"}, "found VO_calibration.txt, VO_calibration2.txt"),
     ("wheels", {"odometry.csv": "# only\n"}, "odometry.csv: expected lines that begin with a time"),
     ("known", {"known_points.csv": ""}, "known_points.csv: the file is empty; expected a table with the columns id,"),
     ("known", {"known_points.csv": "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n"}, "expected rows of id, u_px"),
@@ -115,7 +104,6 @@ MISSING = [
     ("MRCLAM", "Robot3_Odometry.dat", "no such file; expected an MRCLAM log"),
     ("MRCLAM", "Robot3_Measurement.dat", "expected an MRCLAM log"),
     *(("MRPT", name, "no such file; expected an MRPT log") for name in list(MRPT)[:3]),
-    ("tracks", "VO_calibration.txt", "expected one file VO_calibration*.txt of stereo tracks, found none"),
     ("CARMEN", "robot.clf", "no such file or folder; expected a ROS bag"),
     ("wheels", "odometry.csv", "no such file; expected the readings of a robot's wheels"),
     ("wheels", "odometry.yaml", "no such file"),

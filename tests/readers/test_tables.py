@@ -5,13 +5,12 @@ import re
 import numpy as np
 import pytest
 
-from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers import read_known_points
 from rbpf.sensors.readers.text import read_columns, read_csv
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from tests.readers.small import KNOWN, SECOND, TRACKS, WHEELS, write
+from tests.readers.small import KNOWN, WHEELS, write
 
 COLUMNS = ("time", "x")
 
@@ -111,24 +110,3 @@ def test_wheel_odometry(tmp_path):
     poses = odometry.world_from_camera(start)
     np.testing.assert_allclose(poses[0], start, atol=1e-12)
     np.testing.assert_allclose(SE3.translation(SE3.between(poses[0], poses[2])), [0.5, 2.0, 0.0], atol=1e-12)
-
-
-def test_stereo_tracks(tmp_path):
-    tracks = read_stereo_tracks(write(tmp_path, TRACKS), std_px=0.5, size=(1000, 400))
-    log, camera = tracks.log, tracks.log.camera
-    one = camera.camera
-    assert (one.width, one.height, one.fx, one.fy, one.cx, one.cy) == (1000, 400, 700.0, 710.0, 600.0, 180.0)
-    assert camera.baseline_m == 0.5
-    assert [frame.stamp_ns for frame in log.frames] == [0, 1]
-    np.testing.assert_array_equal(log.frames[0].landmarks, [7, 3])
-    np.testing.assert_array_equal(log.frames[0].z, [[620.0, 200.0, 600.0], [500.0, 100.0, 450.0]])
-    np.testing.assert_array_equal(log.frames[1].cov_z, [0.25 * np.eye(3)])
-    path = np.stack([SE3.identity(), SECOND])
-    np.testing.assert_allclose(SE3.local(path, tracks.world_from_camera), 0.0, atol=1e-5)
-    assert log.known is None and log.truth is None
-    # A frame that sees nothing is kept.
-    first = "".join(TRACKS["VO_stereo_factors.txt"].splitlines(keepends=True)[:2])
-    log = read_stereo_tracks(write(tmp_path, {"VO_stereo_factors.txt": first})).log
-    assert [len(frame.landmarks) for frame in log.frames] == [2, 0]
-    with pytest.raises(InputError, match="must be positive, got 0 px"):
-        read_stereo_tracks(tmp_path, std_px=0)

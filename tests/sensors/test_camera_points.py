@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model
-from rbpf.core.models import Records
 from rbpf.errors import InputError
-from rbpf.lie import SE3, Euclidean, Product
+from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
-from rbpf.maps.point import Point
 from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays, with_velocity
 
-WITH_VELOCITY = Product(SE3, Euclidean(6))
 every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 
 
@@ -23,17 +20,6 @@ def test_sound_models(camera):
     assert check_model(CameraPoint(camera), SE3) == []
     assert check_model(CameraRay(camera), SE3, example=Example(landmark=InverseDepth())) == []
     assert check_model(EpipolarRay(camera), SE3, example=Example(landmark=InverseDepth())) == []
-
-
-@every_camera
-def test_sound_where_the_state_holds_a_velocity_too(camera):
-    """The kernels leave its columns alone, and a landmark that rushes past is no angle that wraps."""
-    rng = np.random.default_rng(0)
-    state = with_velocity(SE3.exp(rng.normal(scale=0.2, size=(5, 6))))
-    mean = rng.normal(size=(5, 3, 3)) + np.array([0.0, 0.0, 4.0])
-    cov = np.tile(0.01 * np.eye(3), (5, 3, 1, 1))
-    example = Example(state=state, landmark=Point(3), records=Records(mean, cov))
-    assert check_model(CameraPoint(camera), WITH_VELOCITY, example=example) == []
 
 
 @every_camera

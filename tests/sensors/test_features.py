@@ -202,16 +202,3 @@ def test_products_of_keys(length):
     cosine = plain @ plain.T / np.linalg.norm(plain, axis=1)[:, None] / np.linalg.norm(plain, axis=1)
     np.testing.assert_allclose(sift @ sift.T, cosine, atol=1e-6)
     assert not descriptors_from_histograms(np.zeros((1, 128)), length).any()
-
-
-def test_threads_change_nothing():
-    image, before = room()[0][0][0], cv2.getNumThreads()
-    found = []
-    try:
-        for threads in (1, 4):
-            cv2.setNumThreads(threads)
-            found.append(Sift(SiftConfig(features=100)).extract(image))
-    finally:
-        cv2.setNumThreads(before)
-    for name in ("px", "scale", "orientation", "score", "descriptors"):
-        assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()

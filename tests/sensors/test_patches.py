@@ -252,19 +252,6 @@ def test_known_motion_is_recovered(affine):
     assert np.sqrt((error[~wrong] ** 2).mean()) < 0.1
 
 
-@pytest.mark.parametrize(
-    ("noise", "blur_px", "hits", "std_px"), [(3.0, 0.5, 0.98, 0.05), (15.0, 0.5, 0.60, 0.20), (3.0, 1.5, 0.97, 0.09)]
-)
-def test_hit_rate_and_accuracy_under_noise(noise, blur_px, hits, std_px):
-    """Right matches among those looked for, and their errors without bias."""
-    several = [errors(np.eye(2), blur_px, noise, seed) for seed in range(4)]
-    error, tried = np.concatenate([one[0] for one in several]), sum(one[2] for one in several)
-    right = error[np.abs(error).max(axis=1) <= WRONG_PX]
-    assert len(right) >= hits * tried and len(error) - len(right) <= 0.03 * tried
-    assert np.sqrt((right**2).mean()) < std_px
-    assert np.abs(right.mean(axis=0)).max() < 0.3 * std_px + 0.006
-
-
 @pytest.mark.parametrize("noise", [3.0, 8.0])
 def test_covariances_are_those_of_the_errors(noise):
     """Mean normalised squared error of 2 degrees of freedom: from cautious because of the floor to a little bold."""

@@ -48,12 +48,6 @@ def drive(steps):
     return filter_, anchor, anchored
 
 
-def test_before_any_motion_the_start_is_known():
-    _, _, anchored = drive(1)
-    np.testing.assert_array_equal(anchored.mean, np.zeros((50, 3)))
-    np.testing.assert_array_equal(anchored.factor, np.zeros((50, 3, 3)))
-
-
 def test_law_of_the_start_equals_the_joint_gaussian():
     """Against a plain information-form solution: odometry from x_0 to x_1, first frame against the rest of the map."""
     filter_, anchor, _ = drive(4)
@@ -87,30 +81,6 @@ def test_law_of_the_start_equals_the_joint_gaussian():
         np.testing.assert_allclose(anchored.mean[i], x, atol=1e-9)
         factor = anchored.factor[i]
         np.testing.assert_allclose(factor @ factor.T, np.linalg.inv(info), atol=1e-9)
-
-
-def test_landmarks_seen_only_at_the_start_say_nothing_about_it():
-    filter_, anchor = started(5)
-    rng = np.random.default_rng(0)
-    first = frame(rng, SE2.identity(), 0)
-    anchor.after_step(filter_.step(first, None, 0))
-    nothing = Frame(1, None, None, np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    anchored = anchor.after_step(filter_.step(nothing, CONTROL, 10**9), CONTROL)
-    expected = SE2.compose(filter_.particles.state, SE2.inverse(CONTROL.delta))
-    np.testing.assert_allclose(anchored.mean, expected, atol=1e-12)
-
-
-def test_singular_odometry_is_met():
-    rng = np.random.default_rng(3)
-    filter_, anchor = started(8)
-    anchor.after_step(filter_.step(frame(rng, SE2.identity(), 0), None, 0))
-    exact = Odometry(CONTROL.delta, np.diag([0.0, 0.01, 0.0]))
-    for t in (1, 2, 3):
-        pose = SE2.exp(np.zeros(3))
-        report = filter_.step(frame(rng, pose, t), exact, t * 10**9)
-        anchored = anchor.after_step(report, exact)
-    assert np.isfinite(anchored.mean).all()
-    assert np.isfinite(anchored.factor).all()
 
 
 def test_zero_period_is_refused():
@@ -155,14 +125,3 @@ def test_covariance_of_the_frame_is_turned_into_the_poses_chart(space):
     scale = np.sqrt(np.outer(np.diag(found.cov), np.diag(found.cov)))
     assert (np.abs(np.cov(errors.T) - found.cov) / scale).max() < 0.05
     assert (np.abs(factor @ factor.T - found.cov) / scale).max() > 0.1
-
-
-@every_space
-def test_another_name_for_the_frame(space):
-    """The covariance is in the right chart at the pose and stays."""
-    anchored, state, _, log_weights = draw(space, 5, 0.1)
-    origin = space.exp(np.linspace(0.1, 0.6, space.dim))
-    plain = relative_estimate(space, anchored, state, log_weights)
-    named = relative_estimate(space, anchored, state, log_weights, origin)
-    np.testing.assert_allclose(named.mean, space.compose(origin, plain.mean), atol=1e-12)
-    np.testing.assert_allclose(named.cov, plain.cov, atol=1e-12)

@@ -52,15 +52,6 @@ def test_chained_motions_over_persistent_features(independent, low, high):
     assert low < np.mean(nees) < high
 
 
-def test_points_in_one_place_are_chained():
-    """They leave most of the motion open: what the prior says of it is no noise of the pixels."""
-    one = slam(**NEVER)
-    z, cov = np.tile(RIG.project(np.array([0.1, 0.1, 3.0])), (20, 1)), np.tile(0.01 * np.eye(3), (20, 1, 1))
-    told = [one.take(FeatureFrame(t * SECOND, np.arange(20), z, cov)) for t in range(4)]
-    assert all("the matches leave the motion open" in " ".join(one.messages) for one in told[1:])
-    assert np.linalg.eigvalsh(told[-1].cov).min() > 0.0
-
-
 def test_every_draw_comes_from_the_filters_generator(monkeypatch):
     """Also those of the odometry, between updates."""
     one, recorded, states = slam(**NEVER), frames(), []

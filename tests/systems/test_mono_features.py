@@ -15,7 +15,6 @@ from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.runs.recordings import filter_features as run
 from rbpf.runs.run import Run
-from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
@@ -95,32 +94,6 @@ def test_how_rays_are_used():
     assert epipolar[2] == marginal[2] == {(EpipolarRay, state)}
     # Without known points the prior of depth holds the scale: the marginal, where it counts.
     assert groups_of("marginal", without_known(LOG))[1] == {(CameraRay, state)}
-
-
-def still_log(seed: int, frames: int) -> FeatureLog:
-    """A camera at rest sees four known points and 25 others, with 0.3 px of noise."""
-    rng, camera = np.random.default_rng(seed), Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
-    corners = np.array([[-0.4, -0.3, 2.0], [0.4, -0.3, 2.0], [0.4, 0.3, 2.0], [-0.4, 0.3, 2.0]])
-    px = rng.uniform([20.0, 20.0], [620.0, 460.0], (25, 2))
-    z = np.concatenate([camera.project(corners), px])
-    cov = np.tile(0.09 * np.eye(2), (29, 1, 1))
-    seen = [
-        FeatureFrame(int(t * 1e9 / 30), np.arange(29), z + rng.normal(0.0, 0.3, z.shape), cov) for t in range(frames)
-    ]
-    known_points = KnownPoints(np.arange(4), corners, np.tile(1e-6 * np.eye(3), (4, 1, 1)))
-    return FeatureLog("still", camera, seen, known_points)
-
-
-def test_a_camera_at_rest_stays():
-    """RMS error in the particles' own world, after 50 frames of four recordings; lines begin late."""
-    squares, late = [], InverseDepthConfig(epipolar_parallax_px=3.0)
-    for seed in range(4):
-        filter_ = run(
-            still_log(seed, 50), MonoConfig(seed=seed, max_new_per_frame=30, inverse_depth=late)
-        ).system.filter
-        paths = SE3.translation(filter_.history.paths()[..., :7])
-        squares.append(np.square(np.einsum("tnk,n->tk", paths, filter_.particles.weights)[-1]).sum())
-    assert np.sqrt(np.mean(squares)) < 4e-3
 
 
 @every_setting

@@ -110,15 +110,6 @@ def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
     assert np.linalg.norm(SE3.translation(run.log.poses[-1]) - last) < 0.1
 
 
-@slow
-def test_a_frozen_camera_is_noticed(tracked, tmp_path):
-    still = view(texture(), path(FRAMES)[START])
-    run = resumed(tracked, tmp_path, lambda t, image: still if START <= t < START + DARK else image)
-    assert sum("frozen" in problem for problem in run.messages) == 1
-    assert run.log.lost()[START + DARK - 1]
-    assert not run.log.lost()[-20:].any()
-
-
 def test_a_pose_is_found_in_each_particles_own_world():
     """Two worlds that differ by a known motion: the same camera among the same landmarks in both, and as uncertain."""
     n, rng, other = 2, np.random.default_rng(0), SE3.exp(np.array([0.2, -0.3, 0.1, 0.5, -0.2, 0.3]))

@@ -10,7 +10,7 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.landmarks import ParticleSubsample, View, log_support
+from rbpf.systems.stereo.landmarks import View, log_support
 from rbpf.systems.stereo.slam import StereoSlam
 from tests.systems.stereo_sequences import pairs
 
@@ -73,19 +73,6 @@ def test_else_few_are_enough(slam):
     """The gate tells true from false."""
     report = slam.filter.step(view(few(slam)), Odometry(SE3.identity(), 1e-6 * np.eye(6)))
     assert sum((group.ids >= 0).sum() for group in report.groups) >= 3
-
-
-def test_the_subsample_speaks_for_all(slam):
-    """Its expectations against those of the belief, of all particles."""
-    belief, model = slam.filter.belief(), slam.front_end.landmarks.model
-    ids = belief.map.ids[:12]
-    subsample = ParticleSubsample.of(belief, 60)
-    found = subsample.expected(belief, model, ids)
-    mean, cov = belief.project(model, ids)
-    np.testing.assert_allclose(found.mean, mean, atol=0.05)
-    ratio = np.diagonal(found.cov, axis1=1, axis2=2) / np.diagonal(cov, axis1=1, axis2=2)
-    assert ratio.min() > 0.5 and ratio.max() < 2.0
-    assert subsample.rows[-1] == belief.mode and subsample.rows.size == 61
 
 
 def test_how_well_landmarks_are_seen():

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.studies.point_worlds import MONO, STEREO, LabWorld, Measuring, simulate_features
+from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_features, filter_opened, open_features
+from rbpf.runs.recordings import filter_opened, open_features
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
@@ -83,25 +83,6 @@ def test_the_prior_proposal(log, kind):
     assert np.isfinite(run.log["log_evidence"]).all() == (kind == "outliers")
 
 
-def test_without_times(log):
-    """Stamps that count frames are seconds to the odometry, and stay what they are."""
-    frames = [replace(frame, stamp_ns=t) for t, frame in enumerate(log.frames[:20])]
-    run = filtered(FeatureLog("steps", log.camera, frames))
-    np.testing.assert_array_equal(run.log.stamps_ns, np.arange(len(frames)))
-    assert run.messages == []
-    assert np.linalg.norm(SE3.translation(run.log.poses[-1])) > 0.3
-
-
-def test_halves_of_the_landmarks(log):
-    """The map holds odd names alone, or even ones, and the odometry always the even ones."""
-    for split, remainder in (("apart", 1), ("same", 0)):
-        run = filtered(log, replace(CONFIG, odometry=OdometryConfig(split=split)))
-        names = run.system.map().ids
-        assert names.size > 50 and (names % 2 == remainder).all()
-    seen = np.intersect1d(log.frames[0].landmarks, log.frames[1].landmarks)
-    assert run.log["agreeing"][1] <= (seen % 2 == 0).sum()
-
-
 def test_nees_of_the_pose(log):
     """Per degree of freedom, 12 recordings of 20 pairs: where each pixel counts once it is 1, in S05 1.4 and more.
 
@@ -171,8 +152,3 @@ def test_found_again_by_names(log):
         assert any("found again by" in message for message in run.messages) == used
         assert run.log["assumed"][20:23].all() and not run.log["assumed"][24:].any()
     assert errors[0] < 0.5 * errors[1]
-
-
-def test_one_camera_is_refused():
-    with pytest.raises(InputError, match="stereo SLAM needs a log of a rectified pair"):
-        filter_features(simulated(4, camera=MONO), CONFIG)

@@ -146,14 +146,6 @@ def test_a_frame_without_an_image_is_not_what_is_resampled_after(resampled):
     assert resampled[0] == 7 and done.failure is None
 
 
-def test_what_the_new_map_has_not_is_not_looked_for(resampled):
-    """Features that were started in frames that took no part."""
-    done = filter_images(sequence(40), replace(SMALL, start=StartConfig(max_frames=5, depth_std_ratio=1e-6)))
-    table = done.system.sensor.table
-    held = set(done.system.filter.belief().map.ids.tolist())
-    assert resampled and set(np.flatnonzero(table.alive).tolist()) <= held
-
-
 @pytest.mark.slow
 def test_where_the_lens_has_no_direction_the_start_does_not_stop(resampled):
     folded = replace(known(LOG.camera), distortion=(-0.25, 0.0, 0.0, 0.0, 0.0))
@@ -272,11 +264,3 @@ def test_paths_are_drawn_with_the_covariance_of_the_optimum():
     np.testing.assert_allclose(np.corrcoef(drawn.T), (cov[last, last] / std / std[:, None]), atol=0.06)
     features = cov.shape[0] - 3 * FEATURES + 2 + 3 * np.arange(FEATURES)
     np.testing.assert_allclose(best.std_inverse(), np.sqrt(np.diag(cov)[features]), rtol=1e-6)
-
-
-def test_a_wrong_match_moves_little():
-    window, truth = scene()
-    right = optimum(window, EXPECTED, truth).structure.path[-1, 4:]
-    window.px[5] += [40.0, -25.0]
-    wrong = optimum(window, EXPECTED, truth).structure.path[-1, 4:]
-    assert np.linalg.norm(wrong - right) < 0.01

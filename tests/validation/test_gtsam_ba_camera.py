@@ -8,14 +8,11 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.motion.least_squares import Rule
-from rbpf.motion.stereo_vo import VoConfig, fit
 from rbpf.sensors.feature_log import KnownPoints
 from rbpf.validation.gtsam.camera import CameraEstimate, begin, solve_features
 from rbpf.validation.gtsam.camera_graph import CameraProblem, adjust
 from rbpf.validation.gtsam.observations import known_by_name, observation_table
 from rbpf.validation.gtsam.solvers import marginals_by_schur
-from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, correlated
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
 from tests.validation.numeric import assert_same_covariances
 
@@ -132,38 +129,3 @@ def test_a_landmark_that_nothing_determines_is_refused():
     graph.push_back(gtsam.PriorFactorPoint3(last, values.atPoint3(last), weak))
     with pytest.raises(InputError, match="do not determine all poses and landmarks"):
         marginals_by_schur(graph, values, problem.pose_keys, problem.point_keys, problem.held_keys, problem.name)
-
-
-STRICT = VoConfig(rule=Rule(offset=1e-7, iterations=100))
-all_worlds = pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
-
-
-@all_worlds
-def test_the_motion_and_its_covariance_are_gtsams(world):
-    """A factor graph of two poses and all points, the first pose held."""
-    matches, delta = correlated(world, 40, np.random.default_rng(0))
-    camera, one = matches.camera, matches.camera.camera
-    pair = gtsam.Cal3_S2Stereo(one.fx, one.fy, 0.0, one.cx, one.cy, camera.baseline_m)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.push_back(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3()))
-    values.insert(0, gtsam.Pose3())
-    values.insert(1, gtsam.Pose3(SE3.matrix(delta)))
-    order = [0, 2, 1]
-    for row, point in enumerate(camera.triangulate(matches.z_prev)):
-        values.insert(100 + row, point)
-        both = (0, matches.z_prev, matches.cov_prev), (1, matches.z_now, matches.cov_now)
-        for pose, z, cov in both:
-            noise = gtsam.noiseModel.Gaussian.Covariance(cov[row][np.ix_(order, order)])
-            seen = gtsam.StereoPoint2(*z[row][order])
-            graph.push_back(gtsam.GenericStereoFactor3D(seen, noise, pose, 100 + row, pair))
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-14)
-    params.setAbsoluteErrorTol(1e-12)
-    best = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-    theirs = SE3.from_matrix(best.atPose3(1).matrix())
-    cov = gtsam.Marginals(graph, best).marginalCovariance(1)
-    ours = fit(matches, SE3.identity(), STRICT)
-    std = np.sqrt(np.diagonal(cov))
-    np.testing.assert_allclose(SE3.local(theirs, ours.x) / std, 0.0, atol=1e-3)
-    np.testing.assert_allclose(0.5 * ours.squared, graph.error(best), rtol=1e-8)
-    np.testing.assert_allclose(ours.cov / np.outer(std, std), cov / np.outer(std, std), atol=2e-3)

@@ -57,12 +57,6 @@ def test_a_sweep_is_one_tidy_table(config, tmp_path):
     assert len({row["path_rmse_m"] for row in found}) == 8
 
 
-def test_processes_change_nothing(config, tmp_path):
-    jobs = read_plan(config)[:2]
-    alone = sweep(jobs, tmp_path / "alone", workers=1)
-    assert steady(sweep(jobs, tmp_path / "two", workers=2)) == steady(alone)
-
-
 def test_an_interrupted_sweep_loses_nothing(config, tmp_path, monkeypatch, capsys):
     calls: list[str] = []
     right = sweeping.run_job
@@ -139,16 +133,15 @@ def test_damaged_rows_name_their_line(tmp_path):
         read_rows(path)
 
 
-@pytest.mark.slow
-def test_a_cluster_of_two_workers_gives_the_same_table(config, tmp_path):
-    distributed = pytest.importorskip("distributed")
+def test_processes_and_clusters_change_nothing(config, tmp_path):
     jobs = read_plan(config)[:2]
+    alone = steady(sweep(jobs, tmp_path / "alone", workers=1))
+    assert steady(sweep(jobs, tmp_path / "two", workers=2)) == alone
+    distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-        rows = sweep(jobs, tmp_path / "cluster", scheduler=cluster.scheduler_address)
-    assert steady(rows) == steady(sweep(jobs, tmp_path / "alone", workers=1))
+        assert steady(sweep(jobs, tmp_path / "cluster", scheduler=cluster.scheduler_address)) == alone
 
 
-@pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_said(config, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(sweeping, "SECONDS", 1)
@@ -156,7 +149,6 @@ def test_a_scheduler_that_does_not_answer_is_said(config, tmp_path, monkeypatch)
         sweep(read_plan(config), tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 
-@pytest.mark.slow
 def test_images_are_swept_with_their_known_points(tmp_path):
     render_desk(tmp_path / "desk")
     sequence = {"recording": "desk", "known_points": "desk/known_points.csv"}

@@ -11,7 +11,6 @@ from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.runs.results import load
 from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers import Truth
-from rbpf.validation.consistency.against_groundtruth import truth_errors
 from rbpf.validation.report.page import _images, write_report
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
@@ -49,19 +48,6 @@ def test_a_finished_run_has_its_verdict_on_top(finished):
     assert entries["figures"]["steps_compared"] == 40
     summary = json.loads((finished / "summary.json").read_text())
     assert (finished / "batch.tum").exists() and summary["batch_ate_rmse_m"] < summary["odometry_ate_rmse_m"]
-
-
-def test_errors_are_those_of_the_run_itself(finished):
-    record = load(finished)
-    errors = truth_errors(record)
-    summary = record.summary
-    assert errors.positions.rmse == pytest.approx(summary["path_rmse_m"])
-    assert errors.positions.rmse == pytest.approx(summary["position_rmse_m"])
-    landmark = np.linalg.norm(errors.landmarks.map.mean - errors.landmarks.truth, axis=1).mean()
-    assert landmark == pytest.approx(summary["landmark_error_mean_m"])
-    path, truth = record.path, record.truth
-    last = path.space.local(path.mean[-1], truth.poses[-1])
-    assert errors.whitened.nees[-1] == pytest.approx(last @ np.linalg.solve(path.cov[-1], last))
 
 
 def test_gtsam_stands_beside(run_folder, tmp_path, capsys):

@@ -1,7 +1,5 @@
 """ROS bags."""
 
-import logging
-
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
@@ -85,19 +83,6 @@ def test_the_same_grey_values_from_every_encoding(tmp_path):
             bag.image("/image_raw", STAMPS_NS[0], picture, name, padding=6)
         (frame,) = open_images(tmp_path / f"{name}.bag").frames()
         np.testing.assert_array_equal(frame.image, level, name)
-
-
-def test_colours_are_told_apart(tmp_path):
-    """Pure blue, green and red by OpenCV's weights; and big-endian values."""
-    colour = np.zeros((*SIZE, 3), np.uint8)
-    colour[..., 0] = 200
-    deep = np.full(SIZE, 0x1234, ">u2")
-    with recorded(tmp_path / "walk.bag") as bag:
-        bag.info("/camera_info")
-        bag.image("/image_raw", 1, colour, "bgr8")
-        bag.image("/image_raw", 2, colour, "rgb8")
-        bag.image("/image_raw", 3, deep, "mono16", is_bigendian=1)
-    assert levels(open_images(tmp_path / "walk.bag")) == [23, 60, 18]
 
 
 def test_compressed_pictures_are_those_of_the_same_files(tmp_path):
@@ -358,16 +343,6 @@ def test_truth_from_every_message_that_holds_a_pose(tmp_path, kind, message):
     truth = open_images(path, topics=TRUTH).truth
     assert truth.stamps_ns.tolist() == list(STAMPS_NS)
     np.testing.assert_allclose(SE3.between(truth.world_from_camera, poses), np.tile(SE3.identity(), (3, 1)), atol=1e-12)
-
-
-def test_poses_of_another_frame_are_said(tmp_path, caplog):
-    with recorded(tmp_path / "walk.bag") as bag:
-        bag.info("/camera_info")
-        bag.image("/image_raw", 1, grey(10, SIZE))
-        bag.pose("/truth", 1, SE3.identity(), "nav_msgs/msg/Odometry", child="base_link")
-    with caplog.at_level(logging.WARNING):
-        open_images(tmp_path / "walk.bag", topics=TRUTH)
-    assert "the poses of /truth are those of base_link and are taken as those of the camera cam" in caplog.text
 
 
 @pytest.mark.parametrize(

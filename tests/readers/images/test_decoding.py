@@ -107,26 +107,12 @@ def test_the_first_image_that_can_be_read_tells_the_size(tmp_path):
     assert levels(open_images(tmp_path)) == [None, 20, 30]
 
 
-def test_no_image_can_be_read(tmp_path):
-    write_plain(tmp_path)
-    for name in ("0.png", "1.png", "2.png"):
-        (tmp_path / name).write_bytes(b"none")
-    with pytest.raises(InputError, match=r"none of 3 images can be read; the first is .*0.png: the file is damaged"):
-        open_images(tmp_path)
-
-
 def test_from_any_image_on_and_more_than_once(tmp_path):
     sequence = open_images(write_plain(tmp_path, [f"{i}.png" for i in range(12)]))
     everything = [10 * i + 10 for i in range(12)]
     assert levels(sequence) == everything == levels(sequence)
     assert levels(sequence, 7) == everything[7:]
     assert [frame.stamp_ns for frame in sequence.frames(11)] == [sequence.stamps_ns[11]]
-
-
-@pytest.mark.parametrize("start", [-1, 3])
-def test_a_start_beyond_the_images(tmp_path, start):
-    with pytest.raises(InputError, match=f"expected a start from 0 to 2, got {start}"):
-        open_images(write_plain(tmp_path)).frames(start)
 
 
 def test_nothing_but_what_is_needed_is_decoded(tmp_path):

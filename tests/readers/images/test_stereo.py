@@ -11,7 +11,6 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.images.rectification import OUTSIDE, Rectification, pair_stamps
-from rbpf.sensors.readers.text import StampedLines
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,
@@ -47,20 +46,6 @@ def test_a_euroc_pair(tmp_path):
     expected = SE3.compose(poses, CAM0)
     np.testing.assert_allclose(SE3.local(sequence.truth.world_from_camera, expected), 0.0, atol=1e-9)
     assert [frame.stamp_ns for frame in sequence.frames(1)] == list(EUROC_NS[1:])
-
-
-def test_a_euroc_pair_lists_each_folder_once(tmp_path, monkeypatch):
-    """However long it is: listed for each image, 4,000 pairs took a minute to open."""
-    listed, files = [], StampedLines.files
-
-    def counted(lines, folder):
-        listed.append(folder.parent.name)
-        return files(lines, folder)
-
-    write_rectified(tmp_path)
-    monkeypatch.setattr(StampedLines, "files", counted)
-    assert levels(open_stereo(tmp_path)) == [(10, 100), (20, 110), (30, 120)]
-    assert sorted(listed) == ["cam0", "cam1"]
 
 
 def test_images_without_a_partner_are_left_out_and_named(tmp_path, caplog):
