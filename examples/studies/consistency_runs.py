@@ -402,7 +402,7 @@ def main(
         quick: few short recordings, few particles.
     """
     if quick:
-        runs, remedies, steps, particles, workers = 4, 2, 40, (10, 20, 40), 1
+        runs, remedies, steps, particles, workers = 2, 2, 40, (10, 20, 40), 1
     figure = Figure(figsize=(14.0, 9.0), layout="constrained")
     panels = figure.subplots(2, 2)
     rows, curves = [], dict[str, np.ndarray]()

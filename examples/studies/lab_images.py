@@ -170,7 +170,7 @@ def main(
         out: folder for the table and the pictures.
         quick: few small images.
     """
-    width, moments = (320, 3) if quick else (640, moments)
+    width, moments = (320, 2) if quick else (640, moments)
     taken = {f"lab, noise {std:g}": list(rendered(seed, std, width, moments)) for std in noise_std}
     table = {name: statistics(pictures) for name, pictures in taken.items()}
     table |= {folder.name: statistics(recorded(folder, moments)) for folder in beside}

@@ -110,10 +110,10 @@ def main(
         frames: pairs of each.
         every: only each so many-th frame of the robot's drive is a pair.
         noise_px: of the pixels.
-        quick: two recordings, half of the pairs and few particles, to see that it works.
+        quick: one recording, a third of the pairs and few particles, to see that it works.
     """
     if quick:
-        seeds, frames, particles = 2, 30, 100
+        seeds, frames, particles = 1, 20, 100
     world = LabWorld(LabDrive(frames=frames, every=every), points=8000)
     measuring = Measuring(noise_px=noise_px, measurements=40, known=0, new_per_frame=20)
     logs = [simulate_features(world, measuring, STEREO, seed) for seed in range(seeds)]

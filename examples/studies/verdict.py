@@ -217,10 +217,10 @@ def main(out: Path = Path("demo/verdict"), quick: bool = False) -> dict[str, boo
 
     Args:
         out: folder for the table and the picture.
-        quick: only two of the cases.
+        quick: only the shortest of the cases.
     """
     rows, right = [], {}
-    for case in CASES[2:9:6] if quick else CASES:
+    for case in CASES[9:10] if quick else CASES:
         with TemporaryDirectory() as folder:
             alone, beside, found = judged(case.run(), Path(folder))
         print(f"{case.name}: {alone.sentences[1]} With the truth: {beside.sentences[1]}")

@@ -150,16 +150,19 @@ def tried(case: Case, path: Path) -> str:
     return "went on"
 
 
-def main(name: str, folder: Path, most: int) -> None:
-    """Tries so many damages, in an order drawn at random."""
-    warnings.simplefilter("ignore")
+def tell(name: str, damage: str, **result: str) -> None:
+    print(json.dumps({"case": name, "damage": damage, **result}), flush=True)
+
+
+def try_damages(name: str, folder: Path, most: int) -> None:
+    """Tries so many damages of a case's checkpoint, in an order drawn at random."""
     case, rng = CASES[name](), np.random.default_rng(0)
     run = Run(Listed(), case.make())
     for frame in case.before:
         run.take(frame)
     path = folder / "damaged.npz"
     run.save(path)
-    print(json.dumps({"damage": "none", "result": tried(case, path)}), flush=True)
+    tell(name, "none", result=tried(case, path))
     arrays = load_arrays(path)
     header = json.loads(str(arrays.pop("header")))
     # Of many arrays of one kind the first two are enough.
@@ -167,11 +170,13 @@ def main(name: str, folder: Path, most: int) -> None:
     every = [(key, *damage) for key in names for damage in damages(arrays[key], rng)]
     for k in rng.permutation(len(every))[:most]:
         key, words, value = every[k]
-        print(json.dumps({"damage": f"{key}: {words}"}), flush=True)
+        tell(name, f"{key}: {words}")
         changed = {n: a for n, a in arrays.items() if n != key} | ({} if value is None else {key: value})
         save_arrays(path, {"header": np.array(json.dumps(header | {"digest": _digest(changed)})), **changed})
-        print(json.dumps({"damage": f"{key}: {words}", "result": tried(case, path)}), flush=True)
+        tell(name, f"{key}: {words}", result=tried(case, path))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]))
+    warnings.simplefilter("ignore")
+    for each in CASES:
+        try_damages(each, Path(sys.argv[1]), int(sys.argv[2]))

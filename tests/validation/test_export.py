@@ -11,18 +11,22 @@ from PIL import Image
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.folder import write_run
 from rbpf.runs.reading import PathAndMap
+from rbpf.runs.recordings import filter_robot_log
 from rbpf.runs.results import load
 from rbpf.runs.trajectory import read_kitti, read_tum
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageSequence, Part
 from rbpf.sensors.readers.images.decoding import FileImages
 from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.colmap.images import lay_out
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
 from rbpf.validation.exports import MAP, PATH, export_colmap, export_ply, write_ply
 from rbpf.validation.gtsam.observations import observation_table, reprojection
 from rbpf.validation.report.rerun import recording
+from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 
 SMALL = Pinhole(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -158,13 +162,11 @@ def test_names_that_are_no_text_reach_rerun_in_part(tmp_path):
 
 
 @pytest.fixture(scope="module", params=["planar", "spatial"])
-def run(request, tmp_path_factory, plain_pictures):
+def run(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
-    more = ["--spatial"] if request.param == "spatial" else []
-    assert main(["simulate", "range-bearing", "--out", str(folder / "log"), "--steps", "20", *more]) == 0
-    out = ["--out", str(folder / "run"), "--particles", "20", "--no-batch"]
-    assert main(["run", "range-bearing", str(folder / "log"), *out]) == 0
-    return folder / "run"
+    log = simulated_log(RobotWorld(steps=20, spatial=request.param == "spatial"), 0)
+    write_run(filter_robot_log(log, RangeBearingConfig(particles=20)), folder, {"recording": "here"})
+    return folder
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ import pytest
 from examples.studies.point_worlds import MONO, STEREO, DeskWorld, Measuring, simulate_features
 from rbpf.cli import main
 from rbpf.errors import InputError
+from rbpf.runs.folder import write_run
+from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
@@ -117,11 +119,12 @@ def test_what_does_not_belong_together_is_refused():
 
 
 def test_runs_are_compared_by_their_folders(tmp_path, capsys, plain_pictures):
-    simulate_robot(RobotWorld(steps=20), tmp_path / "log", seed=0)
-    for name, setting in (("a", "anchor_every=0"), ("b", "noise.std_range_m=0.2"), ("c", "likelihood.kind=truncated")):
-        arguments = ["--out", str(tmp_path / name), "--particles", "50", "--no-batch", "--set", setting]
-        assert main(["run", "range-bearing", str(tmp_path / "log"), *arguments]) == 0
-    capsys.readouterr()
+    simulate_robot(RobotWorld(steps=12), tmp_path / "log", seed=0)
+    settings = {"a": {}, "b": {"noise": LogNoise(std_range_m=0.2)}, "c": {"likelihood": LikelihoodConfig("truncated")}}
+    recording = RobotRecording(tmp_path / "log")
+    for name, setting in settings.items():
+        run = filter_recording(recording, RangeBearingConfig(particles=50, anchor_every=0, **setting))
+        write_run(run, tmp_path / name, recording.sources())
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--seeds", "2", "--workers", "1"]) == 0
     assert "explains the recording better than" in capsys.readouterr().err.replace("\n", " ")
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "c"), "--seeds", "2", "--workers", "1"]) == 2
