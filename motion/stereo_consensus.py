@@ -6,14 +6,14 @@ in space for the alignment alone.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, points_from_pixels, times_pixels
-from rbpf.ranges import Probability, Range, Ranged
+from rbpf.ranges import Formerly, Probability, Range, Ranged
 
 REFINEMENTS = 2
 """Gauss-Newton steps on the nine pixels of a triple."""
@@ -25,13 +25,11 @@ FARTHEST = 1e4
 class RansacConfig(Ranged):
     """How many triples of matches are tried."""
 
-    RENAMED: ClassVar[dict[str, str]] = {"most": "max_triples", "certainty": "confidence"}
-
     batch: Annotated[int, Range(ge=1, le=10000)] = 32  #: tried at a time.
-    max_triples: Annotated[int, Range(ge=1, le=1000000)] = 512  #: of all batches.
+    max_triples: Annotated[int, Range(ge=1, le=1000000), Formerly("most")] = 512  #: of all batches.
     #: with this probability one triple without a false match is among them, given the fraction of matches that agree
     #: with the best motion so far.
-    confidence: Probability = 0.9999
+    confidence: Annotated[Probability, Formerly("certainty")] = 0.9999
 
     def needed(self, fraction: float) -> float:
         """Triples that it takes where this fraction of the matches is right."""

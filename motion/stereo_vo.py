@@ -10,7 +10,7 @@ later pair count, and the covariance includes the earlier points' noise.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, final
+from typing import Annotated, final
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from rbpf.motion.stereo_geometry import (
     squared_distances,
     white_rows,
 )
-from rbpf.ranges import Positive, Range, Ranged
+from rbpf.ranges import Formerly, Positive, Range, Ranged
 
 ROUNDS = 5
 """Of optimising and choosing anew which matches agree; it ends when they stay the same."""
@@ -48,14 +48,13 @@ ROUNDING = 1e-14
 class VoConfig(Ranged):
     """How a motion is estimated."""
 
-    RENAMED: ClassVar[dict[str, str]] = {"least_matches": "min_matches", "draws": "ransac"}
-
     points: Points = "adjusted"  #: what the earlier points are taken for, see `rbpf.motion.stereo_geometry.Points`.
     #: squared Mahalanobis distance beyond which a match is false; 99 % of the true ones are within, χ² with three
     #: degrees of freedom.
     gate: Annotated[float, Range(gt=0.0, le=math.inf)] = 11.345
-    min_matches: Annotated[int, Range(ge=3)] = 8  #: fewer that agree are no motion.
-    ransac: RansacConfig = field(default_factory=RansacConfig)  #: how many triples are tried.
+    min_matches: Annotated[int, Range(ge=3), Formerly("least_matches")] = 8  #: fewer that agree are no motion.
+    #: how many triples are tried.
+    ransac: Annotated[RansacConfig, Formerly("draws")] = field(default_factory=RansacConfig)
     #: when the optimiser stops; the default is a hundredth of the motion's standard deviations.
     rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
 

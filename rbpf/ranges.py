@@ -47,6 +47,13 @@ class Range:
         return f"{'odd, ' if self.odd else ''}{low}{'' if math.isinf(self.le) else high}"
 
 
+@dataclass(frozen=True)
+class Formerly:
+    """Of a field that had another name: `load_settings` refuses that name with today's."""
+
+    name: str
+
+
 ANY = Range()
 Positive = Annotated[float, Range(gt=0.0)]
 NotNegative = Annotated[float, Range(ge=0.0)]
@@ -94,6 +101,12 @@ def require_memory(size: float, what: str) -> None:
         raise InputError(
             f"{what} would take {size / 1e9:.1f} GB of memory, this machine has {memory / 1e9:.1f} GB: take fewer particles"
         )
+
+
+def former_names(kind: Any) -> dict[str, str]:
+    """The names that fields of a dataclass had, with those of today."""
+    notes = {name: getattr(hint, "__metadata__", ()) for name, hint in _hints(kind).items()}
+    return {note.name: name for name, of_field in notes.items() for note in of_field if isinstance(note, Formerly)}
 
 
 @cache

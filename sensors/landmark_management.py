@@ -7,13 +7,13 @@ whole numbers that are never used again.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, final
+from typing import Annotated, final
 
 import numpy as np
 
 from rbpf.core.checkpoint import integers, read
 from rbpf.errors import InputError
-from rbpf.ranges import Count, CountOrNone, NotNegative, Range, Ranged
+from rbpf.ranges import Count, CountOrNone, Formerly, NotNegative, Range, Ranged
 from rbpf.sensors.descriptors import distances
 
 DISTINCT = {36: 0.12, 128: 0.3}
@@ -25,13 +25,7 @@ _KEPT = {"table": integers("landmarks", 3, least=0), "counters": integers(2, lea
 class NewLandmarkConfig(Ranged):
     """Which features become landmarks, and how long candidates are kept."""
 
-    RENAMED: ClassVar[dict[str, str]] = {
-        "per_frame": "max_per_frame",
-        "sightings": "observations",
-        "waiting": "max_candidates",
-    }
-
-    max_per_frame: CountOrNone = 15  #: new candidates in a frame at most.
+    max_per_frame: Annotated[CountOrNone, Formerly("per_frame")] = 15  #: new candidates in a frame at most.
     #: least distance of a new descriptor from those held and from other new ones; None for `DISTINCT`.
     distinct: Annotated[float | None, Range(ge=0.0, le=2.0)] = None
     #: least distance of a new candidate's pixel from those of matched features and of other new candidates.
@@ -39,8 +33,9 @@ class NewLandmarkConfig(Ranged):
     #: the image is divided into so many columns and rows, which fill evenly.
     cells: Annotated[int, Range(ge=1, le=1000)] = 6
     patience: Count = 3  #: a candidate that has not been observed in so many frames is dropped.
-    observations: Count = 3  #: a candidate that was observed so often is a landmark, the first time included.
-    max_candidates: CountOrNone = 60  #: candidates at most.
+    #: a candidate that was observed so often is a landmark, the first time included.
+    observations: Annotated[Count, Formerly("sightings")] = 3
+    max_candidates: Annotated[CountOrNone, Formerly("waiting")] = 60  #: candidates at most.
 
 
 @final

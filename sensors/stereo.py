@@ -18,13 +18,13 @@ Without the refinement both places have their own error, and cov = σ_p² I.
 """
 
 from dataclasses import dataclass, field, fields
-from typing import Annotated, ClassVar, NamedTuple, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.errors import InputError
-from rbpf.ranges import NotNegative, Positive, Range, Ranged, Ratio
+from rbpf.ranges import Formerly, NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
@@ -151,8 +151,6 @@ class PairConfig(Ranged):
         InputError: a number is out of its range.
     """
 
-    RENAMED: ClassVar[dict[str, str]] = {"mend": "filter_impulses"}
-
     row_px: NotNegative = 1.0  #: rows of a match differ by at most this …
     row_per_scale: NotNegative = 0.25  #: … and this fraction of the keypoint's scale.
     nearest_m: Positive = 0.3  #: least depth; disparities above that of this depth are left out.
@@ -160,7 +158,8 @@ class PairConfig(Ranged):
     scale_ratio: Ratio = 1.5  #: largest ratio of the two scales.
     turn_rad: Annotated[float, Range(gt=0.0, le=7.0)] = 0.35  #: largest difference of the two orientations.
     limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors.
-    filter_impulses: bool = True  #: whether impulse noise (salt and pepper) is removed before keypoints are detected.
+    #: whether impulse noise (salt and pepper) is removed before keypoints are detected.
+    filter_impulses: Annotated[bool, Formerly("mend")] = True
     refine: bool = True  #: whether the disparity is refined on grey values.
     half_px: Annotated[int, Range(ge=1, le=100)] = 5  #: of the refinement's window.
     #: of the refined windows, else the match is dropped.

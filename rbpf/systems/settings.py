@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from rbpf.errors import InputError
-from rbpf.ranges import SettingError
+from rbpf.ranges import SettingError, former_names
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
 
 HEADER = (
@@ -90,7 +90,7 @@ def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
 
 def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
     known = {item.name: item for item in fields(kind)}
-    renamed: Mapping[str, str] = getattr(kind, "RENAMED", {})
+    renamed = former_names(kind)
     for name, value in values.items():
         if name in renamed:
             raise InputError(f"the setting {prefix}{name} is now called {prefix}{renamed[name]}")

@@ -5,6 +5,7 @@ from dataclasses import asdict, fields, is_dataclass
 import pytest
 
 from rbpf.errors import InputError
+from rbpf.ranges import former_names
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -36,7 +37,7 @@ def test_a_group_can_be_nothing():
 
 def renamed(kind: type, prefix: str = "") -> list[tuple[str, str]]:
     """Every old name of a setting, with the new one, both with their groups."""
-    found = [(prefix + old, prefix + new) for old, new in getattr(kind, "RENAMED", {}).items()]
+    found = [(prefix + old, prefix + new) for old, new in former_names(kind).items()]
     for item in fields(kind):
         if is_dataclass(item.default_factory):
             found += renamed(item.default_factory, f"{prefix}{item.name}.")

@@ -1,14 +1,14 @@
 """Every setting of stereo SLAM, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import MotionPrior, VoConfig
-from rbpf.ranges import Angle, Count, CountOrNone, NotNegative, Positive, Range, Ranged, Ratio, Seed
+from rbpf.ranges import Angle, Count, CountOrNone, Formerly, NotNegative, Positive, Range, Ranged, Ratio, Seed
 from rbpf.sensors.descriptors import MatchLimits
 from rbpf.sensors.features import SiftConfig
 from rbpf.sensors.landmark_management import NewLandmarkConfig
@@ -23,11 +23,9 @@ OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0
 class OdometryConfig(Ranged):
     """Motion from pair to pair (S05 §III-C), and its noise as the filter takes it."""
 
-    RENAMED: ClassVar[dict[str, str]] = {"prediction": "prior"}
-
     estimate: VoConfig = field(default_factory=VoConfig)  #: how a motion is estimated from matches.
     #: what is expected before anything is seen, and assumed where nothing is.
-    prior: MotionPrior = field(default_factory=MotionPrior)
+    prior: Annotated[MotionPrior, Formerly("prediction")] = field(default_factory=MotionPrior)
     limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors of two pairs.
     std_added_rad: NotNegative = 0.0  #: injected per update (S05 §V), standard deviation of the turn about each axis.
     std_added_m: NotNegative = 0.0  #: likewise of the shift along each axis.
@@ -49,15 +47,6 @@ class OdometryConfig(Ranged):
 class MapConfig(Ranged):
     """Which features of a pair are landmarks of the map."""
 
-    RENAMED: ClassVar[dict[str, str]] = {
-        "depth_share": "depth_fraction",
-        "cloud": "subsample",
-        "turn_deg": "max_turn_deg",
-        "scale": "max_scale_change",
-        "doubt_px": "vague_px",
-        "agreeing": "min_agreeing",
-    }
-
     used: bool = True  #: whether there is a map; without one the filter is the odometry and its noise.
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one Gaussian
     #: of the active landmarks and the frame, given the last few updates (joint): an uncertainty that stays true. With it
@@ -75,18 +64,19 @@ class MapConfig(Ranged):
     #: largest squared Mahalanobis distance from where the particles expect the landmark; 11.3 holds 99 %.
     gate: Positive = 11.3
     slack_px: NotNegative = 1.0  #: added to that expectation, standard deviation per axis.
-    subsample: Count = 32  #: particles, drawn evenly from the weight, that say where a landmark is expected.
+    #: particles, drawn evenly from the weight, that say where a landmark is expected.
+    subsample: Annotated[Count, Formerly("cloud")] = 32
     margin_px: float = 20.0  #: landmarks so far outside the image, as the heaviest particle sees it, may be in it.
     #: a landmark is not looked for once its line of sight has turned by this since it was seen last.
-    max_turn_deg: Angle = 45.0
-    max_scale_change: Ratio = 2.0  #: nor once it is so many times nearer or farther.
+    max_turn_deg: Annotated[Angle, Formerly("turn_deg")] = 45.0
+    max_scale_change: Annotated[Ratio, Formerly("scale")] = 2.0  #: nor once it is so many times nearer or farther.
     #: where landmarks are expected with a larger standard deviation than this, the gate lets much pass: the matches
     #: must then agree on one motion …
-    vague_px: NotNegative = 15.0
+    vague_px: Annotated[NotNegative, Formerly("doubt_px")] = 15.0
     #: … and be so many, else none is taken, and the expectation stays as vague.
-    min_agreeing: Annotated[int, Range(ge=3)] = 6
+    min_agreeing: Annotated[int, Range(ge=3), Formerly("agreeing")] = 6
     #: a feature starts a landmark if the standard deviation of its depth is below this fraction of it.
-    depth_fraction: Positive = 0.1
+    depth_fraction: Annotated[Positive, Formerly("depth_share")] = 0.1
 
 
 @dataclass(frozen=True)
@@ -129,8 +119,6 @@ class RecoveryConfig(Ranged):
 class StereoConfig(Ranged):
     """A run of stereo SLAM."""
 
-    RENAMED: ClassVar[dict[str, str]] = {"keys": "new_landmarks"}
-
     particles: Count = 400  #: number of particles.
     seed: Seed = 0  #: of all random generators.
     #: degrees of freedom of the camera: 6, or 3 for one that moves in its x–z plane and turns about y.
@@ -145,7 +133,7 @@ class StereoConfig(Ranged):
     trigger: TriggerConfig = field(default_factory=TriggerConfig)  #: when the filter is updated.
     map: MapConfig = field(default_factory=MapConfig)  #: which features are landmarks.
     #: which features become landmarks, and how long they stay.
-    new_landmarks: NewLandmarkConfig = field(default_factory=NewLandmarkConfig)
+    new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
     #: of a landmark's innovation, S05 (6) by default.
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
