@@ -14,7 +14,7 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.landmarks import View
+from rbpf.systems.stereo.landmarks import Pair
 from rbpf.systems.stereo.slam import StereoSlam
 
 RIG = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
@@ -47,7 +47,8 @@ class Drive:
     def __call__(self) -> None:
         """One update."""
         features = self.frames[self.turn]
-        view = View(10**9 * self.turn, features, np.ones(len(features), dtype=bool))
+        everything = np.ones(len(features), dtype=bool)
+        view = Pair(10**9 * self.turn, features, everything, everything, np.zeros(len(features), dtype=np.int8))
         self.filter.step(view, Odometry(turned(1), np.diag(STD**2)))
         self.turn += 1
 

@@ -9,6 +9,7 @@ from rbpf import gaussian
 from rbpf.core.filter import Filter
 from rbpf.core.models import Records
 from rbpf.lie import SE2Group
+from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.systems.anchoring import Anchored
 
@@ -49,6 +50,8 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
     """Mixture moments of every landmark that exists in most of the weight, relative to the start where it is `anchored`."""
     belief = filter_.belief()
     landmark_map, weights = belief.map, belief.weights
+    if isinstance(landmark_map, JointMap):
+        return MapEstimate(landmark_map.ids, *landmark_map.in_world(filter_.particles))
     names, means, covs = [], [], []
     for landmark_id in landmark_map.ids:
         held = np.ones(weights.size, dtype=bool)

@@ -19,7 +19,7 @@ import numpy as np
 
 from rbpf.arrays import Float, Int
 from rbpf.core.checkpoint import fitting
-from rbpf.core.filter import Filter
+from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import Map, Part
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.ranges import require_memory
@@ -77,6 +77,18 @@ LOG_EVIDENCE = Column(
 NIS = Column("nis", "normalised innovation squared; NaN without a linearised innovation", table=DIAGNOSTICS)
 NIS_DOF = Column("nis_dof", "its degrees of freedom, a weighted mean over the particles", table=DIAGNOSTICS)
 FILTER_COLUMNS = ESS, RESAMPLED, LOG_EVIDENCE, NIS, NIS_DOF
+
+
+def filter_values(report: StepReport) -> dict[str, Any]:
+    """Of `FILTER_COLUMNS`, after a step."""
+    names = (column.name for column in FILTER_COLUMNS)
+    values = report.ess, report.resampled, report.log_evidence, report.nis, report.rows
+    return dict(zip(names, values, strict=True))
+
+
+def timing(name: str, meaning: str, heading: str) -> Column:
+    """A part of the time that a frame takes."""
+    return Column(name, meaning, "s", table=TIMINGS, heading=heading)
 
 
 @dataclass(frozen=True)

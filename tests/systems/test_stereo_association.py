@@ -10,7 +10,7 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.landmarks import View, log_support
+from rbpf.systems.stereo.landmarks import Pair, log_support
 from rbpf.systems.stereo.slam import StereoSlam
 from tests.systems.stereo_sequences import pairs
 
@@ -36,8 +36,9 @@ def slam(keypoints_once: None) -> StereoSlam:
     return slam
 
 
-def view(features: StereoFeatures) -> View[StereoFeatures]:
-    return View(COUNT * 10**9, features, np.ones(len(features), dtype=bool))
+def view(features: StereoFeatures) -> Pair[StereoFeatures]:
+    everything = np.ones(len(features), dtype=bool)
+    return Pair(COUNT * 10**9, features, everything, everything, np.zeros(len(features), dtype=np.int8))
 
 
 def few(slam: StereoSlam) -> StereoFeatures:

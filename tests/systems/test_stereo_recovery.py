@@ -11,7 +11,7 @@ from rbpf.motion.stereo_vo import VoConfig
 from rbpf.runs.run import Run
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.landmarks import View
+from rbpf.systems.stereo.landmarks import Pair
 from rbpf.systems.stereo.recovery import relocalise_globally
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import TrackingState
@@ -80,7 +80,7 @@ def test_where_nothing_was_mapped_the_map_goes_on():
     assert (run.log["assumed"][6:8] > 0).all() and (run.log["assumed"][8:] == 0).all()
 
 
-def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> View[StereoFeatures]:
+def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> Pair[StereoFeatures]:
     """The last pair of `settled`, of this wall or another; half of the places are exchanged."""
     source = Pairs(texture(seed), pairs(12).truth.world_from_camera, lambda t, frame: frame)
     pair, _ = slam.front_end.measure(next(iter(source.frames(11))))
@@ -90,11 +90,11 @@ def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> View[Stereo
         z[rows] = z[np.roll(rows, 1)]
     rest = features.cov, features.scale, features.orientation, features.descriptors
     return replace(
-        pair.view(uncertain=True), stamp_ns=slam.filter.stamp_ns, features=StereoFeatures.measured(slam.rig, z, *rest)
+        pair, uncertain=True, stamp_ns=slam.filter.stamp_ns, features=StereoFeatures.measured(slam.rig, z, *rest)
     )
 
 
-def located(slam: StereoSlam, shown: View[StereoFeatures]):
+def located(slam: StereoSlam, shown: Pair[StereoFeatures]):
     rng, landmarks = np.random.default_rng(0), slam.front_end.landmarks
     return relocalise_globally(landmarks, shown, slam.filter.belief(), VoConfig(), rng)
 

@@ -6,7 +6,6 @@ frame = slam.track(z, cov_z, names, odometry, stamp_ns)
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -22,6 +21,7 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers import Frame, RobotLog
@@ -29,7 +29,7 @@ from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.systems.anchoring import StartAnchor
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.system import FILTER_COLUMNS, Column, Ragged, Recorded, System, Tracked, TrackingState
+from rbpf.systems.system import FILTER_COLUMNS, Column, Ragged, Recorded, System, Tracked, TrackingState, filter_values
 
 
 @final
@@ -153,7 +153,7 @@ class RangeBearingSlam(System):
         Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
-        report = self.filter.step(Observed(names, z, cov_z), odometry, stamp_ns)
+        report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
         if odometry is not None:
             self._odometry = self.space.compose(self._odometry, odometry.delta)
 
@@ -173,11 +173,7 @@ class RangeBearingSlam(System):
             estimate.cov,
             TrackingState.TRACKED if (used != NULL).any() else TrackingState.PREDICTED,
             {
-                "ess": report.ess,
-                "resampled": report.resampled,
-                "log_evidence": report.log_evidence,
-                "nis": report.nis,
-                "nis_dof": report.rows,
+                **filter_values(report),
                 "correction": np.full(d, np.nan) if correction is None else correction.mean,
                 "cov_correction": np.full((d, d), np.nan) if correction is None else correction.cov,
                 "odometry": self._odometry,
@@ -194,13 +190,10 @@ class RangeBearingSlam(System):
         return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
 
     def map(self) -> MapEstimate:
-        if self.joint is not None:
-            return MapEstimate(self.joint.ids, *self.joint.in_world(self.filter.particles))
         return estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
 
     def particle_poses(self) -> np.ndarray:
-        state = self.filter.particles.state
-        return state if self.joint is None else self.joint.world(state)
+        return self.filter.belief().map.world(self.filter.particles.state)
 
     def measurements(self, name: str, log: Recorded) -> Measurements:
         """The odometry, and every observation that updated a landmark or started one."""
@@ -285,15 +278,6 @@ class RangeBearingSlam(System):
             return np.where(new & again, NULL, names)
         ids = _ids_with_new(report, len(names))
         return ids[self.filter.belief().mode if len(ids) > 1 else 0]
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What the sensor takes: names (K,), measurements (K, p) and their covariance (K, p, p)."""
-
-    landmarks: np.ndarray
-    z: np.ndarray
-    cov_z: np.ndarray
 
 
 _ASSOCIATIONS = {"shapes": integers("steps", 3, least=0), "ids": integers("ids", least=NULL)}

@@ -6,31 +6,29 @@ always in the same half, whenever it is seen.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Generic, final
 
 import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, read
-from rbpf.core.models import NULL, Landmark
+from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.landmarks import (
-    AssociationGate,
     DescriptorLandmarks,
     F,
     FeatureKind,
     Landmarks,
     NamedLandmarks,
     NamedPixels,
-    View,
+    Pair,
 )
 from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
@@ -52,34 +50,13 @@ KEPT = {
 """What the rest of `StereoFeatures` follows from."""
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Pair(Generic[F]):
-    """What one frame showed."""
-
-    stamp_ns: int
-    features: F  #: K of them.
-    for_odometry: np.ndarray  #: (K,) bool, which the odometry may use.
-    for_map: np.ndarray  #: (K,) bool, which the map may use.
-    labels: np.ndarray  #: (K,) whether each stood still, see `rbpf.systems.stereo.motion_segmentation`.
-
-    def __len__(self) -> int:
-        return len(self.features)
-
-    def view(self, moving: np.ndarray | None = None, uncertain: bool = False) -> View[F]:
-        """What the map is asked about, without rows that are of things that move."""
-        free = self.for_map.copy()
-        if moving is not None:
-            free[moving] = False
-        return View(self.stamp_ns, self.features, free, uncertain)
-
-
 class FrontEnd(ABC, Generic[F]):
     """Measures frames and matches pairs."""
 
     frames: ClassVar[tuple[type, ...]]  #: types of the frames that it takes.
     names_landmarks: ClassVar[bool] = False  #: whether the frames themselves say which landmark each feature is.
     rig: RectifiedStereo
+    config: StereoConfig
     landmarks: Landmarks[F]  #: the map's side: finds landmarks among the features.
 
     @abstractmethod
@@ -124,6 +101,15 @@ class FrontEnd(ABC, Generic[F]):
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[F]:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
 
+    def _pair(self, stamp_ns: int, features: F, half: np.ndarray) -> Pair[F]:
+        """A pair whose features odometry and map share as the settings say; `half` (K,) of them are always on one side."""
+        split, everything = self.config.odometry.split, np.ones(len(features), dtype=bool)
+        for_map = {"none": everything, "same": half, "apart": ~half}[split]
+        # A point at infinity or beyond is no landmark.
+        for_map = for_map & (features.z[:, 0] > features.z[:, 2]) & self.config.map.used
+        for_odometry = everything if split == "none" else half
+        return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))
+
 
 class ImageFrontEnd(FrontEnd[StereoFeatures]):
     """Features of images, matched by their descriptors.
@@ -131,8 +117,8 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
     Args:
         rig: the cameras.
         config: all settings.
-        extractor, gate, model, landmark: see `rbpf.systems.stereo.slam.StereoSlam`.
-        landmarks: finds landmarks among the features; None for those by descriptors, with `gate`, `model` and `landmark`.
+        extractor: see `rbpf.systems.stereo.slam.StereoSlam`.
+        landmarks: finds landmarks among the features; None for `DescriptorLandmarks`.
     """
 
     frames = (ImageFrame,)
@@ -142,16 +128,12 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         rig: RectifiedStereo,
         config: StereoConfig,
         extractor: FeatureExtractor | None = None,
-        gate: AssociationGate | None = None,
-        model: CameraModel | None = None,
-        landmark: Landmark | None = None,
         landmarks: Landmarks[StereoFeatures] | None = None,
     ) -> None:
         self.rig, self.config = rig, config
         extractor = extractor or Sift(config.sift)
         self.matcher = StereoMatcher(rig, extractor, config.pair)
-        own = config.map, config.new_landmarks, extractor.length, config.likelihood.build()
-        self.landmarks = landmarks or DescriptorLandmarks(rig, *own, gate, model, landmark)
+        self.landmarks = landmarks or DescriptorLandmarks(rig, config, extractor.length)
 
     def measure(self, frame: Any) -> tuple[Pair[StereoFeatures], str]:
         features, problem = self.features_of(frame)
@@ -159,7 +141,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
             nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
             descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
             features = StereoFeatures.measured(self.rig, *nothing, descriptors)
-        return self._pair(frame.stamp_ns, features), problem
+        return self._measured(frame.stamp_ns, features), problem
 
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
         """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
@@ -196,19 +178,13 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[StereoFeatures]:
         found = read(arrays, KEPT | _LABELS, "pair/", length=self.matcher.extractor.length)
         features = StereoFeatures.measured(self.rig, *(found[name] for name in KEPT))
-        return replace(self._pair(0, features), labels=found["stood"])
+        return replace(self._measured(0, features), labels=found["stood"])
 
-    def _pair(self, stamp_ns: int, features: StereoFeatures) -> Pair[StereoFeatures]:
-        split, everything = self.config.odometry.split, np.ones(len(features), dtype=bool)
-        for_odometry, for_map = everything, everything
-        if split != "none":
-            # A random half, the same whenever a feature is seen: whether its first numbers outweigh its last ones.
-            side = features.descriptors.shape[1] // 3
-            for_odometry = features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)
-            for_map = for_odometry if split == "same" else ~for_odometry
-        if not self.config.map.used:
-            for_map = ~everything
-        return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))
+    def _measured(self, stamp_ns: int, features: StereoFeatures) -> Pair[StereoFeatures]:
+        # A random half, the same whenever a feature is seen: whether its first numbers outweigh its last ones.
+        side = features.descriptors.shape[1] // 3
+        half = features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)
+        return self._pair(stamp_ns, features, half)
 
 
 @final
@@ -223,11 +199,11 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
 
     def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
         self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
-        self.landmarks: NamedLandmarks = NamedLandmarks(rig, config.map, config.likelihood.build())
+        self.landmarks: NamedLandmarks = NamedLandmarks(rig, config)
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[NamedPixels], str]:
         pixels = NamedPixels(frame.z, frame.cov_z, frame.landmarks)
-        return self._pair(self.ns_per_stamp * frame.stamp_ns, pixels), ""
+        return self._pair(self.ns_per_stamp * frame.stamp_ns, pixels, pixels.names % 2 == 0), ""
 
     def match(self, before: Pair[NamedPixels], now: Pair[NamedPixels]) -> tuple[np.ndarray, np.ndarray]:
         names = before.features.names, now.features.names
@@ -246,13 +222,4 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
 
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[NamedPixels]:
         z, cov, names, labels = read(arrays, _NAMED, "pair/").values()
-        return replace(self._pair(0, NamedPixels(z, cov, names)), labels=labels)
-
-    def _pair(self, stamp_ns: int, features: NamedPixels) -> Pair[NamedPixels]:
-        split, even = self.config.odometry.split, features.names % 2 == 0
-        # A point at infinity or beyond is no landmark.
-        for_map = (features.z[:, 0] > features.z[:, 2]) & self.config.map.used
-        if split != "none":
-            for_map = for_map & (even if split == "same" else ~even)
-        for_odometry = even if split != "none" else np.ones(len(features), dtype=bool)
-        return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))
+        return replace(self._pair(0, NamedPixels(z, cov, names), names % 2 == 0), labels=labels)

@@ -19,7 +19,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import integers, numbers, read
-from rbpf.core.models import NULL, Belief, Landmark, Likelihood, NewLandmarks, Observations, Part, Records, Sensor
+from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Part, Sensor
 from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
@@ -31,10 +31,10 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
 from rbpf.sensors.descriptors import DescriptorStore, gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
+from rbpf.sensors.landmark_management import LandmarkManager
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
-from rbpf.systems.stereo.config import MapConfig
+from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.system import MAP_IDS
 
 _MAP = frozenset({Part.LANDMARK})
@@ -96,18 +96,24 @@ class NamedPixels:
         return NamedPixels(self.z[rows], self.cov[rows], self.names[rows])
 
 
-@dataclass(frozen=True)
-class View(Generic[F]):
-    """A pair, as the map is asked about it and as the filter is updated by it."""
+@final
+@dataclass(frozen=True, eq=False)
+class Pair(Generic[F]):
+    """What one frame showed; as the map is asked about it and the filter updated by it, without what is of moving things."""
 
     stamp_ns: int
     features: F  #: K of them.
-    free: np.ndarray  #: (K,) which of them the map may use.
+    for_odometry: np.ndarray  #: (K,) bool, which the odometry may use.
+    for_map: np.ndarray  #: (K,) bool, which the map may use.
+    labels: np.ndarray  #: (K,) whether each stood still, see `rbpf.systems.stereo.motion_segmentation`.
     #: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks that were seen
     #: again before, and none are started.
     uncertain: bool = False
     #: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
     landmarks: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.features)
 
 
 class Landmarks(Sensor, ABC, Generic[F]):
@@ -120,7 +126,7 @@ class Landmarks(Sensor, ABC, Generic[F]):
     seconds: float = 0.0  #: that finding them took.
 
     @abstractmethod
-    def associate(self, view: View[F], belief: Belief) -> np.ndarray:
+    def associate(self, pair: Pair[F], belief: Belief) -> np.ndarray:
         """Landmark (K,) of each feature, NULL where it has none."""
 
     @abstractmethod
@@ -147,21 +153,21 @@ class Landmarks(Sensor, ABC, Generic[F]):
         """Entries of summary.json: SIFT features ever started, and landmarks, of so many that the map holds."""
         return {"sift_features": 0, "landmarks_mean_per_particle": float(held)}
 
-    def match_globally(self, view: View[F]) -> np.ndarray:
+    def match_globally(self, pair: Pair[F]) -> np.ndarray:
         """Landmark (K,) of each feature, wherever it may be expected; NULL where it has none, as by default all."""
-        return np.full(len(view.features), NULL, dtype=np.int64)
+        return np.full(len(pair), NULL, dtype=np.int64)
 
-    def log_support(self, view: View[F], belief: Belief) -> float:
+    def log_support(self, pair: Pair[F], belief: Belief) -> float:
         """How well landmarks are seen where particles expect them: a log-density, beside that of unknown things.
 
         Candidates that were never seen again have no say: they may be of what moves.
         """
-        ids = self.associate(view, belief)
+        ids = self.associate(pair, belief)
         rows = np.flatnonzero(np.isin(ids, self.seen_again()))
         if not rows.size:
             return 0.0
-        features, (mean, cov) = view.features.take(rows), self.expected(belief, ids[rows])
-        z = view.features.z[view.free]
+        features, (mean, cov) = pair.features.take(rows), self.expected(belief, ids[rows])
+        z = pair.features.z[pair.for_map]
         return log_support(features.z - mean, features.cov + cov, z, self.rig)
 
     @abstractmethod
@@ -285,7 +291,13 @@ class Places:
         """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""
         camera = self.rig.camera
         margin = self.config.margin_px + min(SIGMAS * camera.fx * std_direction_rad, 0.5 * camera.width)
-        rows = self._in_image(SE3.inverse_transform(world_from_camera, self._place), margin)
+        # In both images, or nearly; most are far from it.
+        local = SE3.inverse_transform(world_from_camera, self._place)
+        across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
+        down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
+        x, y, z = local.T
+        rows = np.flatnonzero((z > 0.0) & (np.abs(x) <= across * z) & (np.abs(y) <= down * z))
+        rows = rows[self.rig.visible(local[rows], -margin)]
         then = self._place[rows] - self._seen_from[rows]
         now = self._place[rows] - SE3.translation(world_from_camera)
         lengths = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
@@ -293,15 +305,6 @@ class Places:
         ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
         alike = cosine >= np.cos(np.deg2rad(self.config.max_turn_deg))
         return self._ids[rows[alike & (ratio <= np.log(self.config.max_scale_change))]]
-
-    def _in_image(self, local: np.ndarray, margin: float) -> np.ndarray:
-        """Rows of points (M, 3) in the camera's frame that are in both images, or nearly; most are far from it."""
-        camera = self.rig.camera
-        across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
-        down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
-        x, y, z = local.T
-        rows = np.flatnonzero((z > 0.0) & (np.abs(x) <= across * z) & (np.abs(y) <= down * z))
-        return rows[self.rig.visible(local[rows], -margin)]
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"places/place": self._place, "places/seen_from": self._seen_from}
@@ -337,33 +340,29 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
 
     Args:
         rig: the cameras.
-        config: how landmarks are matched.
-        new: which features become landmarks.
+        config: all settings.
         length: of a descriptor.
-        likelihood: of an innovation.
         gate, model, landmark: see `rbpf.systems.stereo.slam.StereoSlam`.
     """
 
     def __init__(
         self,
         rig: RectifiedStereo,
-        config: MapConfig,
-        new: NewLandmarkConfig,
+        config: StereoConfig,
         length: int,
-        likelihood: Likelihood,
         gate: AssociationGate | None = None,
         model: CameraModel | None = None,
         landmark: Landmark | None = None,
     ) -> None:
-        self.rig, self.config, self.likelihood = rig, config, likelihood
-        self.gate = gate or MahalanobisGate(config.gate, config.slack_px)
+        self.rig, self.config, self.likelihood = rig, config.map, config.likelihood.build()
+        self.gate = gate or MahalanobisGate(self.config.gate, self.config.slack_px)
         self.model, self.landmark = model or StereoPoint(rig), landmark or Point(3)
         self.store = DescriptorStore(length)
-        self.manager = LandmarkManager(new, (rig.camera.width, rig.camera.height))
-        self.places = Places(rig, config)
+        self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height))
+        self.places = Places(rig, self.config)
         self.ids = np.zeros(0, dtype=np.int64)
 
-    def observe(self, frame: View[StereoFeatures], belief: Belief) -> Sequence[Observations]:
+    def observe(self, frame: Pair[StereoFeatures], belief: Belief) -> Sequence[Observations]:
         """The features that are landmarks, and those that are candidates."""
         started = time.perf_counter()
         features = frame.features
@@ -388,7 +387,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return groups
 
     def new_landmarks(
-        self, frame: View[StereoFeatures], belief: Belief, observed: Sequence[Observations]
+        self, frame: Pair[StereoFeatures], belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """Counts what was seen, drops candidates that were not seen again, starts new ones."""
         known = self.ids >= 0
@@ -406,14 +405,16 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         mode = belief.state[belief.mode]
         pose = belief.map.world(mode[None], np.array([belief.mode]))[0]
         if seen.size:
-            place = world_points(self.landmark, belief.read_mode(seen))[0]
+            records = belief.read_mode(seen)
+            place = self.landmark.homogeneous(records.mean, records.const)[0]
+            place = place[:, :3] / place[:, 3:]
             self.places.put(seen, SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
         if frame.uncertain:
             return []
         # Those whose depth is known well enough for a Gaussian in space, and which the manager chooses.
         features = frame.features
         deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
-        rows = np.flatnonzero(~known & deep & frame.free)
+        rows = np.flatnonzero(~known & deep & frame.for_map)
         if rows.size:
             descriptors = features.descriptors[rows]
             nearest, px = self.store.nearest(descriptors), features.z[:, :2]
@@ -428,14 +429,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.ids[rows] = ids
         return [NewLandmarks(features.z, features.cov, self.model, self.landmark, ids=ids)]
 
-    def associate(self, view: View[StereoFeatures], belief: Belief) -> np.ndarray:
+    def associate(self, pair: Pair[StereoFeatures], belief: Belief) -> np.ndarray:
         """By their descriptors, where the particles expect them."""
-        out = np.full(len(view.features), NULL, dtype=np.int64)
-        rows = np.flatnonzero(view.free)
-        features = view.features.take(rows)
+        out = np.full(len(pair), NULL, dtype=np.int64)
+        rows = np.flatnonzero(pair.for_map)
+        features = pair.features.take(rows)
         subsample = ParticleSubsample.of(belief, self.config.subsample)
         ids = self._alike(features.descriptors, subsample)
-        if view.uncertain:
+        if pair.uncertain:
             ids = ids[np.isin(ids, self.seen_again())]
         if not (ids.size and rows.size):
             return out
@@ -445,16 +446,16 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         found = match_pairs(features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits)
         taken = store.ids[found.second]
         agreed = self._agreed(
-            expected.take(np.searchsorted(ids, taken)), features.take(found.first), view.uncertain, belief.rng
+            expected.take(np.searchsorted(ids, taken)), features.take(found.first), pair.uncertain, belief.rng
         )
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
-    def match_globally(self, view: View[StereoFeatures]) -> np.ndarray:
+    def match_globally(self, pair: Pair[StereoFeatures]) -> np.ndarray:
         """By their descriptors alone."""
-        out = np.full(len(view.features), NULL, dtype=np.int64)
-        rows = np.flatnonzero(view.free)
-        out[rows] = self.store.match(view.features.descriptors[rows], self.config.limits)
+        out = np.full(len(pair), NULL, dtype=np.int64)
+        rows = np.flatnonzero(pair.for_map)
+        out[rows] = self.store.match(pair.features.descriptors[rows], self.config.limits)
         return out
 
     def seen_again(self) -> np.ndarray:
@@ -467,10 +468,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def kinds(self) -> np.ndarray:
         manager = self.manager
         out = np.full(self.ids.size, FeatureKind.FEATURE)
-        rows = np.searchsorted(manager.names, self.ids)
-        held = np.flatnonzero(rows < manager.names.size)
-        held = held[manager.names[rows[held]] == self.ids[held]]
-        rows = rows[held]
+        rows, is_held = self.store.find(self.ids)
+        held, rows = np.flatnonzero(is_held), rows[is_held]
         out[held] = np.where(manager.confirmed[rows], FeatureKind.LANDMARK, FeatureKind.CANDIDATE)
         out[held[manager.observations[rows] == 1]] = FeatureKind.NEW
         return out
@@ -530,32 +529,26 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return estimate_motion(matches, rng, config=config).inliers
 
 
-def world_points(landmark: Landmark, records: Records) -> np.ndarray:
-    """Points (N, K, 3) in the world of landmarks (N, K) of any parametrisation."""
-    homogeneous = landmark.homogeneous(records.mean, records.const)
-    return np.asarray(homogeneous[..., :3] / homogeneous[..., 3:])
-
-
 @final
 class NamedLandmarks(Landmarks[NamedPixels]):
     """Landmarks by the names that the recording gives them: known association."""
 
-    def __init__(self, rig: RectifiedStereo, config: MapConfig, likelihood: Likelihood) -> None:
-        self.rig, self.config, self.model, self.landmark = rig, config, StereoPoint(rig), Point(3)
+    def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
+        self.rig, self.config, self.model, self.landmark = rig, config.map, StereoPoint(rig), Point(3)
         self.ids = np.zeros(0, dtype=np.int64)
-        self._sensor = NamedLandmarkSensor(self.model, self.landmark, likelihood)
+        self._sensor = NamedLandmarkSensor(self.model, self.landmark, config.likelihood.build())
         # (M,) landmarks of the map, ascending, and how often each was seen.
         self._held = np.zeros(0, dtype=np.int64)
         self._observations = np.zeros(0, dtype=np.int64)
 
-    def observe(self, frame: View[NamedPixels], belief: Belief) -> Sequence[Observations]:
-        self.ids = np.where(frame.free, frame.features.names, NULL)
+    def observe(self, frame: Pair[NamedPixels], belief: Belief) -> Sequence[Observations]:
+        self.ids = np.where(frame.for_map, frame.features.names, NULL)
         return self._sensor.observe(_free(frame), belief)
 
     def new_landmarks(
-        self, frame: View[NamedPixels], belief: Belief, observed: Sequence[Observations]
+        self, frame: Pair[NamedPixels], belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        names = np.unique(frame.features.names[frame.free])
+        names = np.unique(frame.features.names[frame.for_map])
         self._observations[np.isin(self._held, names)] += 1
         started = self._sensor.new_landmarks(_free(frame), belief, observed)
         held = np.union1d(self._held, names)
@@ -570,10 +563,10 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         self._held, self._observations = held, observations
         return started
 
-    def associate(self, view: View[NamedPixels], belief: Belief) -> np.ndarray:
+    def associate(self, pair: Pair[NamedPixels], belief: Belief) -> np.ndarray:
         """By their names; where the view is uncertain, only those that were observed more than once."""
-        known = self.seen_again() if view.uncertain else self._held
-        return np.where(view.free & np.isin(view.features.names, known), view.features.names, NULL)
+        known = self.seen_again() if pair.uncertain else self._held
+        return np.where(pair.for_map & np.isin(pair.features.names, known), pair.features.names, NULL)
 
     def seen_again(self) -> np.ndarray:
         return self._held[self._observations >= SEEN_AGAIN]
@@ -591,6 +584,6 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         self._held, self._observations = read(arrays, _NAMES, "names/").values()
 
 
-def _free(view: View[NamedPixels]) -> Any:
-    features = view.features.take(view.free)
-    return FeatureFrame(view.stamp_ns, features.names, features.z, features.cov)
+def _free(pair: Pair[NamedPixels]) -> Any:
+    features = pair.features.take(pair.for_map)
+    return FeatureFrame(pair.stamp_ns, features.names, features.z, features.cov)

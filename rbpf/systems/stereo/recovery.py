@@ -5,7 +5,7 @@ camera has come, it grows with every pair, and no particle is drawn from it. Dra
 be decimetres apart, none of them within millimetres of the right place, and landmarks started then would be so, too.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,23 +17,16 @@ from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.landmarks import TINY, Landmarks, View
+from rbpf.systems.stereo.landmarks import TINY, Landmarks, Pair
 from rbpf.systems.stereo.odometry import DeadReckoning
 
 
-class Decision(NamedTuple):
-    """What is done with a pair after a motion that was only assumed, and in words why."""
-
-    motion: (
-        Odometry | None
-    )  #: by what the particles are moved; None where the map does not say yet where the camera is.
-    message: str = ""
-
-
 def motion_for_update(
-    filter_: Filter, landmarks: Landmarks[Any], view: View[Any], at: DeadReckoning, config: StereoConfig
-) -> Decision:
-    """By what the particles are moved at a pair after an assumed motion.
+    filter_: Filter, landmarks: Landmarks[Any], view: Pair[Any], at: DeadReckoning, config: StereoConfig
+) -> tuple[Odometry | None, str]:
+    """By what the particles are moved at a pair after an assumed motion, and in words why.
+
+    None where the map does not say yet where the camera is.
 
     A map that has not got so far that it could say where the camera is, is not waited for. A place that is found far
     from where the camera was assumed to go takes the place of the assumed mean: something has deceived the odometry.
@@ -41,7 +34,7 @@ def motion_for_update(
     """
     motion, least = at.since_update, config.map.min_agreeing
     if landmarks.seen_again().size < least:
-        return Decision(motion)
+        return motion, ""
     after = f"after {at.assumed} pair{'s'[: at.assumed > 1]} whose motion was only assumed"
     belief = filter_.expect(motion, view.stamp_ns)
     count = int((landmarks.associate(view, belief) != NULL).sum())
@@ -51,14 +44,14 @@ def motion_for_update(
             count, heaviest = place[1], filter_.particles.state[belief.mode]
             motion = Odometry(SE3.between(heaviest, place[0]), motion.cov)
     if count >= least:
-        return Decision(motion, f"the camera is found again by {count} landmarks of the map, {after}")
+        return motion, f"the camera is found again by {count} landmarks of the map, {after}"
     if at.waiting >= config.recovery.patience:
-        return Decision(motion, f"the camera is not found again in the map, which goes on from here, {after}")
-    return Decision(None)
+        return motion, f"the camera is not found again in the map, which goes on from here, {after}"
+    return None, ""
 
 
 def relocalise_globally(
-    landmarks: Landmarks[Any], view: View[Any], belief: Belief, config: VoConfig, rng: np.random.Generator
+    landmarks: Landmarks[Any], view: Pair[Any], belief: Belief, config: VoConfig, rng: np.random.Generator
 ) -> tuple[np.ndarray, int] | None:
     """Where in its whole map a stereo camera is, by what its features look like: without a prediction.
 

@@ -27,14 +27,14 @@ from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry, pixel_gains
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
-from rbpf.sensors.features import FeatureExtractor
+from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
-from rbpf.systems.stereo.landmarks import AssociationGate, View
+from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd
+from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
 from rbpf.systems.stereo.odometry import DeadReckoning
 from rbpf.systems.stereo.recovery import motion_for_update
@@ -46,13 +46,14 @@ from rbpf.systems.system import (
     NIS,
     NIS_DOF,
     RESAMPLED,
-    TIMINGS,
     Column,
     Ragged,
     Recorded,
     System,
     Tracked,
     TrackingState,
+    filter_values,
+    timing,
 )
 
 _STEREO = {
@@ -96,10 +97,10 @@ class StereoSlam(System):
         ESS,
         LOG_EVIDENCE,
         NIS,
-        Column("seconds_features", "time of measuring the pair", "s", table=TIMINGS, heading="features_ms"),
-        Column("seconds_odometry", "time of estimating the motion", "s", table=TIMINGS, heading="odometry_ms"),
-        Column("seconds_matching", "time of finding landmarks", "s", table=TIMINGS, heading="matching_ms"),
-        Column("seconds_filter", "time of the rest of the update", "s", table=TIMINGS, heading="filter_ms"),
+        timing("seconds_features", "time of measuring the pair", "features_ms"),
+        timing("seconds_odometry", "time of estimating the motion", "odometry_ms"),
+        timing("seconds_matching", "time of finding landmarks", "matching_ms"),
+        timing("seconds_filter", "time of the rest of the update", "filter_ms"),
         Column("odometry", "world_from_camera by visual odometry alone", shape=(7,)),
         Column("measured", "whether the next pair is matched with this one", kind=bool),
     )
@@ -124,11 +125,13 @@ class StereoSlam(System):
     ) -> None:
         self.rig, self.config = rig, config or StereoConfig()
         config = self.config
-        self._front_ends: tuple[FrontEnd[Any], ...] = (
-            (ImageFrontEnd(rig, config, extractor, gate, model, landmark), NamedFrontEnd(rig, config))
-            if front_end is None
-            else (front_end,)
-        )
+        self._front_ends: tuple[FrontEnd[Any], ...]
+        if front_end is None:
+            extractor = extractor or Sift(config.sift)
+            landmarks = DescriptorLandmarks(rig, config, extractor.length, gate, model, landmark)
+            self._front_ends = ImageFrontEnd(rig, config, extractor, landmarks), NamedFrontEnd(rig, config)
+        else:
+            self._front_ends = (front_end,)
         free = CAMERA_PLANE if config.dof == 3 else None
         added = np.repeat([config.odometry.std_added_rad, config.odometry.std_added_m], 3)
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
@@ -224,7 +227,9 @@ class StereoSlam(System):
         if measured and due:
             uncertain = config.recovery.used and at.assumed > 0
             control: Odometry | None = at.since_update
-            view = pair.view(motion.rows[1][motion.moving], uncertain)
+            for_map = pair.for_map.copy()
+            for_map[motion.rows[1][motion.moving]] = False
+            view = replace(pair, for_map=for_map, uncertain=uncertain)
             if uncertain:
                 control, message = motion_for_update(self.filter, landmarks, view, at, config)
                 messages += filter(None, (message,))
@@ -284,10 +289,7 @@ class StereoSlam(System):
 
     def map(self) -> MapEstimate:
         """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
-        if self.joint is None:
-            found = estimate_map(self.filter)
-        else:
-            found = MapEstimate(self.joint.ids, *self.joint.in_world(self.filter.particles))
+        found = estimate_map(self.filter)
         return replace(found, columns=self.front_end.landmarks.columns(found.ids))
 
     def particle_poses(self) -> np.ndarray:
@@ -427,7 +429,7 @@ class StereoSlam(System):
         at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity, cross=cross, noise=noise)
         return _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
 
-    def _proposed(self, view: View[Any], moved: Odometry) -> tuple[View[Any], Odometry, Proposal | None]:
+    def _proposed(self, view: Pair[Any], moved: Odometry) -> tuple[Pair[Any], Odometry, Proposal | None]:
         """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
 
         Where the map has too few landmarks in view to tell the motion, what the odometry has used is not in it either:
@@ -447,7 +449,7 @@ class StereoSlam(System):
         steps = [*(motion.odometry for motion in found.motions), found.prior]
         if not self.filter.steps:
             return np.zeros(len(steps))
-        view, before = pair.view(uncertain=self.reckoning.assumed > 0), self.reckoning.since_update
+        view, before = replace(pair, uncertain=self.reckoning.assumed > 0), self.reckoning.since_update
         controls = [before.then(self._constrained(step)) for step in steps]
         beliefs = (self.filter.expect(control, pair.stamp_ns) for control in controls)
         return np.array([self.front_end.landmarks.log_support(view, belief) for belief in beliefs])
@@ -472,11 +474,4 @@ def _figures(report: StepReport | None) -> dict[str, Any]:
     if report is None:
         return {"observed": 0, "resampled": False, "nis_dof": 0, "ess": 0.0, "log_evidence": 0.0, "nis": 0.0}
     weighed = (group.ids for group in report.groups if Part.STATE in group.updates)
-    return {
-        "observed": sum(int((ids >= 0).sum()) for ids in weighed if ids is not None),
-        "resampled": report.resampled,
-        "nis_dof": report.rows,
-        "ess": report.ess,
-        "log_evidence": report.log_evidence,
-        "nis": report.nis,
-    }
+    return filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed if ids is not None)}
