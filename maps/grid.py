@@ -116,7 +116,12 @@ class GridMap(Conditional):
         place = self._place(prior.base, beams, slack)
         cells.search(*place, info, radius, spacing, self._steps, _EVERY, found, value, hessian)
         factor = np.broadcast_to(prior.factor, (n, *prior.factor.shape[1:]))
-        curvature = np.swapaxes(factor, -1, -2) @ self._curvature(hessian) @ factor
+        # What falls off about the maximum, as information; in units in which the steps weigh the same.
+        unit = self._steps
+        curve, axes = np.linalg.eigh(-hessian * unit[:, None] * unit)
+        scaled = axes / unit[:, None]
+        falling = (scaled * np.maximum(curve, 0.0)[:, None, :]) @ np.swapaxes(scaled, -1, -2)
+        curvature = np.swapaxes(factor, -1, -2) @ falling @ factor
         root = np.linalg.cholesky(np.eye(factor.shape[2]) + curvature)
         u = (np.linalg.pinv(factor) @ found[..., None])[..., 0]
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
@@ -125,13 +130,6 @@ class GridMap(Conditional):
         # A field has no innovation, whose square would be a χ².
         unknown = np.full(n, np.nan)
         return Proposed(u, np.swapaxes(np.linalg.inv(root), -1, -2), log_w1, unknown, np.zeros(n)), fit
-
-    def _curvature(self, hessian: np.ndarray) -> np.ndarray:
-        """What falls off about a maximum (N, 3, 3), as information; in units in which the steps weigh the same."""
-        unit = self._steps
-        curve, axes = np.linalg.eigh(-hessian * unit[:, None] * unit)
-        scaled = axes / unit[:, None]
-        return (scaled * np.maximum(curve, 0.0)[:, None, :]) @ np.swapaxes(scaled, -1, -2)
 
     def log_likelihood(self, state: np.ndarray, beams: np.ndarray) -> np.ndarray:
         """(N,) log p(z | x, m) up to a constant, of a scan (K, 5) at the states (N, 3)."""
@@ -155,7 +153,8 @@ class GridMap(Conditional):
         touched = np.zeros(self.index.shape, dtype=bool)
         side = self.config.cell_m
         cells.touch(state, beams, side, self.origin, touched)
-        self._require(cells.count_shared(touched, self.index, self.users))
+        # As many at most: what is shared, or not there, in what is written.
+        self._require(int(np.count_nonzero(touched & ((self.index < 0) | (self.users[self.index] > 1)))))
         cells.own(touched, self.index, self.users, self.pool, np.flatnonzero(self.users == 0))
         cells.insert(state, beams, side, self.origin, self.index, self.pool, self._change)
 

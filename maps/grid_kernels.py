@@ -82,20 +82,6 @@ def touch(state, beams, side, origin, touched):
                 touched[n, int(y) - origin[0], int(x) - origin[1]] = True
 
 
-@njit(int64(TOUCHED, INDEX, INDICES), cache=True, error_model="numpy")
-def count_shared(touched, index, users):
-    """How many tiles `own` will take from the pool."""
-    count = 0
-    for n in range(index.shape[0]):
-        for y in range(index.shape[1]):
-            for x in range(index.shape[2]):
-                if touched[n, y, x]:
-                    tile = index[n, y, x]
-                    if tile < 0 or users[tile] > 1:
-                        count += 1
-    return count
-
-
 @njit(void(TOUCHED, INDEX, INDICES, POOL, INDICES), cache=True, error_model="numpy")
 def own(touched, index, users, pool, free):
     """Gives every particle a tile of its own wherever it will write: a copy of the one that it shares, or an empty one."""

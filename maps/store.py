@@ -49,15 +49,11 @@ class Columns:
         """Columns held."""
         self.next_id = 0
         """One more than the largest id that was ever used."""
-        self._ids = np.zeros(_FIRST_ROWS, dtype=np.int64)
+        self._hold(np.zeros((5, _FIRST_ROWS), dtype=np.int64))
         self._ascending = True
         """Whether the ids held ascend, as those that are counted up do."""
         self._sorted: tuple[np.ndarray, np.ndarray] | None = None
         """Where they do not: the ids ascending, and the rows of each; made when it is asked for."""
-        self.fields = np.zeros(_FIRST_ROWS, dtype=np.int64)
-        self.slab = np.full(_FIRST_ROWS, -1)
-        self.generation = np.zeros(_FIRST_ROWS, dtype=np.int64)
-        self.kind = np.full(_FIRST_ROWS, -1)
 
     @property
     def ids(self) -> np.ndarray:
@@ -103,8 +99,7 @@ class Columns:
     def add(self, column: int | None = None) -> int:
         """Makes room for a new column and returns its id: the one given, which must not be held, or the next one."""
         if self.count == self._ids.size:
-            for name, table in self._tables().items():
-                setattr(self, name, np.concatenate([table, np.zeros_like(table)]))
+            self._hold(np.concatenate([self._tables, np.zeros_like(self._tables)], axis=1))
         row, column = self.count, self.next_id if column is None else column
         self._ascending = self._ascending and (not row or column > int(self._ids[row - 1]))
         self._ids[row], self.slab[row], self.kind[row] = column, -1, -1
@@ -121,10 +116,9 @@ class Columns:
         room = self._ids.size
         while room > max(_FIRST_ROWS, 4 * count):
             room //= 2
-        for name, table in self._tables().items():
-            table[first:count] = table[kept]
-            if room < table.size:
-                setattr(self, name, table[:room].copy())
+        self._tables[:, first:count] = self._tables[:, kept]
+        if room < self._ids.size:
+            self._hold(self._tables[:, :room].copy())
         self.count, self._sorted = count, None
         self._ascending = self._ascending or not count
 
@@ -133,16 +127,16 @@ class Columns:
         if np.unique(ids).size < ids.size:
             raise InputError("a landmark's id comes twice")
         room = max(_FIRST_ROWS, 2 * ids.size)
-        for name, table in self._tables().items():
-            setattr(self, name, np.zeros(room, dtype=table.dtype))
+        self._hold(np.zeros((5, room), dtype=np.int64))
         self.slab[:], self.kind[:] = -1, -1
         self._ids[: ids.size] = ids
         self.count, self.next_id = ids.size, next_id
         self._ascending, self._sorted = bool((np.diff(ids) > 0).all()), None
 
-    def _tables(self) -> dict[str, np.ndarray]:
-        names = ("_ids", "fields", "slab", "generation", "kind")
-        return {name: getattr(self, name) for name in names}
+    def _hold(self, tables: np.ndarray) -> None:
+        """Five tables, one below the other."""
+        self._tables = tables
+        self._ids, self.fields, self.slab, self.generation, self.kind = tables
 
 
 class Pool:
