@@ -22,6 +22,10 @@ class FeatureFrame:
     z: np.ndarray  #: (K, p) pixels: (u, v), or (u_left, v, u_right) of a stereo pair.
     cov_z: np.ndarray  #: (K, p, p) their covariance, px².
 
+    def take(self, rows: np.ndarray | slice) -> "FeatureFrame":
+        """Some of its features, by number or by mask."""
+        return FeatureFrame(self.stamp_ns, self.landmarks[rows], self.z[rows], self.cov_z[rows])
+
 
 @dataclass(frozen=True)
 class KnownPoints:

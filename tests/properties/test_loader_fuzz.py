@@ -16,7 +16,7 @@ from rbpf.lie import SE3
 from rbpf.runs.results import load
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_table import PATCH_PX
-from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
+from rbpf.systems.mono.known_map import KnownMap, known_map_arrays, read_known_map
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.comparison import read_comparisons
@@ -141,7 +141,7 @@ def known(tmp_path_factory) -> Path:
         first_pose=np.tile(SE3.identity(), (count, 1)),
         views=SE3.identity()[None],
     )
-    write_known_map(path, found)
+    save_arrays(path, known_map_arrays(found))
     assert read_known_map(path).names.size == count
     return path
 

@@ -8,7 +8,6 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers import KnownPixels
 from rbpf.systems.mono.known_start import (
     ISOTROPIC,
@@ -16,7 +15,6 @@ from rbpf.systems.mono.known_start import (
     KnownStart,
     constellation,
     constellation_records,
-    located_points,
     require_texture,
     resect_known,
 )
@@ -66,7 +64,8 @@ def test_no_camera_is_found_by_them(given, words):
 
 def test_what_is_given_of_a_point_is_uncertain_along_the_line_of_sight():
     given = replace(points(), std_m=np.linspace(0.01, 0.06, 6))
-    located, pose = located_points(CAMERA, given, noise_px=1.0)
+    start = KnownStart.from_pixels(CAMERA, given, noise_px=1.0)
+    located, pose = start.points, start.world_from_camera
     assert np.abs(SE3.local(pose, POSE)).max() < 1e-6
     np.testing.assert_allclose(np.trace(located.cov, axis1=1, axis2=2), given.std_m**2)
     line = given.positions - POSE[4:]
@@ -82,7 +81,7 @@ def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sigh
         given = replace(points(), std_m=np.full(6, std))
         across = error * rng.standard_normal((6, 3))
         across -= (across @ SE3.rotation(POSE)[:, 2])[:, None] * SE3.rotation(POSE)[:, 2]
-        located, _ = located_points(CAMERA, replace(given, positions=given.positions + across), 0.3)
+        located = KnownStart.from_pixels(CAMERA, replace(given, positions=given.positions + across), 0.3).points
         fractions.append(np.sqrt(np.linalg.eigvalsh(located.cov)[:, 0]) / std)
     np.testing.assert_allclose(fractions[0], TRIANGULATED, rtol=1e-6)
     assert (fractions[1] > 1.5 * TRIANGULATED).all() and (fractions[1] < ISOTROPIC).all()
@@ -100,10 +99,8 @@ def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
         line = seen / np.linalg.norm(seen, axis=1, keepdims=True) @ SE3.rotation(POSE).T
         placed = exact.positions + std_m * rng.standard_normal((6, 1)) * line
         given = replace(exact, px=px, positions=placed, std_m=np.full(6, std_m))
-        located, pose = located_points(CAMERA, given, std_px)
-        sight = FeatureFrame(0, located.names, px, np.tile(std_px**2 * np.eye(2), (6, 1, 1)))
-        start = KnownStart(located, pose, np.arange(6), sight)
-        group, cov_frame = constellation(located), np.diag(np.repeat([0.25, 1.0], 3))
+        start = KnownStart.from_pixels(CAMERA, given, std_px)
+        group, cov_frame = constellation(start.points), np.diag(np.repeat([0.25, 1.0], 3))
         records = constellation_records(CAMERA, start, group, 1, cov_frame)
         frame, factor = (part[0] for part in group.frame(records))
         error = SE3.local(frame, SE3.inverse(POSE))

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_images
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence, Source
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
+from rbpf.systems.mono.known_map import KnownMap, known_map_arrays, read_known_map
 from tests.systems.plane_sequences import CAMERA, known_points, made_up_map, path, sequence
 
 MAPPED, FRAMES = 60, 90
@@ -115,7 +116,7 @@ FISHEYE = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.
 def test_the_file_keeps_every_bit(tmp_path, camera, count):
     """The kind of lens is told of a fisheye alone: files of others are as they were before there was one."""
     written = replace(made_up_map(), camera=camera)
-    write_known_map(tmp_path / "known_map.npz", written)
+    save_arrays(tmp_path / "known_map.npz", known_map_arrays(written))
     read = read_known_map(tmp_path)
     assert read.camera == written.camera and read.alignment == written.alignment
     for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views"):
@@ -136,7 +137,7 @@ def test_the_file_keeps_every_bit(tmp_path, camera, count):
 )
 def test_a_damaged_file_is_refused(tmp_path, change, words):
     path = tmp_path / "known_map.npz"
-    write_known_map(path, made_up_map())
+    save_arrays(path, known_map_arrays(made_up_map()))
     with np.load(path) as archive:
         arrays = dict(archive)
     np.savez(path, **(arrays | change))
@@ -147,7 +148,7 @@ def test_a_damaged_file_is_refused(tmp_path, change, words):
 def test_no_map_too_small_a_map_and_another_camera(tmp_path, mapped):
     with pytest.raises(InputError, match="there is no such map"):
         read_known_map(tmp_path)
-    write_known_map(tmp_path / "known_map.npz", made_up_map(5))
+    save_arrays(tmp_path / "known_map.npz", known_map_arrays(made_up_map(5)))
     with pytest.raises(InputError, match="holds 5 points of known depth"):
         read_known_map(tmp_path)
     (tmp_path / "known_map.npz").write_bytes(b"no archive")

@@ -12,8 +12,8 @@ from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
-from rbpf.systems.mono.config import StartConfig, VelocityConfig
-from rbpf.systems.mono.unknown_start import SCALE_STD, Expected, Linearised, Structure, UnknownStart, Window, optimum
+from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
+from rbpf.systems.mono.unknown_start import SCALE_STD, Linearised, Structure, UnknownStart, Window, optimum
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
@@ -68,7 +68,7 @@ def resampled(monkeypatch) -> list[int]:
 
     def noted(self, *args):
         out = original(self, *args)
-        done.extend([] if out[0] is None else [len(out[0].stamps_ns)])
+        done.extend([] if out[0] is None else [len(out[0].revision.stamps_ns)])
         return out
 
     monkeypatch.setattr(UnknownStart, "after_frame", noted)
@@ -162,7 +162,7 @@ def test_where_the_lens_has_no_direction_the_start_does_not_stop(resampled):
 # The optimum: its derivatives, its minimum, and what is drawn around it.
 
 LENS = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, distortion=(0.05, -0.02, 0.001, 0.0, 0.0))
-EXPECTED = Expected((0.8, 0.6), np.repeat([0.5, 0.5], 3), np.repeat([3.0, 1.5], 3))
+EXPECTED = MonoConfig()
 FRAMES, FEATURES = 7, 14
 
 
@@ -216,12 +216,12 @@ def test_a_camera_that_seems_to_stand_still_is_found_to_have_moved():
     assert np.abs(best.structure.inverse - truth.inverse).max() < 0.1
 
 
-def walking(seed: int, expected: Expected, frames: int = 12, noise_px: float = 0.5) -> tuple[Window, Structure]:
+def walking(seed: int, expected: VelocityConfig, frames: int = 12, noise_px: float = 0.5) -> tuple[Window, Structure]:
     """As `scene`, with a path drawn from the motion that is expected."""
     rng, dt = np.random.default_rng(seed), 0.033
-    velocity, path = expected.std_start * rng.normal(size=6), [SE3.identity()]
+    velocity, path = expected.start_std() * rng.normal(size=6), [SE3.identity()]
     for _ in range(frames - 1):
-        walk = velocity_walk(expected.std_walk, dt) @ rng.normal(size=12)
+        walk = velocity_walk(expected.walk_std(), dt) @ rng.normal(size=12)
         path.append(SE3.retract(path[-1], dt * velocity + walk[:6]))
         velocity = velocity + walk[6:]
     _, truth = scene(seed)
@@ -237,11 +237,11 @@ def walking(seed: int, expected: Expected, frames: int = 12, noise_px: float = 0
 def test_errors_are_as_large_as_the_information_says():
     """Normalised squared errors over thirty windows; with differences of velocities as independent or without the loss's
     share of the information the poses' is below 0.85."""
-    expected = Expected((0.8, 0.6), np.repeat([0.2, 0.3], 3), np.repeat([0.5, 0.5], 3))
+    velocity = VelocityConfig(walk_rad_s=0.5, walk_m_s=0.5, start_rad_s=0.2, start_m_s=0.3)
     of_poses, of_features = [], []
     for seed in range(30):
-        window, truth = walking(seed, expected)
-        best = optimum(window, expected, truth)
+        window, truth = walking(seed, velocity)
+        best = optimum(window, MonoConfig(velocity=velocity), truth)
         off = SE3.local(best.structure.path[1:], truth.path[1:]).ravel()
         cov = np.linalg.inv(best.information)[: off.size, : off.size]
         of_poses.append(off @ np.linalg.solve(cov, off) / off.size)

@@ -121,6 +121,7 @@ class ActiveSearch:
         self.features, self.camera = features, features.camera
         self.table, self.config = table, config
         self.gate = gate or RobustMotionGate()
+        self.noise = config.noise_px**2 * np.eye(2)  #: covariance of a found place, px².
 
     def run(self, image: np.ndarray, belief: Belief) -> SearchResult:
         """Looks for features in an image (H, W) uint8; what is found agrees with one motion of the camera."""
@@ -133,7 +134,7 @@ class ActiveSearch:
 
         # Each is looked for in the ellipse where all particles together expect it, as it looked at first.
         which, mean, cov = self.features.project(belief, rows)
-        rows, cov = rows[which], cov + self._noise()
+        rows, cov = rows[which], cov + self.noise
         templates = self.templates(rows, self.table.first_patch, self.table.first_pose, pose)
         matches = self.match(image, templates, mean, cov)
         result = SearchResult(rows, mean, cov, *matches, in_view, seconds_choosing)
@@ -219,7 +220,7 @@ class ActiveSearch:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Which of the features, ν, H, and S of them in the heaviest particle; see `FeatureSensor.innovations`."""
         which, nu, jac, cov = self.features.innovations(belief, rows, px)
-        return which, nu, jac, cov + self._noise()
+        return which, nu, jac, cov + self.noise
 
     def _placed(self, cov: np.ndarray) -> np.ndarray:
         """Which features (K,) are where the camera's motion puts them, up to what is searched.
@@ -229,6 +230,3 @@ class ActiveSearch:
         """
         own = self.config.ellipse_sigmas * np.sqrt(np.linalg.eigvalsh(cov)[:, -1])
         return np.asarray(own <= WIDEST * self.config.max_radius_px)
-
-    def _noise(self) -> np.ndarray:
-        return self.config.noise_px**2 * np.eye(2)

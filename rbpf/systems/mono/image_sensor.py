@@ -195,12 +195,7 @@ class ImageSensor(Sensor):
         trusted = self.table.trusted(used.landmarks, self.config.trusted_fraction)
         if trusted.all():
             return list(self.features.observe(used, belief))
-        of_trusted, others = (
-            self.features.observe(
-                FeatureFrame(used.stamp_ns, used.landmarks[rows], used.z[rows], used.cov_z[rows]), belief
-            )
-            for rows in (trusted, ~trusted)
-        )
+        of_trusted, others = (self.features.observe(used.take(rows), belief) for rows in (trusted, ~trusted))
         only_map = [replace(group, updates=_MAP) for group in others if Part.LANDMARK in group.updates]
         return [*of_trusted, *only_map]
 
@@ -209,9 +204,15 @@ class ImageSensor(Sensor):
     ) -> Sequence[NewLandmarks]:
         """Counts what was found, drops what fails, and starts features at corners where there is room."""
         started = time.perf_counter()
+        rows, table, config = frame.search.features, self.table, self.config
         failing = np.zeros(0, dtype=np.int64)
-        if frame.search.features.size and not self.bad_frames:
-            failing = self._judge(frame.search)
+        if rows.size and not self.bad_frames:
+            table.count_search(rows, frame.search.found)
+            if not self.features.fixed:
+                missed_often = 1.0 - table.found[rows] / table.attempts[rows] > config.max_failure_ratio
+                failing = rows[missed_often & (table.attempts[rows] >= config.min_attempts)]
+                table.alive[failing] = False
+                failing = failing[table.member[failing] < 0]
         self.place(belief, frame.used.landmarks)
         pose = belief.state[belief.mode][:7]
         if frame.image is not None and not self.bad_frames:
@@ -272,17 +273,6 @@ class ImageSensor(Sensor):
         found = found[radius <= config.max_radius_px]
         fraction = config.lost_fraction if recognised else config.recovered_fraction
         return bool(found.sum() < max(least, fraction * found.size))
-
-    def _judge(self, search: SearchResult) -> np.ndarray:
-        """Counts hits and misses; rows (J,) of what is missed too often."""
-        rows, table, config = search.features, self.table, self.config
-        table.count_search(rows, search.found)
-        if self.features.fixed:
-            return np.zeros(0, dtype=np.int64)
-        failing = 1.0 - table.found[rows] / table.attempts[rows] > config.max_failure_ratio
-        drop = rows[failing & (table.attempts[rows] >= config.min_attempts)]
-        table.alive[drop] = False
-        return np.asarray(drop[table.member[drop] < 0])
 
     def _keep_appearances(self, image: np.ndarray, used: FeatureFrame, pose: np.ndarray) -> None:
         """Renews the last appearance of the features that look different by now.

@@ -7,11 +7,10 @@ first_px (K, 2), first_pose (K, 7), views (V, 7).
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from rbpf.core.checkpoint import fitting, grey, integers, load_arrays, numbers, poses, read, save_arrays, text
+from rbpf.core.checkpoint import fitting, grey, integers, load_arrays, numbers, poses, read, text
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -24,10 +23,9 @@ from rbpf.sensors.feature_log import KnownPoints
 from rbpf.systems.anchoring import Anchored
 from rbpf.systems.map_estimate import MapEstimate, mixture_moments, relative_points
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.feature_table import PATCH_PX, FeatureTable
+from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.system import Gauge
 
-Alignment = Literal["none", "rigid", "similarity"]
 NAME = "known_map.npz"
 VERSION = 1
 LEAST = 8
@@ -52,7 +50,7 @@ _SCHEMA = {
     "first_pose": poses("points"),
     "views": poses("views"),
 }
-_ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
+_GAUGES: dict[str, Gauge] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,7 @@ class KnownMap:
     """K points of a finished run, in its world."""
 
     camera: Pinhole  #: that saw them.
-    #: what the world has in common with the ground truth's: "none" where it is the same one, "rigid" up to a motion,
-    #: "similarity" up to a motion and a scale.
-    alignment: Alignment
+    alignment: Gauge  #: what the world has in common with the ground truth's.
     names: np.ndarray  #: (K,) int64.
     positions: np.ndarray  #: (K, 3).
     cov: np.ndarray  #: (K, 3, 3) of them, within + between particles.
@@ -115,11 +111,6 @@ def known_map_arrays(found: KnownMap) -> dict[str, np.ndarray]:
     }
 
 
-def write_known_map(path: Path, found: KnownMap) -> None:
-    """Writes the file, whole or not at all."""
-    save_arrays(path, known_map_arrays(found))
-
-
 def read_known_map(path: Path) -> KnownMap:
     """Reads the file, or that of a run's folder.
 
@@ -139,24 +130,20 @@ def read_known_map(path: Path) -> KnownMap:
     if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
         raise InputError(f"{path} is no map of this version of the program: map again")
     with fitting(path):
-        found = _parsed(arrays)
+        if "camera" in arrays and arrays["camera"].shape == (9,):
+            arrays = arrays | {"camera": np.append(arrays["camera"], RadialTangential.kind)}
+        parts = read(arrays, _SCHEMA)
+        if not len(parts["views"]) or (np.linalg.eigvalsh(parts["cov"]) < 0.0).any():
+            raise InputError("expected views, and covariances that are none less than zero")
+        params, size, alignment = (parts.pop(name) for name in ("camera", "image_size", "alignment"))
+        width, height = size.tolist()
+        camera = Pinhole.from_params(width, height, params)
+        found = KnownMap(camera, _GAUGES[str(alignment)], **parts)
     if found.names.size < LEAST:
         raise InputError(
             f"{path} holds {found.names.size} points of known depth, expected at least {LEAST}: map for longer"
         )
     return found
-
-
-def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
-    if "camera" in arrays and arrays["camera"].shape == (9,):
-        arrays = arrays | {"camera": np.append(arrays["camera"], RadialTangential.kind)}
-    found = read(arrays, _SCHEMA)
-    if not len(found["views"]) or (np.linalg.eigvalsh(found["cov"]) < 0.0).any():
-        raise InputError("expected views, and covariances that are none less than zero")
-    params, size, alignment = (found.pop(name) for name in ("camera", "image_size", "alignment"))
-    width, height = size.tolist()
-    camera = Pinhole.from_params(width, height, params)
-    return KnownMap(camera, _ALIGNMENTS[str(alignment)], **found)
 
 
 def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored | None) -> MapEstimate:
@@ -197,38 +184,9 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
     return MapEstimate(names[order], means.reshape(-1, 3)[order], covs.reshape(-1, 3, 3)[order], columns, spans)
 
 
-def known_map_of(
-    camera: Pinhole,
-    gauge: Gauge,
-    found: MapEstimate,
-    table: FeatureTable,
-    world_in_mode: np.ndarray | None,
-    poses: np.ndarray,
-) -> KnownMap:
-    """The points of a run's map that it still holds and whose depth is known, with how they look.
-
-    The reported world is `world_in_mode` (7,) in the heaviest particle's own, None where it is the same; poses (T, 7) were
-    tracked.
-    """
-    kept = np.flatnonzero(~found.is_ray() & table.alive[found.ids])
-    rows, positions = found.ids[kept], found.mean[kept]
-    first = table.first_pose[rows]
-    if world_in_mode is not None:
-        first = SE3.compose(SE3.inverse(world_in_mode), first)
-
-    # Views that are far from each other: a turn by a radian is as far as the scene's depth.
+def distant_views(positions: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses (V, 7) of (T, 7) that are far from each other: a turn by a radian is as far as the depth of points (K, 3)."""
     centre = poses[:, 4:].mean(axis=0)
     depth = float(np.linalg.norm(positions - centre, axis=1).mean()) if len(positions) else 1.0
     ahead = SE3.rotation(poses) @ np.array([0.0, 0.0, 1.0])
-    chosen = spread_rows(np.concatenate([poses[:, 4:] / depth, ahead], axis=1), MAX_VIEWS)
-    return KnownMap(
-        camera=camera,
-        alignment=_ALIGNMENTS[gauge],
-        names=rows,
-        positions=positions,
-        cov=found.cov[kept],
-        windows=table.first_patch[rows],
-        first_px=table.first_px[rows],
-        first_pose=first,
-        views=poses[chosen],
-    )
+    return poses[spread_rows(np.concatenate([poses[:, 4:] / depth, ahead], axis=1), MAX_VIEWS)]

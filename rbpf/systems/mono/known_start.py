@@ -70,28 +70,6 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
     return world_from_camera
 
 
-def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tuple[KnownPoints, np.ndarray]:
-    """Known points, named 0, 1, …, with the covariance of their errors, and the first camera.
-
-    What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
-    standard deviation is taken. Across it the first image has the word: where even the best camera leaves residuals
-    beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Their
-    covariances have the traces std_m². Errors as `resect_known`.
-    """
-    pose = resect_known(camera, known, noise_px)
-    local = SE3.inverse_transform(pose, known.positions)
-    residual = camera.project(local) - known.px
-    squared, dof = float(np.square(residual).sum()), residual.size - 6
-    excess = squared / dof - noise_px**2 if squared > chi_square_quantile(NOISE_PROBABILITY, dof) * noise_px**2 else 0.0
-    seen = excess * (local[:, 2] / camera.fx) ** 2
-    var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[:, None, None]
-    line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]
-    along = line @ np.swapaxes(line, -1, -2)
-    var_along = known.std_m[:, None, None] ** 2 - 2.0 * var_across
-    cov = var_along * along + var_across * (np.eye(3) - along)
-    return KnownPoints(np.arange(known.names.size), known.positions, cov), pose
-
-
 @dataclass(frozen=True)
 class KnownStart:
     """Known points, and what the first frame shows of them."""
@@ -103,8 +81,26 @@ class KnownStart:
 
     @classmethod
     def from_pixels(cls, camera: Pinhole, known: KnownPixels, noise_px: float) -> "KnownStart":
-        """Of points that are given with their pixels in the first image; errors as `resect_known`."""
-        points, pose = located_points(camera, known, noise_px)
+        """Of points that are given with their pixels in the first image, named 0, 1, …; errors as `resect_known`.
+
+        What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
+        standard deviation is taken. Across it the first image has the word: where even the best camera leaves residuals
+        beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Their
+        covariances have the traces std_m².
+        """
+        pose = resect_known(camera, known, noise_px)
+        local = SE3.inverse_transform(pose, known.positions)
+        residual = camera.project(local) - known.px
+        squared, dof = float(np.square(residual).sum()), residual.size - 6
+        is_noise = squared <= chi_square_quantile(NOISE_PROBABILITY, dof) * noise_px**2
+        excess = 0.0 if is_noise else squared / dof - noise_px**2
+        seen = excess * (local[:, 2] / camera.fx) ** 2
+        var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[:, None, None]
+        line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]
+        along = line @ np.swapaxes(line, -1, -2)
+        var_along = known.std_m[:, None, None] ** 2 - 2.0 * var_across
+        cov = var_along * along + var_across * (np.eye(3) - along)
+        points = KnownPoints(np.arange(known.names.size), known.positions, cov)
         noise = np.tile(noise_px**2 * np.eye(2), (known.names.size, 1, 1))
         return cls(points, pose, points.names, FeatureFrame(0, points.names, known.px, noise))
 
@@ -113,8 +109,7 @@ class KnownStart:
         """Of named features of the first frame; an InputError if fewer than four, or they do not determine the camera."""
         inside = np.flatnonzero(camera.inside(first.z))
         _, rows, which = np.intersect1d(known.names, first.landmarks[inside], return_indices=True)
-        k = inside[which]
-        seen = FeatureFrame(first.stamp_ns, first.landmarks[k], first.z[k], first.cov_z[k])
+        seen = first.take(inside[which])
         return cls(known, resect(camera, known.positions[rows], seen.z), rows, seen)
 
 

@@ -7,7 +7,7 @@ corners say how the camera has turned since and in which direction it went.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 
@@ -95,14 +95,6 @@ class Attempt:
     certain: bool = False  #: whether the image was recognised beyond doubt.
 
 
-class LostPrior(NamedTuple):
-    """Where a lost camera may be: a prior, whether it is a place recognised beyond doubt, and the last attempt to do so."""
-
-    pose: PosePrior
-    certain: bool
-    attempt: Attempt | None
-
-
 @final
 class TrackingLoss:
     """Remembers where the camera was last trusted, and says where it may be while it is lost.
@@ -148,8 +140,10 @@ class TrackingLoss:
             self._mode = poses[log_weights.argmax()].copy()
         return self._trusted
 
-    def prior(self, filter_: Filter, image: np.ndarray | None) -> LostPrior:
+    def prior(self, filter_: Filter, image: np.ndarray | None) -> tuple[PosePrior, Attempt | None]:
         """Where a lost camera may be in the next frame: where it is recognised, else near the last trusted pose.
+
+        And how far the last attempt to recognise it came.
 
         A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
         turn back. It is looked for from the last trusted pose; then from views of a known map, in the first frame from
@@ -171,10 +165,9 @@ class TrackingLoss:
                 found = attempt.prior
                 # The covariance is in the camera's chart, where a particle's world does not matter.
                 poses = self.relocaliser.in_all_worlds(belief, found.mean)
-                prior = PosePrior(poses, found.cov, self.std_velocity)
-                return LostPrior(prior, attempt.certain, attempt)
+                return PosePrior(poses, found.cov, self.std_velocity), attempt
         std = np.repeat([self.config.search_std_rad, self.config.search_std_m], 3)
-        return LostPrior(PosePrior(pose, cov + np.diag(std**2), self.std_velocity), False, attempt)
+        return PosePrior(pose, cov + np.diag(std**2), self.std_velocity), attempt
 
     def drift(self, stamp_ns: int) -> np.ndarray:
         """Covariance (6, 6) of how far the camera may have gone since the pose was trusted, [ω, v]."""
@@ -247,7 +240,8 @@ class Relocaliser:
         # Landmarks as they should look from near by are matched with the corners; and so is the last view.
         candidates = Candidates(image, rows, points, px)
         descriptors = describe_corners(self.sensor, image, px)
-        distances = descriptor_distances(self.describe_landmarks(candidates, near), descriptors)
+        products = similarities(self.describe_landmarks(candidates, near), descriptors)
+        distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
         pairs = match_by_ratio(distances, points / size, px / config.spacing_px, config.descriptor_ratio)
         again = None if last is None else last.match(descriptors, px, points)
@@ -481,11 +475,6 @@ def similarities(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Greatest product (L, K) of descriptors of unit length (L, d) with those of K places (S, K, d)."""
     products = (one @ other.reshape(-1, other.shape[-1]).T).reshape(-1, *other.shape[:2])
     return np.asarray(products.max(axis=1))
-
-
-def descriptor_distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Least distance (L, K) of descriptors (L, d) from those of K places (S, K, d)."""
-    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * similarities(one, other), 0.0)))
 
 
 def match_by_ratio(

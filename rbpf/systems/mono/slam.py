@@ -9,7 +9,7 @@ search inside, what is reported, and, as long as depths are unknown, the batch a
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, final
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import Belief, Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
+from rbpf.core.models import Conditional, MotionModel, Records, Sensor
 from rbpf.core.particles import mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -36,18 +36,13 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
-from rbpf.systems.mono.known_map import NAME, KnownMap, estimate_mono_map, known_map_arrays, known_map_of
+from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
 from rbpf.systems.mono.unknown_start import UnknownStart
 from rbpf.systems.system import (
     DIAGNOSTICS,
-    ESS,
-    LOG_EVIDENCE,
-    NIS,
-    NIS_DOF,
-    RESAMPLED,
-    TIMINGS,
+    FILTER_COLUMNS,
     Column,
     Gauge,
     Ragged,
@@ -56,6 +51,8 @@ from rbpf.systems.system import (
     System,
     Tracked,
     TrackingState,
+    filter_values,
+    timing,
 )
 
 LINE_SIGMAS = 3.0
@@ -98,23 +95,13 @@ class MonoSlam(System):
         Column("searched", "features looked for", kind=int, table=DIAGNOSTICS),
         Column("found", "features that the filter used", kind=int, table=DIAGNOSTICS),
         Column("lost", "whether the camera was lost after the frame", kind=bool, table=DIAGNOSTICS),
-        ESS,
-        RESAMPLED,
-        LOG_EVIDENCE,
-        NIS,
-        NIS_DOF,
+        *FILTER_COLUMNS,
         Column("relocalised", "whether a camera that was lost was found again in the frame", kind=bool),
         Column("points", "points in the map after the frame", kind=int),
         Column("rays", "features of unknown depth in the map after the frame", kind=int),
-        Column("seconds_search", "time of the search in the image", "s", table=TIMINGS, heading="search_ms"),
-        Column("seconds_filter", "time of everything else", "s", table=TIMINGS, heading="filter_ms"),
-        Column(
-            "seconds_new_landmarks",
-            "time of judging what was looked for and of starting features",
-            "s",
-            table=TIMINGS,
-            heading="new_features_ms",
-        ),
+        timing("seconds_search", "time of the search in the image", "search_ms"),
+        timing("seconds_filter", "time of everything else", "filter_ms"),
+        timing("seconds_new_landmarks", "time of judging what was looked for and starting features", "new_features_ms"),
     )
     observed = (
         Ragged("features", "features that were looked for", kind="int64"),
@@ -167,7 +154,7 @@ class MonoSlam(System):
         self.features = FeatureSensor(camera, rays, config.max_new_per_frame, group, is_fixed)
         self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
         self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
-        self.filter = self._new_filter(_Either(self.sensor, self._named))
+        self.filter = self._new_filter(self.sensor)
         self.screen = ImageScreen(camera)
         if known_map is not None:
             self._add_points(known_map.points)
@@ -230,6 +217,7 @@ class MonoSlam(System):
                 problem = "there is no image"
             messages += [] if problem is None else [problem]
             measured, is_empty = Measurement(stamp_ns, image), image is None
+        self.filter.sensors = [sensor if isinstance(measured, Measurement) else self._named]
 
         # 2. The first frame places the known points.
         prior: PosePrior | None = None
@@ -246,7 +234,8 @@ class MonoSlam(System):
                 at_rest = self.config.velocity.start_std()
                 prior = PosePrior(SE3.identity(), np.zeros((6, 6)), at_rest)
             elif sensor.lost:
-                prior, measured.recognised, self.attempt = self.loss.prior(self.filter, measured.image)
+                prior, self.attempt = self.loss.prior(self.filter, measured.image)
+                measured.recognised = self.attempt is not None and self.attempt.certain
 
         # 4. The filter's step: active search, proposal, weights, samples, landmarks; see `ImageSensor`.
         report = self.report = self.filter.step(measured, prior, stamp_ns)
@@ -270,7 +259,7 @@ class MonoSlam(System):
         observed = self._observed(shown, world, first_new)
 
         # 6. While depths are unknown: batch adjustment of the frames so far, and particles drawn from it.
-        revision = None
+        revision: Revision | None = None
         if not self.start.over:
             seen = measured.features if isinstance(measured, Measurement) else measured
             is_lost = sensor.lost and len(sensor.table) > 0
@@ -278,9 +267,8 @@ class MonoSlam(System):
             near = mixture_estimate(*report.mixture).mean[:7]
             resampled, words = self.start.after_frame(self.filter, seen, near, not sensor.bad_frames, is_lost)
             if resampled is not None:
-                self.filter = resampled.filter
-                revision = Revision(resampled.stamps_ns, resampled.poses, resampled.covs)
-                pose, cov = resampled.poses[-1], resampled.covs[-1]
+                self.filter, revision = resampled.filter, resampled.revision
+                pose, cov = revision.poses[-1], revision.covs[-1]
                 if isinstance(measured, Measurement):
                     sensor.resampled(self.filter.belief(), resampled.path, resampled.frame_of)
                     self.loss.trust(self.filter, measured.image)
@@ -373,10 +361,19 @@ class MonoSlam(System):
         return files
 
     def export_map(self, poses: np.ndarray) -> KnownMap:
-        """The map as a place in which later runs find their camera, looking from some of the tracked poses (T, 7)."""
-        table, world = self.sensor.table, world_of(self.filter)
-        mode = None if world is None else world.mean[self.filter.belief().mode]
-        return known_map_of(self.camera, self.gauge, self.map(), table, mode, poses)
+        """The map as a place in which later runs find their camera, looking from some of the tracked poses (T, 7).
+
+        It has the points that are still held and whose depth is known, with how they look.
+        """
+        found, table, world = self.map(), self.sensor.table, world_of(self.filter)
+        kept = np.flatnonzero(~found.is_ray() & table.alive[found.ids])
+        rows, positions = found.ids[kept], found.mean[kept]
+        first = table.first_pose[rows]
+        if world is not None:
+            first = SE3.compose(SE3.inverse(world.mean[self.filter.belief().mode]), first)
+        looks = table.first_patch[rows], table.first_px[rows], first
+        views = distant_views(positions, poses)
+        return KnownMap(self.camera, self.gauge, rows, positions, found.cov[kept], *looks, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The sensor's table, the last trusted pose, and the frames of a start that is not over."""
@@ -448,8 +445,7 @@ class MonoSlam(System):
         records = constellation_records(self.camera, start, group, config.particles, np.diag(std**2))
         landmark_map.add_records(records, group, ids=start.points.names[:1])
         if isinstance(measured, FeatureFrame):
-            rest = ~np.isin(measured.landmarks, start.points.names)
-            measured = FeatureFrame(measured.stamp_ns, measured.landmarks[rest], measured.z[rest], measured.cov_z[rest])
+            measured = measured.take(~np.isin(measured.landmarks, start.points.names))
         return measured, PosePrior(SE3.identity(), np.zeros((6, 6)))
 
     def _add_points(self, known: KnownPoints) -> None:
@@ -474,11 +470,7 @@ class MonoSlam(System):
             "searched": searched,
             "found": found,
             "lost": self.sensor.lost,
-            "ess": report.ess,
-            "resampled": report.resampled,
-            "log_evidence": report.log_evidence,
-            "nis": report.nis,
-            "nis_dof": report.rows,
+            **filter_values(report),
             "points": landmark_map.ids.size - rays,
             "rays": rays,
             "seconds_search": seconds_search,
@@ -529,25 +521,6 @@ class MonoSlam(System):
         messages = [*messages, "the run starts with the first image that shows the known points"]
         pose, cov = self._start.world_from_camera, np.diag(std**2)
         return Tracked(stamp_ns, pose, cov, TrackingState.INITIALISING, values, self._nothing(), tuple(messages))
-
-
-@final
-class _Either(Sensor):
-    """Images to the one sensor, named features to the other."""
-
-    def __init__(self, images: ImageSensor, named: Sensor) -> None:
-        self.images, self.named = images, named
-
-    def observe(self, frame: Measurement | FeatureFrame, belief: Belief) -> Sequence[Observations]:
-        return self._of(frame).observe(frame, belief)
-
-    def new_landmarks(
-        self, frame: Measurement | FeatureFrame, belief: Belief, observed: Sequence[Observations]
-    ) -> Sequence[NewLandmarks]:
-        return self._of(frame).new_landmarks(frame, belief, observed)
-
-    def _of(self, frame: Measurement | FeatureFrame) -> Sensor:
-        return self.images if isinstance(frame, Measurement) else self.named
 
 
 def world_of(filter_: Filter) -> Anchored | None:

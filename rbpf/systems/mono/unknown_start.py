@@ -39,6 +39,7 @@ from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.active_search import CAUCHY_SCALE
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.systems.system import Revision
 
 MIN_VIEWS = 3
 """Frames that must see a feature for it to take part."""
@@ -100,9 +101,7 @@ class Resampled:
     """What a batch adjustment leaves."""
 
     filter: Filter  #: whose particles were resampled, in place of the one so far.
-    stamps_ns: np.ndarray  #: (T,) of all frames so far.
-    poses: np.ndarray  #: (T, 7) world_from_camera in them, means over the particles' paths.
-    covs: np.ndarray  #: (T, 6, 6) of them in the right chart at each.
+    revision: Revision  #: of all T frames so far: means over the particles' paths.
     path: np.ndarray  #: (T, 7) of the heaviest particle.
     frame_of: np.ndarray  #: (F,) in which of the frames each of F features was seen first, in the order of their names.
 
@@ -124,8 +123,9 @@ class UnknownStart:
         self._next = config.start.first_adjustment
         self._frames: list[FeatureFrame] = []
         self._path: list[np.ndarray] = []
-        self._last: tuple[np.ndarray, np.ndarray, Structure] | None = None
-        """Names, numbers of the frames, and optimum of the last adjustment."""
+        nothing = np.zeros(0, dtype=np.int64)
+        self._last = nothing, nothing, Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0))
+        """Names, numbers of the frames, and optimum of the last adjustment; empty before one."""
 
     def after_frame(
         self, filter_: Filter, seen: FeatureFrame, pose: np.ndarray, usable: bool, lost: bool
@@ -154,11 +154,10 @@ class UnknownStart:
         self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
         frames, path = self._frames, np.array(self._path)
         best, self.over = self._adjusted(filter_, frames, path)
-        if best is None:
-            if not self.over:
-                return None, None
+        if self.over:
             self._frames, self._path = [], []
-            return None, DISCONNECTED
+        if best is None:
+            return None, DISCONNECTED if self.over else None
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         steps, optimum_ = best
@@ -171,17 +170,13 @@ class UnknownStart:
         poses, covs = np.array([each.mean for each in means]), np.array([each.cov for each in means])
         _, first = np.unique(np.concatenate([frame.landmarks for frame in frames]), return_index=True)
         frame_of = np.repeat(np.arange(count), [frame.landmarks.size for frame in frames])[first]
-        self._path = list(poses)
-        if self.over:
-            self._frames, self._path = [], []
+        self._path = [] if self.over else list(poses)
         path = paths[:, filter_.belief().mode]
-        return Resampled(filter_, stamps, poses, covs, path, frame_of), None
+        return Resampled(filter_, Revision(stamps, poses, covs), path, frame_of), None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        nothing = np.zeros(0, dtype=np.int64)
-        no_structure = Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0))
-        names, steps, structure = self._last or (nothing, nothing, no_structure)
+        names, steps, structure = self._last
         out = {
             "start/progress": np.array([self.over, self._next]),
             "start/names": names,
@@ -208,8 +203,7 @@ class UnknownStart:
         over, self._next = last["progress"].tolist()
         self.over = bool(over)
         names, steps = last["names"], last["steps"]
-        structure = Structure(last["path"], last["direction"], last["inverse"])
-        self._last = (names, steps, structure) if names.size else None
+        self._last = names, steps, Structure(last["path"], last["direction"], last["inverse"])
         self._frames, self._path = [], []
         if "start/frames/stamps_ns" in arrays:
             held = read(arrays, _FRAMES, "start/frames/")
@@ -250,12 +244,9 @@ class UnknownStart:
         ordered = np.empty_like(position)
         ordered[which] = position
         starts = [_structure(SE3.between(path[steps][:1], path[steps]), ordered)]
-        if self._last is not None:
+        if self._last[0].size:
             starts.append(self._gone_on(seen, names, path[steps], steps))
-        inverse_depth, velocity = self.config.inverse_depth, self.config.velocity
-        rho = inverse_depth.mean_per_m, inverse_depth.std_per_m
-        expected = Expected(rho, velocity.start_std(), velocity.walk_std())
-        found = [optimum(seen, expected, start) for start in starts]
+        found = [optimum(seen, self.config, start) for start in starts]
         found = [each for each in found if np.isfinite(each.cost) and np.isfinite(each.information).all()]
         if not found:
             return None, True
@@ -282,7 +273,6 @@ class UnknownStart:
 
     def _gone_on(self, seen: "Window", names: np.ndarray, path: np.ndarray, steps: np.ndarray) -> "Structure":
         """The last adjustment's path and structure, gone on with as the filter moved, and what is new at the prior."""
-        assert self._last is not None
         before, old_steps, structure = self._last
         joint = int(np.searchsorted(steps, old_steps[-1], side="right")) - 1
         start = between(old_steps, structure.path[None], steps[: joint + 1])[:, 0]
@@ -316,7 +306,7 @@ class UnknownStart:
                     moved = SE3.log(SE3.between(before[:, :7], state)) / seconds
                 state = np.concatenate([state, moved], axis=1)
             if t not in steps:
-                frame = FeatureFrame(frame.stamp_ns, frame.landmarks[:0], frame.z[:0], frame.cov_z[:0])
+                frame = frame.take(slice(0))
             new.follow(state, frame, at_rest if t <= first else None, frame.stamp_ns)
         landmark_map = new.belief().map
         landmark_map.remove(landmark_map.ids[~old.belief().map.holds(landmark_map.ids)])
@@ -342,15 +332,6 @@ class Window:
     feature: np.ndarray  #: (K,) which one; no feature twice in a frame.
     px: np.ndarray  #: (K, 2) where.
     noise_px: float  #: standard deviation, per axis.
-
-
-@dataclass(frozen=True)
-class Expected:
-    """What is expected before anything is seen."""
-
-    rho: tuple[float, float]  #: mean and standard deviation of an inverse distance, 1/m.
-    std_start: np.ndarray  #: (6,) of the velocity at first, rad/s, m/s.
-    std_walk: np.ndarray  #: (6,) of its walk in one second, (rad/s, m/s)/√s.
 
 
 @final
@@ -405,16 +386,19 @@ class Optimum:
         return np.asarray(np.sqrt(np.square(half).sum(axis=0)))
 
 
-def optimum(seen: Window, expected: Expected, start: Structure) -> Optimum:
-    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations."""
-    now, damping = Linearised(seen, expected, start), DAMPING
+def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum:
+    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations.
+
+    What is expected before anything is seen, of inverse distances and velocities, is that of the settings.
+    """
+    now, damping = Linearised(seen, config, start), DAMPING
     for _ in range(MAX_STEPS):
         information, vector = now.normal_equations()
         while True:
             ahead = None
             with suppress(LinAlgError, ValueError):  # ValueError where it is not finite
                 factor = cho_factor(information + damping * np.diag(np.diag(information)))
-                ahead = Linearised(seen, expected, now.at.moved(np.asarray(cho_solve(factor, vector))))
+                ahead = Linearised(seen, config, now.at.moved(np.asarray(cho_solve(factor, vector))))
             if ahead is not None and ahead.cost < now.cost:
                 break
             damping *= DAMPING_FACTOR
@@ -431,8 +415,8 @@ def optimum(seen: Window, expected: Expected, start: Structure) -> Optimum:
 class Linearised:
     """All residuals at a structure, whitened; their derivatives where they are asked for."""
 
-    def __init__(self, seen: Window, expected: Expected, at: Structure) -> None:
-        self.seen, self.expected, self.at = seen, expected, at
+    def __init__(self, seen: Window, config: MonoConfig, at: Structure) -> None:
+        self.seen, self.rho, self.at = seen, config.inverse_depth, at
         pose, feature = at.path[seen.frame], seen.feature
         position = SE3.translation(pose)
         place = at.direction[feature] + (1.0 - at.inverse[feature, None]) * position
@@ -442,10 +426,17 @@ class Linearised:
         self.weight = 1.0 / (1.0 + squared)
         self._interval = np.diff(seen.stamps_ns) * 1e-9
         self._relative = SE3.between(at.path[:-1], at.path[1:])
-        self._whitener = _walk_whitener(expected, self._interval)
+        # Of the first mean velocity and the differences of mean velocities: that over an interval δ is v + w₁/δ with the noise
+        # of E06 (5), so that the difference from the one before has the variance (δ + δ′)/3 of the walk's in a second, and
+        # shares δ/6 with the difference after it.
+        interval, before = self._interval, np.concatenate([[0.0], self._interval[:-1]])
+        walk = np.diag((before + interval) / 3.0) + np.diag(interval[:-1] / 6.0, 1) + np.diag(interval[:-1] / 6.0, -1)
+        cov = np.square(np.maximum(config.velocity.walk_std(), MIN_STD_VELOCITY))[:, None, None] * walk
+        cov[:, 0, 0] += np.square(np.maximum(config.velocity.start_std(), MIN_STD_VELOCITY))
+        self._whitener = np.linalg.inv(np.linalg.cholesky(cov))
         self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
-        self.prior = (at.inverse - expected.rho[0]) / expected.rho[1]
-        self._by_scale = 1.0 / (at.inverse.size * expected.rho[0] * SCALE_STD)
+        self.prior = (at.inverse - self.rho.mean_per_m) / self.rho.std_per_m
+        self._by_scale = 1.0 / (at.inverse.size * self.rho.mean_per_m * SCALE_STD)
         self.scale = float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
         quadratic = sum(np.square(part).sum() for part in (self.velocity, self.prior, self.scale))
         self.cost = float(0.5 * CAUCHY_SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
@@ -456,11 +447,7 @@ class Linearised:
         return np.einsum("ktj,jk...->tk...", self._whitener, moved)
 
     def normal_equations(self, loss_information: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss and Newton's: information of the step, and the vector that it is solved with.
-
-        Args:
-            loss_information: times what was seen counts in the information.
-        """
+        """Gauss and Newton's: information of the step, what was seen counting so often, and the vector it is solved with."""
         seen, at, direction = self.seen, self.at, self._direction
         frames, features = at.path.shape[0], at.inverse.size
         free = 6 * frames
@@ -500,28 +487,10 @@ class Linearised:
 
         # The prior of the inverse distances, and the scale.
         q = free + 2 + 3 * np.arange(features)
-        h[q, q] += self.expected.rho[1] ** -2
+        h[q, q] += self.rho.std_per_m**-2
         h[np.ix_(q, q)] += self._by_scale**2
-        b[q] -= self.prior / self.expected.rho[1] + self.scale * self._by_scale
+        b[q] -= self.prior / self.rho.std_per_m + self.scale * self._by_scale
         return h[6:, 6:], b[6:]
-
-
-def _walk_whitener(expected: Expected, interval: np.ndarray) -> np.ndarray:
-    """L⁻¹ (6, T − 1, T − 1) of the covariance L Lᵀ of the first mean velocity and of the differences of mean velocities.
-
-    A mean velocity over an interval δ is v + w₁/δ with the noise of E06 (5): the difference from the one before has the
-    variance (δ + δ′)/3 of the walk's in a second, and shares δ/6 with the difference after it.
-
-    Args:
-        expected: standard deviations.
-        interval: (T − 1,) s.
-    """
-    before = np.concatenate([[0.0], interval[:-1]])
-    walk = np.diag((before + interval) / 3.0) + np.diag(interval[:-1] / 6.0, 1) + np.diag(interval[:-1] / 6.0, -1)
-    std_walk = np.maximum(expected.std_walk, MIN_STD_VELOCITY)
-    cov = np.square(std_walk)[:, None, None] * walk
-    cov[:, 0, 0] += np.square(np.maximum(expected.std_start, MIN_STD_VELOCITY))
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
 
 def tangents(direction: np.ndarray) -> np.ndarray:
