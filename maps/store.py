@@ -202,9 +202,6 @@ class SharedStore:
     def ids(self) -> np.ndarray:
         return self.columns.ids.copy()
 
-    def __contains__(self, column: object) -> bool:
-        return isinstance(column, int | np.integer) and bool(self.columns.held(np.array([column]))[0])
-
     def add(self, records: np.ndarray, column: int | None = None) -> int:
         """Stores a new column (fields, N) and returns its id: the one given, which must not be alive, or a new one."""
         self._checked(records)
