@@ -33,21 +33,6 @@ def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):
     assert "no chessboard of 9x6 inner corners" in sentence(capsys)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--board", "9x6"), "both its inner corners and the side of its squares"),
-        (("--board", "nine", "--square", "0.02"), "inner corners as 9x6"),
-        (("--board", "9x6", "--square", "0.02", "--known-points", "here.csv"), "give one of the two"),
-        (("--aruco", "5", "--marker", "0.04"), "their number as 5x7"),
-    ],
-)
-def test_a_board_that_makes_no_sense_is_refused(desk, tmp_path, capsys, arguments, words):
-    assert run(desk, tmp_path / "run", *arguments, known=False) == 2
-    assert words in sentence(capsys)
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.slow
 def test_markers_are_what_a_run_starts_from(tmp_path, capsys):
     """A sheet of markers under a camera that moves sideways, by homographies."""

@@ -8,7 +8,6 @@ import pytest
 from rbpf.cli import main
 from rbpf.sensors.readers import open_images, open_stereo, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from tests.cli.mono_sequences import sentence
 
 pytestmark = pytest.mark.slow
 
@@ -39,20 +38,3 @@ def test_options_reach_the_images(tmp_path: Path) -> None:
     sequence = open_images(tmp_path / "mono")
     assert len(sequence) == 3 and sequence.camera.fx == 60.0 and sequence.baseline_m is None
     assert {path.suffix for path in (tmp_path / "mono" / "mav0" / "cam0" / "data").iterdir()} == {".jpg"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--frames", "5000"], "has 4000 images"),
-        (["--trajectory", "turn_back", "--every", "0"], "every must be"),
-        (["--jpeg", "200"], "jpeg must be"),
-        (["--baseline-m", "0"], "baseline must be positive"),
-    ],
-)
-def test_bad_options_are_one_sentence(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert lab(tmp_path / "lab", *arguments) == 2
-    assert message in sentence(capsys)
-    assert not (tmp_path / "lab").exists()

@@ -328,26 +328,6 @@ def test_findings_about_kernels(sentence):
     says(findings, sentence)
 
 
-def test_kernels_are_compared_with_numeric_derivatives_where_there_are_no_others():
-    class Numeric(Kerneled):
-        jacobians = ObservationModel.jacobians
-
-    assert check_model(Numeric(RangeBearing(SE2).kernel().function)) == []
-    shifted = RangeBearing(SE2, np.array([0.0, 0.0, 1e-3])).kernel()
-    assert check_model(Numeric(*shifted))
-
-
-def test_a_jacobian_that_the_kernel_gets_wrong():
-    class Scaled(Kerneled):
-        def jacobians(self, state, landmark=None, const=None, substate=None):
-            exact = super().jacobians(state, landmark)
-            return exact._replace(landmark=exact.landmark * (1.0 + 1e-7))
-
-    findings = check_model(Scaled(RangeBearing(SE2).kernel().function))
-    assert len(findings) == 1
-    assert findings[0].startswith("Scaled.kernel: jac_landmark differs from NumPy's: expected")
-
-
 @pytest.fixture
 def example() -> Example:
     """Landmarks 2, 3 and 5 in forty particles."""

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.core.genealogy import History, Lineage
-from rbpf.errors import InputError
 
 
 class Copied:
@@ -96,16 +95,3 @@ def test_a_fixed_lag_takes_constant_memory(rate):
     assert due <= 2 * lag + 4
     assert nodes <= 16 * n
     assert lineage.arrays()["lineage/parent"].size <= 16 * n
-
-
-def test_paths_that_outgrow_the_machine_are_refused(monkeypatch):
-    """16 MiB hold 699 steps of 1,000 particles that are never resampled."""
-    monkeypatch.setattr("rbpf.ranges.os.sysconf", lambda _: 1 << 12)
-    history = History(Lineage(1000))
-    for t in range(640):
-        history.record(t, np.zeros((1000, 3)), np.zeros(1000))
-    with pytest.raises(
-        InputError, match=r"paths of 1000 particles over 704 steps \(a lag keeps fewer\) would take 0.0 GB"
-    ):
-        history.record(640, np.zeros((1000, 3)), np.zeros(1000))
-    assert history.stored_states == 640_000

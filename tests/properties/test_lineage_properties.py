@@ -99,22 +99,3 @@ def test_what_is_settled_is_forgotten_by_a_restoration():
     lineage.restore(other.arrays())
     lineage.take_up(0)
     np.testing.assert_array_equal(lineage.rows(0), [1, 1])
-
-
-def test_survivors_are_found_without_a_walk(monkeypatch):
-    """Whatever is resampled and restored: as the rows of all ancestors tell, among those that were left the last time."""
-    rng, lineage, copies = np.random.default_rng(0), Lineage(40), [np.arange(40)]
-    for generation in range(30):
-        lineage.retain(generation)
-        ancestors = np.sort(rng.integers(0, 40, 40))
-        lineage.advance(ancestors)
-        copies = [rows[ancestors] for rows in copies] + [np.arange(40)]
-        if generation == 15:
-            arrays, lineage = lineage.arrays(), Lineage(40)
-            lineage.restore(arrays)
-            for again in range(16):
-                lineage.take_up(again)
-        with monkeypatch.context() as patch:
-            patch.setattr("rbpf.core.genealogy.forest.rows_at", None)
-            for past in range(generation % 3, generation + 2, 3):
-                np.testing.assert_array_equal(lineage.survivors(past), np.unique(copies[past]))

@@ -93,17 +93,6 @@ class TestPinhole:
         np.testing.assert_allclose(camera.jacobian(points) / scale, numeric / scale, rtol=0, atol=1e-8)
 
     @every_camera
-    def test_round_trip_of_pixels(self, camera):
-        axes = np.linspace(-0.5, camera.width - 0.5, 53), np.linspace(-0.5, camera.height - 0.5, 41)
-        px = np.stack(np.meshgrid(*axes), axis=-1)
-        uv = camera.unproject(px)
-        rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
-        solved = np.isfinite(uv).all(axis=-1)
-        assert uv.shape == px.shape
-        assert solved.all() == (camera is not FOLDING and camera.distortion_model != "equidistant")
-        np.testing.assert_allclose(camera.project(rays)[solved], px[solved], rtol=0, atol=1e-9)
-
-    @every_camera
     def test_unproject_jacobian_is_the_derivative_and_the_inverse(self, camera):
         px = camera.project(seen_points(camera))
         uv = camera.unproject(px)

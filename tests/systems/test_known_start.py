@@ -126,19 +126,3 @@ def test_a_point_where_the_image_shows_no_corner(shown):
         return
     with pytest.raises(InputError, match=r"known point 3 at \(60.0, 200.0\) px cannot be found again"):
         require_texture(image, points())
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "words"),
-    [
-        ("positions", np.nan, "positions of 6 known points"),
-        ("px", np.inf, "px of 6 known points"),
-        ("std_m", np.nan, "std_m of 6 known points"),
-        ("std_m", -0.1, "is negative"),
-    ],
-)
-def test_known_points_that_are_no_numbers(field, value, words):
-    spoiled = getattr(points(), field).copy()
-    spoiled.reshape(-1)[3] = value
-    with pytest.raises(InputError, match=words):
-        replace(points(), **{field: spoiled})

@@ -189,22 +189,6 @@ def start_of(truth: Structure) -> Structure:
     return Structure(still, truth.direction, np.full(FEATURES, 0.8))
 
 
-def test_the_vector_is_the_slope_of_the_cost():
-    """By central differences, at a place where every residual and every loss takes part."""
-    window, truth = scene(noise_px=2.0)
-    step = np.random.default_rng(1).normal(scale=2e-3, size=6 * (FRAMES - 1) + 3 * FEATURES)
-    at = truth.moved(step)
-    _, vector = Linearised(window, EXPECTED, at).normal_equations()
-    numeric = np.empty_like(vector)
-    for k in range(vector.size):
-        nudge = np.zeros(vector.size)
-        nudge[k] = 1e-6
-        ahead, behind = (Linearised(window, EXPECTED, at.moved(s * nudge)).cost for s in (1.0, -1.0))
-        numeric[k] = (behind - ahead) / 2e-6
-    # To first order in a step's velocity, which is what the logarithm's derivative leaves out.
-    np.testing.assert_allclose(vector, numeric, rtol=0.0, atol=1e-3 * np.abs(vector).max())
-
-
 def test_a_camera_that_seems_to_stand_still_is_found_to_have_moved():
     window, truth = scene()
     best = optimum(window, EXPECTED, start_of(truth))

@@ -104,20 +104,6 @@ def test_malformed_numbers_are_refused_by_line(tmp_path, dim, name, line, column
         read_measurements(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("dim", "change", "complaint"),
-    [
-        (2, {"recording": ""}, "name on one line"),
-        (2, {"start": np.array([0.0, np.inf, 0.0])}, "finite numbers .* in start"),
-        (2, {"covs": np.tile(np.diag([1.0, -1.0, 1.0]), (6, 1, 1))}, "covariances in covs, .* row 0"),
-        (3, {"start": np.zeros(7)}, "quaternions of length 1"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(dim, change, complaint):
-    with pytest.raises(InputError, match=complaint):
-        replace(world(dim, "position"), **change)
-
-
 CAMERA = Pinhole(640, 480, 512.1, 511.9, 319.4, 239.6, (0.1, -0.05, 1e-3, -2e-3, 0.01))
 
 
