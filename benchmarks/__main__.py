@@ -20,6 +20,7 @@ NAMES = (
     "small_update",
     "many_particles",
     "map_size",
+    "submaps",
     "sharing",
     "genealogy_growth",
     "user_model",

@@ -44,7 +44,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
-from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
+from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
 from rbpf.maps.joint_columns import JointColumns, Kind, Table
 from rbpf.maps.joint_rows import (
@@ -60,6 +60,7 @@ from rbpf.maps.joint_rows import (
     whitened,
 )
 from rbpf.maps.point import Point
+from rbpf.maps.submaps import SubMap, SubMaps, by_frame
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
@@ -81,8 +82,12 @@ class JointMap(Map):
         substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
             frame; None has none. It may be observed together with a landmark.
         compiled: use the models' fused kernels where they have one.
+        submap: landmarks with which a sub-map ends, so that a step costs the same however large the map becomes; None keeps
+            one Gaussian. Sub-maps hold points, no substate, and nothing may be observed in the world.
 
     Attributes:
+        old: the sub-maps that are finished; None where there are none to be. All else is of the present one, where the
+            world is the place where it began.
         mean: (N, n) of ξ, s, and the landmarks and clones as they came.
         cov: (n, n), common to all particles.
         origin: (E,) G.
@@ -96,6 +101,7 @@ class JointMap(Map):
         space: SE2Group | SE3Group | Euclidean,
         substate: tuple[np.ndarray, np.ndarray] | None = None,
         compiled: bool = True,
+        submap: int | None = None,
     ) -> None:
         self.space = space
         self.compiled = compiled
@@ -105,19 +111,27 @@ class JointMap(Map):
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
         gaussian.psd_factor(cov)
-        self._substate = mean, cov
+        if submap is not None and mean.size:
+            raise InputError("sub-maps take no substate: what it knows would tie them")
+        self._substate, self.submap = (mean, cov), submap
         self._first = space.dim + mean.size
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
-        d = self.space.dim
-        self.n = n
+        self.n, self._next_id = n, 0
+        self.old = None if self.submap is None else SubMaps(self.space, self.point.dim, 2 * self.submap)
+        self._frame: Estimate | None = None  # where there are finished sub-maps, what they and this one say of F
+        self._begin_submap()
+
+    def _begin_submap(self) -> None:
+        """At the robot, with no landmark."""
+        d, n = self.space.dim, self.n
         self.origin = self.space.identity()
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
         self.clones, self._held = np.zeros((0, self.space.size)), JointColumns(d, self._held.kinds)
-        self._next_id = 0
+        self._in_step = False  # from prediction to correction: what is observed is associated with what is held
         self._gain: np.ndarray | None = None
 
     def driving(self) -> np.ndarray | None:
@@ -127,6 +141,7 @@ class JointMap(Map):
         """Joint distribution of the increment ε and all that is held, kept as (ξ, s, l) | ε; without a substate as it is."""
         coupling, dynamics, drift = transition.coupling, transition.dynamics, transition.drift
         d, m = space.dim, self._first - space.dim
+        self._in_step = True
         if not m:
             return None
         sizes = [None if block is None else block.shape[1:] for block in (coupling, dynamics, drift)]
@@ -198,7 +213,7 @@ class JointMap(Map):
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
         self.mean, self.cov = self._given(increment)
-        self._gain = None
+        self._gain, self._in_step = None, False
         if not groups:
             return LogDensities(np.zeros(self.n), np.zeros(self.n))
         rows = self._rows(state, self.mean, self.cov, groups)
@@ -232,18 +247,41 @@ class JointMap(Map):
         """Ends the window: the frame moves to the robot; what the particles differ by enters the common covariance."""
         self.origin, self.clones, mean, self.cov = self._consolidated(particles)
         self.mean = np.repeat(mean[None], self.n, axis=0)
+        if self.old is not None and self.submap is not None:
+            ids, present = self._held.table.ids, self._finished(self.origin, mean, self.cov)
+            # As many as tell a pose in space; with fewer the sub-map waits for more.
+            if not self._in_step and (ids.size >= self.submap or self.old.returned(ids).sum() >= 3):
+                self.old.join(present)
+                self._begin_submap()
+                present = self._finished(self.origin, self.mean[0], self.cov)
+            if self.old.maps:
+                self._frame = self.old.end(present)
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
 
     def estimate(self, particles: Particles) -> Estimate:
         """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
         d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
         origin, turn = self.space.mean(world, weights), self._turn(particles)
-        within = turn @ self.cov[:d, :d] @ turn.T
-        between = spread_of(self.space.local(origin, world), weights)
-        return Estimate(origin, gaussian.symmetrise(within + between))
+        within = self.cov[:d, :d] if self._frame is None else self._frame.cov
+        cov = turn @ within @ turn.T + spread_of(self.space.local(origin, world), weights)
+        return Estimate(origin, gaussian.symmetrise(cov))
+
+    def landmarks(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Names (M,) of all landmarks, means (M, D) and covariances (M, D, D) in the world."""
+        if self.old is None or not self.old.maps:
+            return self.ids, *self.in_world(particles)
+        if not self.ids.size:
+            return self.old.landmarks()
+        origin, _, mean, cov = self._consolidated(particles)
+        return self.old.with_one_more(self._finished(origin, mean, cov)).landmarks()
+
+    def _finished(self, origin: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> SubMap:
+        columns = self._held.of_one_kind(self._held.table.ids).columns
+        used = np.append(np.arange(self.space.dim), columns)
+        return SubMap(origin, self.ids, mean[columns], cov[np.ix_(used, used)])
 
     def in_world(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
-        """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`."""
+        """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`; see `landmarks`."""
         origin, clones, mean, cov = self._consolidated(particles)
         d, dim = self.space.dim, self.point.dim
         means, covs = np.empty((self._held.table.ids.size, dim)), np.empty((self._held.table.ids.size, dim, dim))
@@ -251,18 +289,22 @@ class JointMap(Map):
         for kind in self._held.by_kind():
             points, slope = self._points(kind, mean, clones)
             # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
-            by_frame = np.concatenate(
-                [self._by_turn(points), np.broadcast_to(np.eye(dim), (*points.shape, dim))], axis=-1
-            )
             columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
             blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
-            by_all = turn @ np.concatenate([by_frame, slope], axis=-1)
+            by_all = turn @ np.concatenate([by_frame(self.space, points), slope], axis=-1)
             means[kind.rows] = self.space.transform(origin, points)
             covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
         return means, covs
 
     def world(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
         """World_from_robot (n, E) of some particles, without what is uncertain about each one's frame."""
+        if self._frame is None:
+            return self._from_start(state, particles)
+        # Sub-maps tell the frame's place when it moves: it is the same until then.
+        return self.space.compose(self._frame.mean, state)
+
+    def _from_start(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """As `world`, from where the present sub-map begins."""
         frame = self.space.retract(self.origin, self.mean[particles, : self.space.dim])
         return self.space.compose(frame, state)
 
@@ -270,7 +312,7 @@ class JointMap(Map):
         """World_from_frame, clones, mean and covariance in a frame at the robot, Mathematics (consolidation)."""
         space, weights, state = self.space, particles.weights, particles.state
         d = space.dim
-        world = self.world(state)
+        world = self._from_start(state)
         origin, centre = space.mean(world, weights), space.mean(state, weights)
         # Every particle's means as seen from its own robot, and T, by which the covariance turns with their mean.
         before = weighted_mean(self.mean, weights)
@@ -343,6 +385,10 @@ class JointMap(Map):
                 substate = mean[:, None, d : self._first]
             in_world = model.reads == frozenset({Part.STATE})
             if in_world:
+                if self.old is not None:
+                    raise InputError(
+                        f"{type(model).__name__} observes the pose in the world: sub-maps do not take that"
+                    )
                 frame = self.space.retract(self.origin, mean[:, :d])
                 at = self.space.compose(frame, state)[:, None]
             if landmarks is None or substate is not None or not self.compiled:
@@ -402,8 +448,7 @@ class JointMap(Map):
         points, slope = landmark.point(mean[..., kind.columns], anchor)
         # p = K Exp(δ) l: ∂p/∂δ = R [l's turn | I] J_r.
         near = space.inverse_transform(anchor, points)
-        by_pose = np.concatenate([self._by_turn(near), np.broadcast_to(np.eye(self.point.dim), slope.shape)], axis=-1)
-        by_clone = space.rotation(anchor) @ by_pose @ space.right_jacobian(mean[..., kind.clones])
+        by_clone = space.rotation(anchor) @ by_frame(space, near) @ space.right_jacobian(mean[..., kind.clones])
         return points, np.concatenate([slope, by_clone], axis=-1)
 
     @property
@@ -493,6 +538,8 @@ class JointMap(Map):
         if self._held.number(landmark) >= 0:
             return
         space, anchor = self.space, self.space.identity() if landmark.anchored else None
+        if landmark.anchored and self.submap is not None:
+            raise InputError(f"sub-maps hold points, not {type(landmark).__name__}")
         fits = landmark.components == 1 and landmark.constants == (0 if anchor is None else space.size)
         if not fits or landmark.point(np.zeros(landmark.dim), anchor)[0].shape != (self.point.dim,):
             raise InputError(
@@ -570,11 +617,14 @@ class JointMap(Map):
     def arrays(self) -> dict[str, np.ndarray]:
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}
         named |= {"clones": self.clones, "clone_first": self._held.clone_first, **self._held.table._asdict()}
-        return {f"joint/{name}": array for name, array in named.items()}
+        named = {f"joint/{name}": array for name, array in named.items()}
+        if self._frame is not None:
+            named |= {"joint/frame": self._frame.mean, "joint/frame_cov": self._frame.cov}
+        return named if self.old is None else named | self.old.arrays()
 
     def options(self) -> dict[str, object]:
         kinds = [type(kind).__name__ for kind in self._held.kinds]
-        return {"joint substate": self._first - self.space.dim, "joint kinds": kinds}
+        return {"joint substate": self._first - self.space.dim, "joint kinds": kinds, "submap": self.submap}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         rows, kinds = checkpoint.integers("landmarks", least=0), len(self._held.kinds)
@@ -599,10 +649,10 @@ class JointMap(Map):
         own.append(self._held.clone_columns(np.arange(len(self.clones))).ravel())
         if not np.array_equal(np.sort(np.concatenate(own)), np.arange(self._first, self.mean.shape[1])):
             raise InputError("the arrays joint/first and joint/clone_first do not share the columns of joint/mean out")
-
-    def _by_turn(self, points: np.ndarray) -> np.ndarray:
-        """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""
-        if isinstance(self.space, SE3Group):
-            return -skew(points)
-        columns = np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
-        return columns if isinstance(self.space, SE2Group) else np.zeros((*points.shape, 0))
+        if self.old is not None:
+            self.old.restore(arrays)
+            if self.old.maps:
+                d = self.space.dim
+                schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}
+                found = checkpoint.read(arrays, schema, "joint/")
+                self._frame = Estimate(found["frame"], found["frame_cov"])

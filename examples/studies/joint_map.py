@@ -47,6 +47,18 @@ def loops(steps: int, std_rotation_deg: float = 0.3) -> RobotWorld:
     )  # fmt: skip
 
 
+MANY = RobotWorld(
+    steps=1500, landmarks=800, radius_m=20.0, laps=2.0, extent_m=28.0, max_range_m=4.5, half_field_of_view_deg=180.0,
+    std_range_m=0.05, std_angle_deg=1.0, std_translation_m=0.02, std_rotation_deg=0.3,
+)  # fmt: skip
+"""Two rounds of 125 m, seen twice: more landmarks than one Gaussian takes quickly."""
+OF_MANY = {
+    **{f"joint map, sub-maps of {n}": replace(JOINT, submap=n) for n in (50, 150)},
+    "joint map, one": replace(JOINT, submap=None),
+    "particles": PARTICLES,
+}
+
+
 @dataclass(frozen=True)
 class EkfTrial:
     """The joint EKF on the logs of a world; call it with a seed."""
@@ -93,11 +105,11 @@ def simulated(
     return {name: run_trials(trial, range(runs), workers) for name, trial in trials.items()}
 
 
-def rows_of(world: str, found: dict[str, Consistency]) -> list[list[str | int | float]]:
-    """A line per filter: evidence and error beside the EKF's of the same run."""
-    ekf, rows = found["joint EKF"].trials, list[list[str | int | float]]()
+def rows_of(world: str, found: dict[str, Consistency], beside: str = "joint EKF") -> list[list[str | int | float]]:
+    """A line per filter: evidence and error beside another's of the same run."""
+    other, rows = found[beside].trials, list[list[str | int | float]]()
     for name, consistency in found.items():
-        evidence = [own.log_evidence - other.log_evidence for own, other in zip(consistency.trials, ekf, strict=True)]
+        evidence = [own.log_evidence - its.log_evidence for own, its in zip(consistency.trials, other, strict=True)]
         inside = consistency.coverage(0.95)
         rows.append([
             world, name, len(evidence), consistency.pose_nees.value, consistency.pose_nees.error,
@@ -214,6 +226,7 @@ def main(
     steps: int = 400,
     particles: tuple[int, ...] = (50, 250),
     windows: tuple[int, ...] = (1, 5),
+    many_runs: int = 0,
     recordings: Path | None = None,
     seeds: int = 3,
     room_runs: int = 10,
@@ -229,6 +242,7 @@ def main(
         steps: of each.
         particles: numbers of them.
         windows: of the joint map.
+        many_runs: logs with 800 landmarks, seeds 0, 1, …, beside one Gaussian of all; each takes minutes.
         recordings: folder of the recorded logs; None leaves them out.
         seeds: of the filter on each recording, 0, 1, ….
         room_runs: two cameras in a room, seeds 0, 1, …; none by 0.
@@ -261,6 +275,11 @@ def main(
         "heading noise", "filter", "runs", "NEES / d", "± s.e.", "in 95 % [%]", "± s.e.", "landmarks", "path [m]",
         "log-evidence − EKF",
     ]  # fmt: skip
+    if many_runs:
+        many = {
+            name: run_trials(RobotTrial(MANY, config), range(many_runs), workers) for name, config in OF_MANY.items()
+        }
+        rows += rows_of("800 landmarks", many, "joint map, one")
     write_table(out / "joint_map.csv", header, rows)
     if recordings is not None:
         configs = {f"joint, 50, window {w}": replace(JOINT, particles=50, window=w) for w in windows}

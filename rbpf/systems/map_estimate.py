@@ -51,7 +51,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
     belief = filter_.belief()
     landmark_map, weights = belief.map, belief.weights
     if isinstance(landmark_map, JointMap):
-        return MapEstimate(landmark_map.ids, *landmark_map.in_world(filter_.particles))
+        return MapEstimate(*landmark_map.landmarks(filter_.particles))
     names, means, covs = [], [], []
     for landmark_id in landmark_map.ids:
         held = np.ones(weights.size, dtype=bool)

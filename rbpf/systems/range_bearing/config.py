@@ -13,10 +13,6 @@ from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, 
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
-MOST = 500
-"""Landmarks up to which they are one Gaussian where the settings leave it open: its cost grows with their square."""
-
-
 @dataclass(frozen=True)
 class AssociationConfig(Ranged):
     """Unknown association."""
@@ -51,11 +47,14 @@ class RangeBearingConfig:
     association: Literal["known", "ml"] = "known"
     #: one Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true; or
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles). By default
-    #: (auto) joint, but particles where landmarks have no names, a lag is set, or a log names more than 500.
+    #: (auto) joint, but particles where landmarks have no names or a lag is set.
     map: Literal["auto", "joint", "particles"] = "auto"
     #: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.
     window: Count = 5
+    #: of a joint map: landmarks with which a sub-map ends and the next begins, so that a step costs the same however large
+    #: the map becomes; a log that names fewer has one. None keeps one Gaussian of all.
+    submap: Count | None = 150
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
     #: steps of trajectory kept for smoothing; None keeps all of a log, and the last 150 where no end is known. With a joint
     #: map one.
@@ -78,16 +77,14 @@ class RangeBearingConfig:
         if self.map == "joint" and self.association != "known":
             raise InputError("map=joint takes association=known: map=particles takes both")
 
-    def kept_map(self, landmarks: int = 0) -> tuple[Literal["joint", "particles"], str]:
-        """The map of a run over a log with so many named landmarks, and in one sentence why it is this one."""
+    def kept_map(self) -> tuple[Literal["joint", "particles"], str]:
+        """The map of a run, and in one sentence why it is this one."""
         if self.map != "auto":
             return self.map, f"The map is as asked for: map={self.map}."
         if self.association != "known":
             why = "landmarks without names are associated in every particle by itself"
         elif self.lag is not None:
             why = "a lag asks for the paths of particles"
-        elif landmarks > MOST:
-            why = f"{landmarks} landmarks are more than the {MOST} up to which one Gaussian of all is quick"
         else:
             return "joint", "All landmarks and the robot are one Gaussian (map=joint)."
         return "particles", f"Every particle has its own landmarks (map=particles): {why}."

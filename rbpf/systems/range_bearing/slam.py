@@ -46,7 +46,6 @@ class RangeBearingSlam(System):
             tells which lineage survives; the memory that this takes grows with the run.
         wrapped: puts a sensor around the usual one, to change what it observes or starts.
         misread: whether a reading may be of another landmark than is said.
-        landmarks: how many there will be, as far as that is known; it decides about the map with `map="auto"`.
     """
 
     name: ClassVar[str] = "range-bearing"
@@ -62,7 +61,6 @@ class RangeBearingSlam(System):
         keep_associations: bool = False,
         wrapped: Callable[[Sensor], Sensor] | None = None,
         misread: bool = False,
-        landmarks: int = 0,
     ) -> None:
         self.config = config = config or RangeBearingConfig()
         self.space, self.measurement, self.pitch_sign = space, measurement, pitch_sign
@@ -76,8 +74,10 @@ class RangeBearingSlam(System):
             view = np.deg2rad(unknown.half_field_of_view_deg)
             self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
-        self.kept_map, self.why_map = config.kept_map(landmarks)
-        self.joint = JointMap(space, compiled=config.compiled) if self.kept_map == "joint" else None
+        self.kept_map, self.why_map = config.kept_map()
+        self.joint = (
+            JointMap(space, compiled=config.compiled, submap=config.submap) if self.kept_map == "joint" else None
+        )
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
@@ -130,8 +130,7 @@ class RangeBearingSlam(System):
         """The system for the robot and the sensor of a log."""
         kind: Kind = "position" if log.measurement == "position" else "range_bearing"
         mount, sign = log.robot_from_sensor, log.pitch_sign
-        names = {name for frame in log.frames for name in frame.landmarks.tolist()}
-        return cls(config, log.space, kind, mount, sign, keep_associations, wrapped, log.misread, len(names))
+        return cls(config, log.space, kind, mount, sign, keep_associations, wrapped, log.misread)
 
     def track(
         self,

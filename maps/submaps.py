@@ -1,0 +1,320 @@
+"""Finished parts of a joint map: Gaussians of their own, tied by the landmarks that they share.
+
+A map that stays one Gaussian costs the square of its landmarks in every step. A *sub-map* begins at the robot with nothing
+that is known before, and ends when it is large; so all of them are independent, and each is one factor on where it begins,
+where it ends, and its landmarks. What they say together is sparse (S. Huang, Z. Wang and G. Dissanayake 2008, "Sparse local
+submap joining filter"). While the robot explores, the last end and the landmarks about it are enough to go on with: one
+Gaussian, to which a finished sub-map is joined at a cost that does not grow (J. Tardós, J. Neira, P. Newman and J. Leonard
+2002). When landmarks return that are not among those, all sub-maps are solved for, linearised anew, Mathematics (submaps).
+"""
+
+from typing import NamedTuple, final
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from rbpf import gaussian
+from rbpf.core import checkpoint
+from rbpf.core.particles import Estimate
+from rbpf.errors import InputError
+from rbpf.lie import Euclidean, SE2Group, SE3Group, skew
+
+CLOSE_ENOUGH = 1e-6
+"""Largest step [m, rad] at which a solution is taken, and iterations until it is."""
+ITERATIONS = 20
+EXACT = 1e-5
+"""Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
+AT_ONCE = 512
+"""Columns of the inverse that are solved for together."""
+
+
+class SubMap(NamedTuple):
+    """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
+
+    `cov` is that of the end, in its right chart, and the points, (d + MD, d + MD).
+    """
+
+    end: np.ndarray
+    ids: np.ndarray
+    points: np.ndarray
+    cov: np.ndarray
+
+
+def by_turn(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
+    """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""
+    if isinstance(space, SE3Group):
+        return -skew(points)
+    columns = np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
+    return columns if isinstance(space, SE2Group) else np.zeros((*points.shape, 0))
+
+
+def by_frame(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
+    """∂(Exp(ε) l)/∂ε (M, D, d) at ε = 0."""
+    moved = np.broadcast_to(np.eye(points.shape[-1]), (*points.shape, points.shape[-1]))
+    return np.concatenate([by_turn(space, points), moved], axis=-1)
+
+
+def _unit_columns(size: int, rows: np.ndarray) -> np.ndarray:
+    columns = np.zeros((size, rows.size))
+    columns[rows, np.arange(rows.size)] = 1.0
+    return columns
+
+
+@final
+class SubMaps:
+    """The sub-maps that are finished, and what they say together about the place where the present one begins.
+
+    Args:
+        space: SE2, SE3 or Euclidean(n).
+        dim: D, of a point.
+        most: landmarks that are kept about the start of the present sub-map, besides those of the last one.
+
+    Attributes:
+        maps: the finished ones.
+        starts: world_from_start (E,) of each, and last that of the present one.
+        near: (K,) landmarks about the last start.
+        points: (K, D) where they are, as seen from it.
+        cov: (d + KD, d + KD) of the last start, in its right chart, and of `points`.
+    """
+
+    def __init__(self, space: SE2Group | SE3Group | Euclidean, dim: int, most: int) -> None:
+        self.space, self.dim, self.most = space, dim, most
+        self.maps: list[SubMap] = []
+        self.starts = [space.identity()]
+        self.near, self.points = np.zeros(0, dtype=np.int64), np.zeros((0, dim))
+        self.cov = np.zeros((space.dim, space.dim))
+        self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
+
+    @property
+    def start(self) -> np.ndarray:
+        """World_from_start (E,) of the present sub-map."""
+        return self.starts[-1]
+
+    def returned(self, ids: np.ndarray) -> np.ndarray:
+        """Which landmarks (K,) are of old sub-maps, and not among those about the start."""
+        old = np.array([landmark in self._last for landmark in ids.tolist()], dtype=bool)
+        return old & ~np.isin(ids, self.near)
+
+    def join(self, finished: SubMap) -> None:
+        """Takes a sub-map that begins at the last start; the next one begins at its end."""
+        loop = bool(self.returned(finished.ids).any())
+        self._take(finished)
+        if loop:
+            self._solve(self._shared())
+
+    def end(self, present: SubMap) -> Estimate:
+        """World_from_end of the present sub-map, by it and what is known about its start."""
+        ends, _, _, cov = self._joined(present)
+        return Estimate(ends[1], cov[: self.space.dim, : self.space.dim])
+
+    def with_one_more(self, finished: SubMap) -> "SubMaps":
+        """As if the present sub-map ended here."""
+        other = SubMaps(self.space, self.dim, self.most)
+        other.maps, other.starts, other._last = list(self.maps), list(self.starts), dict(self._last)
+        other.near, other.points, other.cov = self.near, self.points, self.cov
+        other._take(finished)
+        return other
+
+    def landmarks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Names (M,), places in the world (M, D) and their covariances (M, D, D), by all sub-maps together."""
+        ids = np.array(list(self._last), dtype=np.int64)
+        world, factor = self._solve(ids)
+        first, size, dim = factor.shape[0] - ids.size * self.dim, factor.shape[0], self.dim
+        covs = np.empty((ids.size, dim, dim))
+        together = max(AT_ONCE // dim, 1)
+        for begin in range(0, ids.size, together):
+            count = min(together, ids.size - begin)
+            rows = first + begin * dim + np.arange(count * dim)
+            found = factor.solve(_unit_columns(size, rows))[rows]
+            blocks = found.reshape(count, dim, count, dim)
+            covs[begin : begin + count] = blocks[np.arange(count), :, np.arange(count)]
+        return ids, world, gaussian.symmetrise(covs)
+
+    def _take(self, finished: SubMap) -> None:
+        ends, self.near, self.points, self.cov = self._joined(finished)
+        self.starts[-1:] = list(ends)
+        self._hold(finished)
+
+    def _joined(self, new: SubMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+        """Its start and end in the world; and `near`, `points` and `cov` about its end.
+
+        One Kalman update by what is shared, without noise, of the Gaussians about start and end; then seen from the end.
+        """
+        space, d, dim = self.space, self.space.dim, self.dim
+        k, m = self.near.size, new.ids.size
+        _, mine, its = np.intersect1d(self.near, new.ids, assume_unique=True, return_indices=True)
+        first, second = d + dim * k, d + dim * m
+        size = first + second
+        cov = np.zeros((size, size))
+        cov[:first, :first], cov[first:, first:] = self.cov, new.cov
+        prior = np.concatenate([np.zeros(d), self.points.ravel(), np.zeros(d), new.points.ravel()])
+        x = prior
+        of_mine = d + dim * mine[:, None] + np.arange(dim)
+        of_its = first + d + dim * its[:, None] + np.arange(dim)
+        turned = slice(first, first + d)
+        for _ in range(ITERATIONS if mine.size else 0):
+            # 0 = l − E Exp(ε) l′ for each landmark l that is l′ in the new one, which ends at E Exp(ε).
+            end, seen = space.retract(new.end, x[turned]), x[of_its]
+            rotation = space.rotation(end)
+            blocks = np.zeros((mine.size, dim, size))
+            np.put_along_axis(blocks, np.repeat(of_mine[:, None], dim, axis=1), np.eye(dim)[None], axis=2)
+            np.put_along_axis(blocks, np.repeat(of_its[:, None], dim, axis=1), -rotation[None], axis=2)
+            blocks[:, :, turned] = -rotation @ by_frame(space, seen) @ space.right_jacobian(x[turned])
+            slope = blocks.reshape(-1, size)
+            off = (x[of_mine] - space.transform(end, seen)).ravel()
+            chol = gaussian.cholesky(gaussian.symmetrise(slope @ cov @ slope.T))
+            half = gaussian.solve_lower_matrix(chol, slope @ cov)
+            moved = prior - half.T @ gaussian.solve_lower(chol, off + slope @ (prior - x))
+            step, x = np.abs(moved - x).max(), moved
+            if step < CLOSE_ENOUGH:
+                break
+        if mine.size:
+            cov = cov - half.T @ half
+        # About the new end: it, the new map's landmarks, and the old ones that it has not, as far as there is room.
+        end = space.retract(new.end, x[turned])
+        start = space.retract(self.start, x[:d])
+        others = np.setdiff1d(np.arange(k), mine)
+        seen = space.inverse_transform(end, x[d:first].reshape(k, dim)[others])
+        kept = np.sort(np.argsort(np.linalg.norm(seen, axis=1), kind="stable")[: max(self.most - m, 0)])
+        others, seen = others[kept], seen[kept]
+        by_end = space.right_jacobian(x[turned])
+        turn = np.zeros((second + dim * others.size, size))
+        turn[:d, :d] = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
+        turn[:d, turned] = by_end
+        turn[d:second, first + d :] = np.eye(dim * m)
+        theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
+        turn[second:, theirs] = np.kron(np.eye(others.size), space.rotation(end).T)
+        turn[second:, turned] = (-by_frame(space, seen) @ by_end).reshape(-1, d)
+        near, points = np.append(new.ids, self.near[others]), np.concatenate([x[first + d :].reshape(m, dim), seen])
+        return (start, space.compose(start, end)), near, points, gaussian.symmetrise(turn @ cov @ turn.T)
+
+    def _hold(self, new: SubMap) -> None:
+        self._last |= {landmark: (len(self.maps), row) for row, landmark in enumerate(new.ids.tolist())}
+        self.maps.append(new)
+
+    def _shared(self) -> np.ndarray:
+        """Landmarks that several sub-maps hold, those of the last one, and those nearest to its end."""
+        ids, times = np.unique(np.concatenate([each.ids for each in self.maps]), return_counts=True)
+        room = max(self.most - self.maps[-1].ids.size, 0)
+        far = np.linalg.norm(self.space.inverse_transform(self.start, self._guess(ids)), axis=1)
+        wanted = np.isin(ids, self.maps[-1].ids) | (times > 1)
+        wanted[np.argsort(far, kind="stable")[:room]] = True
+        return ids[wanted]
+
+    def _guess(self, ids: np.ndarray) -> np.ndarray:
+        """Where landmarks (K,) are in the world (K, D), by the last sub-map that holds each."""
+        held = np.array([self._last[landmark] for landmark in ids.tolist()], dtype=np.int64).reshape(-1, 2)
+        ends = np.array([self.starts[number + 1] for number in held[:, 0]])
+        return self.space.transform(ends, np.array([self.maps[number].points[row] for number, row in held]))
+
+    def _solve(self, ids: np.ndarray) -> tuple[np.ndarray, SuperLU]:
+        """Gauss-Newton over all starts and some landmarks; the others of a sub-map are left out of its factor."""
+        space, d, dim = self.space, self.space.dim, self.dim
+        world, starts = self._guess(ids), np.array(self.starts)
+        place = {landmark: row for row, landmark in enumerate(ids.tolist())}
+        first = d * len(self.maps)
+        size = first + dim * ids.size
+        factors = []
+        for number, each in enumerate(self.maps):
+            rows = np.array(
+                [row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64
+            )
+            own = np.append(np.arange(d), d + dim * rows[:, None] + np.arange(dim))
+            at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
+            columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
+            cov = each.cov[np.ix_(own, own)]
+            if np.diagonal(cov)[:d].min() < EXACT**2:
+                cov[:d, :d] += EXACT**2 * np.eye(d)
+            factors.append((rows, at, columns, gaussian.inverse(cov)))
+        where = np.concatenate([np.repeat(columns, columns.size) for *_, columns, _ in factors])
+        across = np.concatenate([np.tile(columns, columns.size) for *_, columns, _ in factors])
+        free = (where >= 0) & (across >= 0)  # the first start is where the world is
+        for _ in range(ITERATIONS):
+            entries, gradient = [], np.zeros(size + d)
+            for number, (rows, at, columns, info) in enumerate(factors):
+                each = self.maps[number]
+                begin, end = starts[number], starts[number + 1]
+                between = space.between(begin, end)
+                error, seen = space.local(each.end, between), space.inverse_transform(end, world[at])
+                residual = np.append(error, seen - each.points[rows])
+                slope = np.zeros((residual.size, columns.size))
+                back = space.right_jacobian_inverse(error)
+                slope[:d, :d] = -back @ space.adjoint(space.inverse(between))
+                slope[:d, d : 2 * d] = back
+                slope[d:, d : 2 * d] = -by_frame(space, seen).reshape(-1, d)
+                slope[d:, 2 * d :] = np.kron(np.eye(rows.size), space.rotation(end).T)
+                half = slope.T @ info
+                entries.append((half @ slope).ravel())
+                gradient[columns] += half @ residual  # columns below zero fall behind the end
+            information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
+            factor = splu(
+                information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+            )
+            step = -factor.solve(gradient[:size])
+            starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
+            world += step[first:].reshape(-1, dim)
+            if np.abs(step).max() < CLOSE_ENOUGH:
+                break
+        self.starts = list(starts)
+        self._settle(ids, world, factor)
+        return world, factor
+
+    def _settle(self, ids: np.ndarray, world: np.ndarray, factor: SuperLU) -> None:
+        """What a solution says about the last start and the landmarks about it."""
+        space, d, dim = self.space, self.space.dim, self.dim
+        seen = space.inverse_transform(self.start, world)
+        last = np.isin(ids, self.maps[-1].ids)
+        order = np.argsort(np.where(last, -1.0, np.linalg.norm(seen, axis=1)), kind="stable")
+        kept = order[: max(self.most, int(last.sum()))]
+        first = factor.shape[0] - ids.size * dim
+        columns = np.append(first - d + np.arange(d), first + dim * kept[:, None] + np.arange(dim))
+        cov = factor.solve(_unit_columns(factor.shape[0], columns))[columns]
+        turn = np.zeros(cov.shape)
+        turn[:d, :d] = np.eye(d)
+        turn[d:, :d] = -by_frame(space, seen[kept]).reshape(-1, d)
+        turn[d:, d:] = np.kron(np.eye(kept.size), space.rotation(self.start).T)
+        self.near, self.points = ids[kept], seen[kept]
+        self.cov = gaussian.symmetrise(turn @ cov @ turn.T)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it, for a checkpoint."""
+        named = {
+            "counts": np.array([each.ids.size for each in self.maps], dtype=np.int64),
+            "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(each.ids for each in self.maps)]),
+            "points": np.concatenate([np.zeros((0, self.dim)), *(each.points for each in self.maps)]),
+            "covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in self.maps)]),
+            "ends": np.array([each.end for each in self.maps]).reshape(-1, self.space.size),
+            "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
+        }  # fmt: skip
+        return {f"submaps/{name}": array for name, array in named.items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Takes up what `arrays` gave. Raises InputError: it is damaged."""
+        schema = {
+            "counts": checkpoint.integers("maps", least=0), "ids": checkpoint.integers("landmarks", least=0),
+            "points": checkpoint.numbers("landmarks", self.dim), "covs": checkpoint.numbers("entries"),
+            "ends": checkpoint.elements(self.space, "maps"), "starts": checkpoint.elements(self.space, "starts"),
+            "near": checkpoint.integers("near", least=0), "near_points": checkpoint.numbers("near", self.dim),
+            "near_cov": checkpoint.numbers("size", "size"),
+        }  # fmt: skip
+        found = checkpoint.read(arrays, schema, "submaps/")
+        counts = found["counts"].tolist()
+        sizes = [self.space.dim + self.dim * count for count in counts]
+        ids = checkpoint.split(found["ids"], counts, "submaps/ids")
+        points = checkpoint.split(found["points"], counts, "submaps/points")
+        covs = checkpoint.split(found["covs"], [size * size for size in sizes], "submaps/covs")
+        if (
+            len(found["starts"]) != len(counts) + 1
+            or len(found["near_cov"]) != self.space.dim + found["near_points"].size
+        ):
+            raise InputError("the arrays submaps/starts and submaps/near_cov do not fit the sub-maps")
+        self.maps, self._last = [], {}
+        for end, names, places, cov, size in zip(found["ends"], ids, points, covs, sizes, strict=True):
+            if np.unique(names).size < names.size:
+                raise InputError("the array submaps/ids names a landmark twice in a sub-map")
+            self._hold(SubMap(end, names, places, cov.reshape(size, size)))
+        if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
+            raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
+        self.starts, self.near = list(found["starts"]), found["near"]
+        self.points, self.cov = found["near_points"], found["near_cov"]

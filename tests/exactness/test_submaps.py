@@ -1,0 +1,207 @@
+"""Sub-maps against one Gaussian of everything: the same map and pose, and no more work per step however long the way."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from rbpf import RangeBearingConfig, RangeBearingSlam
+from rbpf.core.filter import Filter
+from rbpf.core.resampling import Consolidation
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.maps.joint_map import JointMap
+from rbpf.maps.point import Point
+from rbpf.maps.submaps import SubMap, SubMaps
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.readers import RobotLog
+from rbpf.validation.simulation.robot import RobotWorld, simulated_log
+from tests.exactness.models import Relative
+from tests.exactness.slam import NOISE, STEP, Q, Walk
+
+RING = 40
+
+
+class Reading:
+    """Landmarks by name."""
+
+    def __init__(self, landmarks: np.ndarray, z: np.ndarray) -> None:
+        self.landmarks, self.z, self.cov_z = landmarks, z, np.tile(NOISE, (len(z), 1, 1))
+
+
+def walk(steps: int = 14) -> tuple[list[Reading], np.ndarray, np.ndarray]:
+    """Readings of a `Walk` that sees three new landmarks per step and old ones again, and what they say of all: least squares.
+
+    Names (M,) in the order of the solution; mean and covariance of the last position, then of the landmarks.
+    """
+    rng = np.random.default_rng(3)
+    position, landmarks, readings = np.zeros(2), {}, []
+    rows, values, infos = [], [], []
+    columns: dict[object, int] = {}
+
+    def at(name: object) -> int:
+        return columns.setdefault(name, 2 * len(columns))
+
+    def say(blocks: dict[object, float], value: np.ndarray, cov: np.ndarray) -> None:
+        rows.append({at(name): sign for name, sign in blocks.items()})
+        values.append(value)
+        infos.append(np.linalg.inv(cov))
+
+    for t in range(steps):
+        position = position + STEP + np.linalg.cholesky(Q) @ rng.normal(size=2)
+        say({("robot", t): 1.0} | ({("robot", t - 1): -1.0} if t else {}), STEP, Q)
+        # The last steps look back at the first landmarks, which the sub-maps between have not.
+        seen = np.arange(2 * t, 2 * t + 4) if t < steps - 2 else np.append(np.arange(4), 2 * t + np.arange(2))
+        z = []
+        for name in seen.tolist():
+            landmarks.setdefault(name, position + rng.normal(size=2))
+            z.append(landmarks[name] - position + np.linalg.cholesky(NOISE) @ rng.normal(size=2))
+            say({name: 1.0, ("robot", t): -1.0}, z[-1], NOISE)
+        readings.append(Reading(seen, np.array(z)))
+    slope = np.zeros((2 * len(rows), 2 * len(columns)))
+    for row, blocks in enumerate(rows):
+        for column, sign in blocks.items():
+            slope[2 * row : 2 * row + 2, column : column + 2] = sign * np.eye(2)
+    weight = np.zeros((len(slope), len(slope)))
+    for row, info in enumerate(infos):
+        weight[2 * row : 2 * row + 2, 2 * row : 2 * row + 2] = info
+    cov = np.linalg.inv(slope.T @ weight @ slope)
+    mean = cov @ slope.T @ weight @ np.concatenate(values)
+    kept = np.concatenate([columns[name] + np.arange(2) for name in [("robot", steps - 1), *sorted(landmarks)]])
+    return readings, mean[kept], cov[np.ix_(kept, kept)]
+
+
+@pytest.mark.parametrize("submap", [4, 7, 100])
+def test_joined_they_say_what_one_gaussian_says(submap):
+    readings, mean, cov = walk()
+    joint = JointMap(Euclidean(2), submap=submap)
+    options = {"n": 10, "rng": np.random.default_rng(0), "lag": 1, "consolidation": Consolidation(1)}
+    filter_ = Filter(Walk(), NamedLandmarkSensor(Relative(), Point(2)), joint, **options)
+    for reading in readings:
+        filter_.step(reading)
+    ids, places, covs = joint.landmarks(filter_.particles)
+    order = np.argsort(ids)
+    assert len(joint.old.maps) == {4: 14, 7: 5, 100: 0}[submap]
+    np.testing.assert_array_equal(ids[order], np.arange(ids.size))
+    np.testing.assert_allclose(places[order].ravel(), mean[2:], rtol=1e-6, atol=1e-6)
+    for row, own in enumerate(covs[order]):
+        at = slice(2 + 2 * row, 4 + 2 * row)
+        np.testing.assert_allclose(own, cov[at, at], rtol=1e-6)
+
+
+def ring(space, seed: int, size: float = 0.05) -> tuple[list[SubMap], np.ndarray, np.ndarray]:
+    """Ten sub-maps of one and a half rounds past landmarks on a ring, their true ends (11, E) and landmarks."""
+    rng = np.random.default_rng(seed)
+    dim = 2 if space is SE2 else 3
+    turns = np.linspace(0.0, 3.0 * np.pi, 11)
+    tangents = np.zeros((11, space.dim))
+    tangents[:, 0 if space is SE2 else 2] = turns
+    ends = space.compose(space.exp(tangents), space.exp(np.eye(space.dim)[-dim] * 8.0))
+    angles = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)
+    landmarks = np.zeros((RING, dim))
+    landmarks[:, 0], landmarks[:, 1] = 10.0 * np.cos(angles), 10.0 * np.sin(angles)
+    landmarks += rng.normal(size=landmarks.shape)
+    landmarks = space.inverse_transform(ends[0], landmarks)
+    ends = space.between(ends[0], ends)
+    found = []
+    for begin, end in pairwise(ends):
+        ids = np.flatnonzero(np.linalg.norm(space.inverse_transform(end, landmarks), axis=1) < 5.0)
+        n = space.dim + dim * ids.size
+        factor = size * (rng.normal(size=(n, n)) / np.sqrt(n) + 0.5 * np.eye(n))
+        error = factor @ rng.normal(size=n)
+        points = space.inverse_transform(end, landmarks[ids]) + error[space.dim :].reshape(-1, dim)
+        moved = space.retract(space.between(begin, end), error[: space.dim])
+        found.append(SubMap(moved, ids, points, factor @ factor.T))
+    return found, ends, landmarks
+
+
+@pytest.mark.parametrize("space", [SE2, SE3])
+def test_what_is_joined_one_by_one_is_what_all_together_say(space):
+    """With small errors, where slopes hardly matter: the start, the landmarks about it, and their covariance."""
+    finished, *_ = ring(space, 0, 1e-4)
+    maps = SubMaps(space, 2 if space is SE2 else 3, RING)
+    for each in finished[:6]:
+        maps.join(each)
+    assert maps.near.size < RING  # nothing has returned: no solution of all was needed
+    start, near, points, cov = maps.start, maps.near, maps.points, maps.cov
+    maps.landmarks()
+    np.testing.assert_allclose(space.local(start, maps.start), 0.0, atol=1e-7)
+    mine, its = (np.argsort(ids) for ids in (near, maps.near[np.isin(maps.near, near)]))
+    np.testing.assert_allclose(points[mine], maps.points[np.isin(maps.near, near)][its], atol=1e-7)
+    d = space.dim
+    np.testing.assert_allclose(cov[:d, :d], maps.cov[:d, :d], rtol=1e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("space", [SE2, SE3])
+def test_the_place_after_a_loop_is_as_uncertain_as_told(space):
+    """NEES per degree of freedom of the last start and the landmarks about it, over the runs."""
+    pose, near = [], []
+    for seed in range(20):
+        finished, ends, landmarks = ring(space, seed)
+        maps = SubMaps(space, landmarks.shape[1], 10)
+        closed = 0
+        for each in finished:
+            closed += bool(maps.returned(each.ids).any())
+            maps.join(each)
+        assert closed
+        error, d = space.local(maps.start, ends[-1]), space.dim
+        pose.append(error @ np.linalg.solve(maps.cov[:d, :d], error) / d)
+        error = (maps.points - space.inverse_transform(ends[-1], landmarks[maps.near])).ravel()
+        near.append(error @ np.linalg.solve(maps.cov[d:, d:], error) / error.size)
+    for found in (pose, near):
+        assert abs(np.mean(found) - 1.0) < 3.0 * np.std(found) / np.sqrt(len(found)) + 0.05
+
+
+def loop() -> RobotLog:
+    return simulated_log(RobotWorld(260, 60, radius_m=8.0, laps=1.2, extent_m=11.0, max_range_m=5.0), 0)
+
+
+@pytest.mark.slow
+def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
+    log = loop()
+    config = RangeBearingConfig(particles=50, submap=20)
+    system, whole = (RangeBearingSlam.of_log(log, replace(config, submap=n)) for n in (20, None))
+    errors, sizes = [], []
+    for t, frame in enumerate(log.frames):
+        found, theirs = system.take(frame), whole.take(frame)
+        error = SE2.local(found.pose, log.truth.poses[t])
+        errors.append(error @ np.linalg.solve(found.cov, error) / 3.0 if t else 0.0)
+        sizes.append(system.joint.cov.shape[0])
+        assert np.linalg.norm(found.pose[1:] - theirs.pose[1:]) <= 6.0 * np.sqrt(np.trace(found.cov[1:, 1:]))
+    assert len(system.joint.old.maps) > 2 and max(sizes) <= 3 + 2 * 40 < whole.joint.cov.shape[0]
+    assert np.mean(errors) < 3.0
+    found, theirs = system.map(), whole.map()
+    kept, again = tmp_path / "checkpoint.npz", RangeBearingSlam.of_log(log, config)
+    system.save(kept)
+    again.load(kept)
+    np.testing.assert_equal(vars(again.map()), vars(found))
+    np.testing.assert_array_equal(
+        again.joint.estimate(again.filter.particles).mean, system.joint.estimate(system.filter.particles).mean
+    )
+    assert set(found.ids) == set(theirs.ids)
+    error = found.mean - np.array([log.truth.landmarks[name] for name in found.ids.tolist()])
+    assert np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov), error).mean() < 6.0
+
+
+def test_what_ties_sub_maps_is_refused():
+    with pytest.raises(InputError, match="sub-maps take no substate"):
+        JointMap(SE2, (np.zeros(3), np.eye(3)), submap=10)
+
+
+def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
+    finished, *_ = ring(SE2, 1)
+    maps = SubMaps(SE2, 2, 10)
+    for each in finished:
+        maps.join(each)
+    again = SubMaps(SE2, 2, 10)
+    again.restore(maps.arrays())
+    for mine, theirs in zip(again.landmarks(), maps.landmarks(), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    for name, wrong in {
+        "counts": lambda a: a + 1, "ends": lambda a: a[1:], "starts": lambda a: a[1:], "near": lambda a: a + 1000,
+        "ids": lambda a: np.zeros_like(a), "near_cov": lambda a: a[1:, 1:], "covs": lambda a: a[1:],
+    }.items():  # fmt: skip
+        damaged = {key: wrong(array) if key.endswith("/" + name) else array for key, array in maps.arrays().items()}
+        with pytest.raises(InputError, match="submaps/"):
+            SubMaps(SE2, 2, 10).restore(damaged)
