@@ -13,6 +13,7 @@ from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, 
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
+
 @dataclass(frozen=True)
 class AssociationConfig(Ranged):
     """Unknown association."""
