@@ -174,14 +174,8 @@ class JointMap(Map):
         """Which observations are outliers: the most probable choice, given all particles, Mathematics (joint-outliers)."""
         if all(group.likelihood is None or group.likelihood.kernel_id == 0 for group in groups):
             return groups
-        prior, weights = belief.prior, belief.weights
-        rows = self._seen_through(belief.state, groups, prior)
-        spread = np.einsum("n,nra->ra", weights, rows.by_state @ prior.spread(prior.mean))
-        nu = weighted_mean(rows.nu, weights)
-        apart = rows.nu - nu
-        chosen = iter(
-            log_odds_of(nu, rows.cov + spread @ spread.T + multiplied((weights[:, None] * apart).T, apart), rows.groups)
-        )
+        nu, cov, parts = self._foreseen(groups, belief)
+        chosen = iter(log_odds_of(nu, cov, parts))
         decided = []
         for group in groups:
             log_odds = np.full(len(group.z), np.inf)
@@ -363,6 +357,15 @@ class JointMap(Map):
             return rows
         slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
         return rows._replace(by_state=rows.by_state + rows.by_marginal @ slope)
+
+    def _foreseen(self, groups: Sequence[Observations], belief: Belief) -> tuple[np.ndarray, np.ndarray, list[Group]]:
+        """Mean (R,) and covariance (R, R) of the innovations under all particles, and whose rows they are."""
+        prior, weights = belief.prior, belief.weights
+        rows = self._seen_through(belief.state, groups, prior)
+        spread = np.einsum("n,nra->ra", weights, rows.by_state @ prior.spread(prior.mean))
+        nu = weighted_mean(rows.nu, weights)
+        apart = rows.nu - nu
+        return nu, rows.cov + spread @ spread.T + multiplied((weights[:, None] * apart).T, apart), rows.groups
 
     def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
         """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
@@ -613,6 +616,16 @@ class JointMap(Map):
 
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         return projected(model, self.read(ids), belief)
+
+    def project_jointly(
+        self, model: ObservationModel, ids: np.ndarray, belief: Belief
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`project`, with what the landmarks have in common: mean (K, p) and covariance (K p, K p)."""
+        mode = slice(belief.mode, belief.mode + 1)
+        records = self.read(ids, mode)
+        z = model.predict(belief.state[mode, None], records.mean, records.const)[0]
+        nu, cov, _ = self._foreseen([Observations(z, np.zeros((*z.shape, z.shape[1])), model, ids=ids)], belief)
+        return z - nu.reshape(z.shape), cov
 
     def arrays(self) -> dict[str, np.ndarray]:
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}

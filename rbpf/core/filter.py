@@ -318,7 +318,23 @@ class Filter:
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
         """A checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
-        arrays = {
+        held = self.arrays() | {f"extra/{name}": array for name, array in (extra or {}).items()}
+        checkpoint.write_checkpoint(Path(path), held, self._fingerprint(), self.rng.bit_generator.state)
+
+    def load(self, path: Path | str) -> dict[str, np.ndarray]:
+        """Continues from a checkpoint, in a filter built with the same models and options; returns the `extra` arrays.
+
+        Raises InputError: the file is missing, damaged, or belongs to another filter.
+        """
+        arrays, rng_state = checkpoint.read_checkpoint(Path(path), self._fingerprint())
+        with self._unchanged_by_failure(), checkpoint.fitting(Path(path)):
+            self.restore(arrays)
+            self.rng.bit_generator.state = rng_state
+        return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything that a checkpoint must hold, but for the state of the random generator."""
+        return {
             "particles/state": self.particles.state,
             "particles/log_weights": self.particles.log_weights,
             "filter/numbers": np.array([self.steps, -1 if self.stamp_ns is None else self.stamp_ns]),
@@ -328,41 +344,32 @@ class Filter:
             **self.lineage.arrays(),
             **self.history.arrays(),
             **self.marginals.arrays(),
-            **{f"extra/{name}": array for name, array in (extra or {}).items()},
         }
-        checkpoint.write_checkpoint(Path(path), arrays, self._fingerprint(), self.rng.bit_generator.state)
 
-    def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        """Continues from a checkpoint, in a filter built with the same models and options; returns the `extra` arrays.
-
-        Raises InputError: the file is missing, damaged, or belongs to another filter.
-        """
-        arrays, rng_state = checkpoint.read_checkpoint(Path(path), self._fingerprint())
-        with self._unchanged_by_failure(), checkpoint.fitting(Path(path)):
-            state = checkpoint.read_one(arrays, "particles/state", checkpoint.elements(self.space, "n"), n=self.n)
-            log_weights = checkpoint.read_one(
-                arrays, "particles/log_weights", checkpoint.numbers("n", values="log"), n=self.n
-            )
-            if abs(np.logaddexp.reduce(log_weights)) > 1e-6:
-                raise InputError("the particles' weights do not sum to 1")
-            counted = checkpoint.read(arrays, _FILTER, "filter/")
-            lineage = Lineage(self.n)
-            lineage.restore(arrays)
-            history = History(lineage, self.history.lag, self.history.clouds)
-            history.restore(arrays, self.particles.state.shape[1])
-            self.lineage, self.history = lineage, history
-            self.marginals.begin(self.n, lineage)
-            self.marginals.restore(arrays)
-            self.particles = Particles(state, log_weights)
-            steps, stamp = counted["numbers"].tolist()
-            if steps < 0:
-                raise InputError(f"the array filter/numbers counts {steps} steps")
-            self.steps, self.stamp_ns = steps, stamp if counted["started"] else None
-            self.log_evidence = float(counted["log_evidence"])
-            if self.consolidation is not None:
-                self._age = int(checkpoint.read_one(arrays, "filter/age", checkpoint.integers(least=0)))
-            self.rng.bit_generator.state = rng_state
-        return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`. Raises InputError: an array does not fit; the filter is then in between."""
+        state = checkpoint.read_one(arrays, "particles/state", checkpoint.elements(self.space, "n"), n=self.n)
+        log_weights = checkpoint.read_one(
+            arrays, "particles/log_weights", checkpoint.numbers("n", values="log"), n=self.n
+        )
+        if abs(np.logaddexp.reduce(log_weights)) > 1e-6:
+            raise InputError("the particles' weights do not sum to 1")
+        counted = checkpoint.read(arrays, _FILTER, "filter/")
+        lineage = Lineage(self.n)
+        lineage.restore(arrays)
+        history = History(lineage, self.history.lag, self.history.clouds)
+        history.restore(arrays, self.particles.state.shape[1])
+        self.lineage, self.history = lineage, history
+        self.marginals.begin(self.n, lineage)
+        self.marginals.restore(arrays)
+        self.particles = Particles(state, log_weights)
+        steps, stamp = counted["numbers"].tolist()
+        if steps < 0:
+            raise InputError(f"the array filter/numbers counts {steps} steps")
+        self.steps, self.stamp_ns = steps, stamp if counted["started"] else None
+        self.log_evidence = float(counted["log_evidence"])
+        if self.consolidation is not None:
+            self._age = int(checkpoint.read_one(arrays, "filter/age", checkpoint.integers(least=0)))
 
     def _fingerprint(self) -> dict[str, object]:
         return {

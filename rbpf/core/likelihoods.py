@@ -1,13 +1,15 @@
-"""Likelihoods of an innovation, and the association that maximises them.
+"""Likelihoods of an innovation, and the associations that maximise them.
 
-Association is per particle: each measurement is explained by a landmark within the gate, by a new landmark (only where
-nothing known is near), or by clutter; no landmark explains two. Costs, Mathematics (association-cost), are negative
-log-densities in the measurement's units, so that the choice and the particle's weight speak of the same thing.
+Each measurement is explained by a landmark within the gate, by a new landmark (only where nothing known is near), or by
+clutter; no landmark explains two. `associate` does so in every particle by itself, whose landmarks are independent;
+`associations` finds the most probable explanations of a whole frame by landmarks that are one Gaussian. Costs, Mathematics
+(association-cost), are negative log-densities in the measurement's units, so that the choice and the weight speak of the
+same thing.
 """
 
 from copy import copy
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -167,6 +169,86 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
         columns = linear_sum_assignment(square)[1]
         chosen[i] = np.where(columns < m, columns, fallback[i])
     return chosen
+
+
+class Association(NamedTuple):
+    """An explanation of K measurements, and what is then expected of M landmarks."""
+
+    chosen: np.ndarray  #: (K,) index of a landmark, NEW or NULL.
+    log_density: float  #: of all measurements.
+    mean: np.ndarray  #: (M, p).
+    cov: np.ndarray  #: (M, p, p).
+
+
+WIDTH = 50
+"""Explanations of the first measurements of a frame that are followed, at most."""
+
+
+def associations(
+    z: np.ndarray,
+    noise: np.ndarray,
+    mean: np.ndarray,
+    cov: np.ndarray,
+    gates: Gates,
+    log_unit: np.ndarray,
+    bound: float,
+) -> list[Association]:
+    """The most probable explanations of a frame, best first.
+
+    Searches the measurements one by one, those with the fewest candidates first. An explanation of some is a Kalman filter of
+    what is expected of the landmarks, by which the next one is judged: what fits together is found together (as the joint
+    compatibility of J. Neira and J. Tardós 2001), and exclusion and all densities are those of the joint Gaussian.
+
+    Args:
+        z: (K, p) measurements, linear in what is expected.
+        noise: (K, p, p) their covariance.
+        mean: (M, p) what is expected of landmarks.
+        cov: (M p, M p) its covariance.
+        gates: as `associate` has them.
+        log_unit: (K,) log-size of the unit that the gates' densities are in, in units of z.
+        bound: log-ratio up to which an explanation is worth keeping beside the best one.
+    """
+    (k, p), m = z.shape, len(mean)
+    best_else = max(gates.log_new, gates.log_clutter)
+    total, chosen = np.zeros(1), np.full((1, k), NULL)
+    mean, cov, each = mean.reshape(1, -1), cov[None], np.arange(m)
+
+    def blocks() -> np.ndarray:
+        return np.moveaxis(cov.reshape(len(cov), m, p, m, p)[:, each, :, each], 0, 1)
+
+    alone = squared_mahalanobis(z[:, None] - mean.reshape(m, p), blocks()[0] + noise[:, None])
+    for reading in np.argsort((alone <= gates.accept).sum(axis=1), kind="stable").tolist():
+        # A landmark within the gate that explains nothing yet, or none.
+        nu, own = z[reading] - mean.reshape(len(mean), m, p), blocks() + noise[reading]
+        free = (squared_mahalanobis(nu, own) <= gates.accept) & ~(chosen[:, :, None] == each).any(axis=1)
+        by_landmark = np.where(free, gaussian.log_density(nu, own), -np.inf)
+        log_else = np.full((len(total), 1), best_else - log_unit[reading])
+        options = (total[:, None] + np.concatenate([by_landmark, log_else], axis=1)).ravel()
+        kept = np.argsort(-options, kind="stable")[:WIDTH]
+        kept = kept[options[kept] >= options[kept[0]] - 2.0 * bound]
+        parent, which = np.divmod(kept, m + 1)
+        total, chosen, mean, cov = options[kept], chosen[parent], mean[parent], cov[parent]
+        took = np.flatnonzero(which < m)
+        if took.size:
+            which, parent = which[took], parent[took]
+            chosen[took, reading] = which
+            columns = (which[:, None] * p + np.arange(p))[:, None]
+            cross = np.take_along_axis(cov[took], columns, axis=2)
+            gain = cross @ gaussian.inverse(own[parent, which])
+            mean[took] += (gain @ nu[parent, which][..., None])[..., 0]
+            cov[took] -= gain @ np.swapaxes(cross, 1, 2)
+    # What is explained by no landmark is new, but clutter where a landmark is as near as the measurement's own noise: that
+    # one is uncertain of its place is no reason to take another one for it.
+    for reading in np.flatnonzero((chosen == NULL).any(axis=0)).tolist():
+        white = gaussian.solve_lower(gaussian.cholesky(noise[reading]), z[reading] - mean.reshape(len(mean), m, p))
+        near = np.square(white).sum(axis=-1).min(axis=1, initial=np.inf) <= gates.isolate
+        none = chosen[:, reading] == NULL
+        if gates.log_new >= gates.log_clutter:
+            chosen[none & ~near, reading] = NEW
+            total = total + np.where(none & near, gates.log_clutter - best_else, 0.0)
+    order = np.argsort(-total, kind="stable")
+    order, means, covs = order[total[order] >= total[order[0]] - bound], mean.reshape(len(mean), m, p), blocks()
+    return [Association(chosen[i], float(total[i]), means[i], covs[i]) for i in order.tolist()]
 
 
 @dataclass(frozen=True)

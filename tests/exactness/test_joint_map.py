@@ -250,9 +250,23 @@ def test_sensors_read_it_as_any_map():
 
     for first, second in zip(told(joint), told(own), strict=True):
         np.testing.assert_allclose(first, second, 1e-12, 1e-12)
+    mean, cov = joint.project_jointly(model, joint.ids, belief)
+    alone = own.project(model, own.ids, belief)
+    np.testing.assert_allclose(mean, alone[0], 1e-12, 1e-12)
+    np.testing.assert_allclose([cov[i : i + 2, i : i + 2] for i in (0, 2, 4)], alone[1], 0.01, 1e-3)  # mean slopes
     assert joint.are(np.array([0, 9]), Point(2)).tolist() == [True, False]
     assert joint.landmark_of(2).dim == 2
     assert joint.stored_fraction < 1.0
+
+
+def test_what_is_expected_of_several_landmarks_is_correlated_as_they_are():
+    """Of one particle that stands still, in a sensor that turns: R^T P R, blocks off the diagonal, too."""
+    joint, particles = held(SE2, 1, 3)
+    standing = Prior(SE2, particles.state, np.zeros((1, 3)), np.zeros((1, 3, 0)))
+    turn = np.kron(np.eye(3), SE2.rotation(particles.state[0]))
+    mean, cov = joint.project_jointly(RelativePosition(SE2), joint.ids, Belief(particles.log_weights, standing, {}))
+    np.testing.assert_allclose(mean, SE2.inverse_transform(particles.state[0], joint.mean[0, 3:].reshape(3, 2)), 1e-12)
+    np.testing.assert_allclose(cov, turn.T @ joint.cov[3:, 3:] @ turn, 1e-9, 1e-15)
 
 
 def test_more_landmarks_than_a_covariance_can_hold():

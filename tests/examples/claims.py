@@ -97,6 +97,11 @@ def joint_map(figures: dict[str, float]) -> None:
     assert 0.8 < figures["stereo joint, 50 particles: map"] < 1.25
 
 
+def hypotheses(figures: dict[str, float]) -> None:
+    assert figures["4 hypotheses"] == 1.0
+    assert figures["1 hypotheses"] < 1.0
+
+
 def mono_joint(figures: dict[str, float]) -> None:
     assert 0.3 < figures["joint map, 50, window 1"] < 1.6
     assert 0.3 < figures["joint map, 50, window 1, true depth"] < 1.4

@@ -95,6 +95,15 @@ def robot(association: str, **options: str) -> Case:
     return Case(make, log.frames[:20], log.frames[20:])
 
 
+def returning() -> Case:
+    from examples.studies.hypotheses import corridor
+
+    log, config = corridor(0), RangeBearingConfig(particles=4, association="ml", map="joint")
+    return Case(
+        lambda: RangeBearingSlam.of_log(log, config, keep_associations=True), log.frames[:59], log.frames[59:63]
+    )
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "mono": lambda: mono(True),
     "mono, nothing known": lambda: mono(False),
@@ -103,7 +112,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "stereo": stereo,
     "named stereo": named_stereo,
     "robot": lambda: robot("known", map="particles"),
-    "robot, unnamed": lambda: robot("ml"),
+    "robot, unnamed": lambda: robot("ml", map="particles"),
+    "robot, hypotheses": returning,
     "robot, joint map": lambda: robot("known"),
 }
 

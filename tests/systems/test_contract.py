@@ -7,6 +7,7 @@ from itertools import count, cycle
 import numpy as np
 import pytest
 
+from examples.studies.hypotheses import corridor
 from examples.studies.image_faults import blur_motion
 from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
@@ -55,6 +56,12 @@ class Case:
     states: set[TrackingState] = field(default_factory=set)
 
 
+def unnamed(**options) -> RangeBearingSlam:
+    """A robot that does not know which of two doors it has come back to."""
+    config = RangeBearingConfig(particles=10, association="ml", map="joint", **options)
+    return RangeBearingSlam.of_log(corridor(0), config, keep_associations=True)
+
+
 def blurred() -> list:
     """Five pairs of which the odometry makes nothing."""
     return list(blur_motion(25, 10, 5)(pairs(18)).frames())
@@ -81,6 +88,7 @@ RESUMED = {
         lambda: stereo(map=MapConfig(kind="joint", active=30)), lambda: list(pairs(12).frames()), (0, 5, 7)
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
+    "robot, unnamed": Case(unnamed, lambda: corridor(0).frames, (0, 44, 58, 62)),
     "scans": Case(lambda: laser(), lambda: scans(12), (0, 5, 6, 9), {TrackingState.TRACKED, TrackingState.PREDICTED}),
 }
 

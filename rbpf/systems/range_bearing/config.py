@@ -8,7 +8,6 @@ import numpy as np
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.core.models import Likelihood
-from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged, Seed, check_ranges
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
@@ -19,7 +18,8 @@ class AssociationConfig(Ranged):
     """Unknown association."""
 
     accept_probability: Probability = 0.999  #: of the χ² gate within which a landmark may explain an observation.
-    isolate_probability: Probability = 0.999999  #: of the χ² gate beyond which an observation may start a landmark.
+    #: of the χ² gate beyond which an observation may start a landmark; of a joint map that of its noise alone.
+    isolate_probability: Probability = 0.999999
     #: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
     new_density: Positive = 1e-3
     clutter_density: Positive = 1e-4  #: of clutter, same units.
@@ -28,6 +28,9 @@ class AssociationConfig(Ranged):
     hit: NotNegative = 1.0  #: added to a landmark's log-odds by an observation.
     miss: NotNegative = 0.0  #: subtracted where it was expected and not seen.
     drop: float = -2.0  #: log-odds below which a landmark is deleted.
+    #: of a joint map: explanations of all that was measured that are kept side by side, at most.
+    hypotheses: Annotated[int, Range(ge=1, le=4)] = 4
+    least_weight: Probability = 1e-4  #: below which such an explanation is dropped, or not taken up.
 
     def gates(self, dim: int) -> Gates:
         """χ² thresholds for measurements of `dim` numbers."""
@@ -44,7 +47,7 @@ class RangeBearingConfig:
 
     particles: Count = 100  #: number of particles.
     seed: Seed = 0  #: of the only random generator.
-    #: landmarks named by the log, or by maximum likelihood in each particle.
+    #: landmarks named by the log, or by maximum likelihood: in each particle, or of a joint map in each of some hypotheses.
     association: Literal["known", "ml"] = "known"
     #: one Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true; or
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles). By default
@@ -75,8 +78,6 @@ class RangeBearingConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.map == "joint" and self.association != "known":
-            raise InputError("map=joint takes association=known: map=particles takes both")
 
     def kept_map(self) -> tuple[Literal["joint", "particles"], str]:
         """The map of a run, and in one sentence why it is this one."""

@@ -13,7 +13,7 @@ import numpy as np
 from rbpf.core.checkpoint import elements, integers, read, read_one, split
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import NEW, NULL, Sensor
+from rbpf.core.models import NEW, NULL, Part, Sensor
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
@@ -29,6 +29,7 @@ from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.systems.anchoring import StartAnchor
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.hypotheses import HYPOTHESES, Hypotheses
 from rbpf.systems.system import FILTER_COLUMNS, Column, Ragged, Recorded, System, Tracked, TrackingState, filter_values
 
 
@@ -75,38 +76,43 @@ class RangeBearingSlam(System):
             self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
         self.kept_map, self.why_map = config.kept_map()
-        self.joint = (
-            JointMap(space, compiled=config.compiled, submap=config.submap) if self.kept_map == "joint" else None
-        )
+        # Without names, landmarks of all that was mapped may be meant: one Gaussian has them.
+        submap = config.submap if config.association == "known" else None
+        joint = JointMap(space, compiled=config.compiled, submap=submap) if self.kept_map == "joint" else None
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         sensor: Sensor
-        if config.association == "known":
+        evidence = unknown.gates(self.model.dim), unknown.existence()
+        if config.association == "known" or joint is not None:
             sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
         else:
-            evidence = unknown.gates(self.model.dim), unknown.existence()
             sensor = AnonymousLandmarkSensor(self.model, self.point, *evidence, likelihood)
         self.sensor = sensor
         self.filter = Filter(
             OdometryMotion(space),
             sensor if wrapped is None else wrapped(sensor),
-            self.joint or own,
+            joint or own,
             config.proposal.build(),
             config.resampling.build(),
             config.particles,
             np.random.default_rng(config.seed),
-            lag=1 if self.joint else self.lag,
-            consolidation=Consolidation(config.window, config.resampling.ess_threshold) if self.joint else None,
+            lag=1 if joint else self.lag,
+            consolidation=Consolidation(config.window, config.resampling.ess_threshold) if joint else None,
         )
-        anchored = config.anchor_every and self.joint is None
+        self.hypotheses: Hypotheses | None = None
+        if joint is not None and config.association == "ml":
+            several = unknown.hypotheses, unknown.least_weight, keep_associations
+            self.hypotheses = Hypotheses(self.filter, self.model, *evidence, *several)
+        anchored = config.anchor_every and joint is None
         self.anchor = StartAnchor(self.filter, config.anchor_every, likelihood) if anchored else None
         self._names: set[int] = set()
         self._odometry = space.identity()
-        self._associations = _Associations(self.filter) if keep_associations else None
+        self._associations = _Associations(self.filter) if keep_associations and not self.hypotheses else None
         d, e, p = space.dim, space.size, self.model.dim
         self.columns = (
             *FILTER_COLUMNS,
+            *([] if self.hypotheses is None else [HYPOTHESES]),
             Column("correction", "what the observations say about the motion, in its whitened coordinates", shape=(d,)),
             Column("cov_correction", "what a consistent filter expects of the correction", shape=(d, d)),
             Column("odometry", "world_from_robot by odometry alone", shape=(e,)),
@@ -118,6 +124,12 @@ class RangeBearingSlam(System):
             Ragged("z", "measurements", (p,), per="landmarks"),
             Ragged("cov_z", "their covariance", (p, p), per="landmarks"),
         )
+
+    @property
+    def joint(self) -> JointMap | None:
+        """The joint map, of the most probable hypothesis; None where every particle has a map of its own."""
+        held = self.filter.marginals.parts[Part.LANDMARK]
+        return held if isinstance(held, JointMap) else None
 
     @classmethod
     def of_log(
@@ -152,7 +164,12 @@ class RangeBearingSlam(System):
         Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
-        report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
+        if self.hypotheses is None:
+            report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
+            used = self._used(names, report)
+        else:
+            used, report = self.hypotheses.step(z, cov_z, odometry, stamp_ns)
+            self.filter = self.hypotheses.held[0].filter
         if odometry is not None:
             self._odometry = self.space.compose(self._odometry, odometry.delta)
 
@@ -161,7 +178,6 @@ class RangeBearingSlam(System):
         if self.anchor is not None:
             estimate = self.anchor.state_estimate(self.anchor.after_step(report, odometry))
 
-        used = self._used(names, report)
         if self._associations is not None:
             self._associations.record(report, len(z))
         d, e = self.space.dim, self.space.size
@@ -173,6 +189,7 @@ class RangeBearingSlam(System):
             TrackingState.TRACKED if (used != NULL).any() else TrackingState.PREDICTED,
             {
                 **filter_values(report),
+                **({} if self.hypotheses is None else {"hypotheses": len(self.hypotheses.held)}),
                 "correction": np.full(d, np.nan) if correction is None else correction.mean,
                 "cov_correction": np.full((d, d), np.nan) if correction is None else correction.cov,
                 "odometry": self._odometry,
@@ -189,7 +206,11 @@ class RangeBearingSlam(System):
         return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
 
     def map(self) -> MapEstimate:
-        return estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
+        found = estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
+        if self.hypotheses is None:
+            return found
+        held = self.hypotheses.held[0].exist(found.ids)
+        return MapEstimate(found.ids[held], found.mean[held], found.cov[held])
 
     def particle_poses(self) -> np.ndarray:
         return self.filter.belief().map.world(self.filter.particles.state)
@@ -237,12 +258,14 @@ class RangeBearingSlam(System):
 
         Only with `keep_associations`; before the end of a run the association of the last steps may still change.
         """
+        if self.hypotheses is not None:
+            return self.hypotheses.held[0].chosen
         assert self._associations is not None
         return self._associations.of(self.filter.belief().mode)
 
     def _final(self, log: Recorded) -> list[np.ndarray]:
         """The landmark of every observation, one array (K,) per step, as known now."""
-        if self._associations is not None:
+        if self._associations is not None or (self.hypotheses is not None and self.hypotheses.keep):
             return self.associations()
         return [log.observed(t)["landmarks"] for t in range(len(log))]
 
@@ -252,6 +275,8 @@ class RangeBearingSlam(System):
             kept["observed_once"] = np.array(sorted(self.sensor.observed_once), dtype=np.int64)
         if self._associations is not None:
             kept |= self._associations.arrays()
+        if self.hypotheses is not None:
+            kept |= self.hypotheses.arrays()
         return kept if self.anchor is None else kept | self.anchor.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -261,6 +286,8 @@ class RangeBearingSlam(System):
         self._odometry = read_one(arrays, "odometry", elements(self.space))
         if self._associations is not None:
             self._associations.restore(arrays)
+        if self.hypotheses is not None:
+            self.hypotheses.restore(arrays)
         if self.anchor is not None:
             self.anchor.restore(arrays, self.model, self.point)
 
