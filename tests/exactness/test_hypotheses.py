@@ -9,7 +9,7 @@ from scipy.special import logsumexp, softmax
 from scipy.stats import multivariate_normal
 
 from rbpf.core.filter import Filter
-from rbpf.core.likelihoods import ExistenceModel, Gates, associations
+from rbpf.core.likelihoods import Gates, associations
 from rbpf.core.models import NEW, NULL
 from rbpf.core.resampling import Consolidation
 from rbpf.lie import SE2
@@ -18,6 +18,7 @@ from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.systems.range_bearing.config import AssociationConfig
 from rbpf.systems.range_bearing.hypotheses import Hypotheses
 from tests.exactness.models import Kalman
 
@@ -69,8 +70,8 @@ def test_two_hypotheses_are_the_mixture_of_two_kalman_filters():
         OdometryMotion(SE2), NamedLandmarkSensor(RelativePosition(SE2), Point(2)), joint, n=12, lag=1,
         rng=np.random.default_rng(0), consolidation=Consolidation(1),
     )  # fmt: skip
-    gates = Gates(13.8, 27.6, -60.0, -70.0)
-    found = Hypotheses(filter_, RelativePosition(SE2), gates, ExistenceModel(), 4, 1e-4, False)
+    config = AssociationConfig(new_density=np.exp(-60.0), clutter_density=np.exp(-70.0))
+    found = Hypotheses(filter_, RelativePosition(SE2), config)
     evidence = 0.0
     for t, z in enumerate(readings):
         control = None if not t else Odometry(np.append(0.0, step), block_diag(0.0, (None, wide, narrow)[t]))
@@ -88,7 +89,7 @@ def test_two_hypotheses_are_the_mixture_of_two_kalman_filters():
             kalman.update(np.array(z[0]), H, R)
         exact.append(kalman)
     logs = np.array([kalman.log_evidence for kalman in exact])
-    assert evidence == pytest.approx(2 * gates.log_new + logsumexp(logs), abs=1e-6)
+    assert evidence == pytest.approx(2 * -60.0 + logsumexp(logs), abs=1e-6)
     order = np.argsort(-logs)
     np.testing.assert_allclose(np.exp([each.log_weight for each in found.held]), softmax(logs)[order], 1e-6)
     for each, kalman in zip(found.held, [exact[i] for i in order], strict=True):

@@ -15,13 +15,14 @@ import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, read, split
 from rbpf.core.filter import Filter, StepReport, checked_observations
-from rbpf.core.likelihoods import ExistenceModel, Gates, associations, squared_mahalanobis
+from rbpf.core.likelihoods import associations, squared_mahalanobis
 from rbpf.core.models import NEW, NULL, Observations, Part
 from rbpf.errors import InputError
 from rbpf.maps.joint_map import JointMap
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.range_bearing import RelativePosition, RigidPointModel
+from rbpf.systems.range_bearing.config import AssociationConfig
 from rbpf.systems.system import DIAGNOSTICS, Column
 
 HYPOTHESES = Column("hypotheses", "explanations kept side by side", kind=int, table=DIAGNOSTICS)
@@ -80,29 +81,17 @@ class Hypotheses:
     Args:
         filter_: on a joint map, with a sensor of named landmarks: the names are chosen here.
         model: how measurements arise.
-        gates: when a landmark may explain a measurement, and what the alternatives cost.
-        existence: when a landmark is dropped again.
-        most: number of hypotheses.
-        least: weight below which one is dropped, and up to which an alternative is taken up.
+        config: of association.
         keep: remember every association.
 
     Attributes:
         held: the hypotheses.
     """
 
-    def __init__(
-        self,
-        filter_: Filter,
-        model: RigidPointModel,
-        gates: Gates,
-        existence: ExistenceModel,
-        most: int,
-        least: float,
-        keep: bool,
-    ) -> None:
+    def __init__(self, filter_: Filter, model: RigidPointModel, config: AssociationConfig, keep: bool = False) -> None:
         self.held = [Hypothesis(filter_)]
-        self.model, self.gates, self.existence = model, gates, existence
-        self.most, self.bound, self.keep = most, -float(np.log(least)), keep
+        self.model, self.gates, self.existence, self.keep = model, config.gates(model.dim), config.existence(), keep
+        self.most, self.bound = config.hypotheses, -float(np.log(config.least_weight))
         self._next = 0
 
     def step(

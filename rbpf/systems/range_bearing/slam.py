@@ -83,10 +83,10 @@ class RangeBearingSlam(System):
         own.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         sensor: Sensor
-        evidence = unknown.gates(self.model.dim), unknown.existence()
         if config.association == "known" or joint is not None:
             sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
         else:
+            evidence = unknown.gates(self.model.dim), unknown.existence()
             sensor = AnonymousLandmarkSensor(self.model, self.point, *evidence, likelihood)
         self.sensor = sensor
         self.filter = Filter(
@@ -102,8 +102,7 @@ class RangeBearingSlam(System):
         )
         self.hypotheses: Hypotheses | None = None
         if joint is not None and config.association == "ml":
-            several = unknown.hypotheses, unknown.least_weight, keep_associations
-            self.hypotheses = Hypotheses(self.filter, self.model, *evidence, *several)
+            self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
         anchored = config.anchor_every and joint is None
         self.anchor = StartAnchor(self.filter, config.anchor_every, likelihood) if anchored else None
         self._names: set[int] = set()
