@@ -6,9 +6,9 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from rbpf.cli import DemoOptions, main, options
-from rbpf.cli.cameras import CalibrateOptions
-from rbpf.cli.judging import CompareOptions, SweepOptions
+from rbpf.cli import APP, main
+from rbpf.cli.running import RUN
+from rbpf.cli.simulating import SIMULATE
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE2
@@ -73,13 +73,10 @@ def test_a_number_that_is_out_of_its_range(system):
             assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        *(each for each in vars(options).values() if is_dataclass(each) and each.__module__ == options.__name__),
-        *(DemoOptions, CalibrateOptions, SweepOptions, CompareOptions),
-    ],
-)
+COMMANDS = [kind for group in (APP, RUN, SIMULATE) for kind in group.kinds.values() if is_dataclass(kind)]
+
+
+@pytest.mark.parametrize("kind", COMMANDS)
 def test_every_number_on_the_command_line_has_a_range(kind):
     free = {"distortion", "fisheye", "baseline_m", "blackout"}  # judged by the camera and the simulation that take them
     assert {name for name, _, allowed in numbers(kind) if allowed == ANY} <= free

@@ -1,4 +1,4 @@
-"""The command line: thin, one function per command."""
+"""The command line: thin, one class per command."""
 
 import os
 import sys
@@ -11,16 +11,14 @@ from typing import Annotated
 # another, make a run take twice as long where other programs keep the cores busy. The results are the same bytes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import tyro
-
 from rbpf import __version__
 from rbpf.cli import cameras, installed, judging
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import require_threads
-from rbpf.cli.options import ImagesOptions, MonoOptions, Printed
-from rbpf.cli.running import RUN, repeated, run_mono
+from rbpf.cli.options import Printed
+from rbpf.cli.running import RUN, RunMono, repeated
 from rbpf.cli.showing import say
-from rbpf.cli.simulating import SIMULATE, simulate_desk
+from rbpf.cli.simulating import SIMULATE, SimulateDesk
 from rbpf.errors import InputError
 from rbpf.ranges import MOST, Range
 
@@ -34,36 +32,33 @@ _DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --h
 Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C."""
 
 
+@APP.add("demo")
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(Printed):
-    """Options of `rbpf demo`."""
+class Demo(Printed):
+    """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video."""
 
     out: Path = Path("demo")  #: folder for the images and the results.
     frames: Annotated[int, Range(ge=2, le=MOST)] = 240  #: number of images, 30 per second.
 
-
-@APP.add("demo")
-def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
-    """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video."""
-    images = options.out / "desk"
-    if not (images / "known_points.csv").is_file():
-        simulate_desk(ImagesOptions(out=images, frames=options.frames))
-    known = images / "known_points.csv"
-    out = options.out / "run"
-    run_mono(MonoOptions(sequence=images, known_points=known, out=out, overwrite=True, json=options.json))
+    def __call__(self) -> None:
+        images = self.out / "desk"
+        known = images / "known_points.csv"
+        if not known.is_file():
+            SimulateDesk(out=images, frames=self.frames)()
+        RunMono(sequence=images, known_points=known, out=self.out / "run", overwrite=True, json=self.json)()
 
 
 APP.add_group("run", RUN)
 APP.add_group("simulate", SIMULATE)
-APP.add("calibrate")(cameras.calibrate)
-APP.add("recalibrate")(cameras.recalibrate)
-APP.add("validate")(judging.validate)
-APP.add("report")(judging.report)
-APP.add("export")(judging.export)
-APP.add("sweep")(judging.sweep)
-APP.add("compare")(judging.compare)
-APP.add("doctor")(installed.doctor)
-APP.add("completion")(installed.completion)
+APP.add("calibrate")(cameras.Calibrate)
+APP.add("recalibrate")(cameras.Recalibrate)
+APP.add("validate")(judging.Validate)
+APP.add("report")(judging.Report)
+APP.add("export")(judging.Export)
+APP.add("sweep")(judging.Sweep)
+APP.add("compare")(judging.Compare)
+APP.add("doctor")(installed.Doctor)
+APP.add("completion")(installed.Completion)
 
 
 def _require_filled(arguments: list[str]) -> None:

@@ -15,8 +15,8 @@ LOOSE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateOptions(Printed):
-    """Options of `rbpf calibrate`."""
+class Calibrate(Printed):
+    """Find the camera's focal lengths, centre and distortion from pictures of a chessboard, and write camera.yaml."""
 
     #: folder of images of the board, 15 or more from different directions, or a video of it.
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
@@ -26,59 +26,55 @@ class CalibrateOptions(Printed):
     model: Literal["pinhole", "fisheye"] = "pinhole"
     out: Path = Path("calibration")  #: folder for camera.yaml, calibration.png and calibration.json.
 
+    def __call__(self) -> None:
+        from rbpf.sensors.calibration import Board
+        from rbpf.validation.calibration import PICTURE, calibrate_images, write_calibration
 
-def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> None:
-    """Find the camera's focal lengths, centre and distortion from pictures of a chessboard, and write camera.yaml."""
-    from rbpf.sensors.calibration import Board
-    from rbpf.validation.calibration import PICTURE, calibrate_images, write_calibration
-
-    board = Board.parse(options.board, options.square)
-    with progress() as bar:
-        found, looked_at = calibrate_images(options.images, board, bar("looking for the board"), options.model)
-    entries = write_calibration(found, board, looked_at, options.out)
-    camera, std = found.camera, found.std
-    left_out = f", {len(found.left_out)} left out" if found.left_out else ""
-    answer(
-        entries | {"out": str(options.out)},
-        options.json,
-        f"{len(found.views)} views of {looked_at} images{left_out}; reprojection error {found.rms_px:.3f} px; "
-        f"corners in {100 * found.covered:.0f} % of the image",
-        f"fx {camera.fx:.2f} ± {std[0]:.2f}, fy {camera.fy:.2f} ± {std[1]:.2f}, cx {camera.cx:.2f} ± {std[2]:.2f}, "
-        f"cy {camera.cy:.2f} ± {std[3]:.2f} px",
-        f"camera.yaml and {PICTURE} are in {options.out}; use it with --calibration {options.out / 'camera.yaml'}",
-    )
-    if options.json:
-        return
-    if found.covered < 0.5:
-        say("the board was seen in less than half of the image: distortion is uncertain where it was not")
-    loose = float(max(std[:4])) / camera.fx
-    if loose > LOOSE:
-        say(
-            f"the camera is known to {100 * loose:.1f} % of its focal length only, and a run with it will bend: film "
-            "the board larger, and tilted in all directions"
+        board = Board.parse(self.board, self.square)
+        with progress() as bar:
+            found, looked_at = calibrate_images(self.images, board, bar("looking for the board"), self.model)
+        entries = write_calibration(found, board, looked_at, self.out)
+        camera, std = found.camera, found.std
+        left_out = f", {len(found.left_out)} left out" if found.left_out else ""
+        answer(
+            entries | {"out": str(self.out)},
+            self.json,
+            f"{len(found.views)} views of {looked_at} images{left_out}; reprojection error {found.rms_px:.3f} px; "
+            f"corners in {100 * found.covered:.0f} % of the image",
+            f"fx {camera.fx:.2f} ± {std[0]:.2f}, fy {camera.fy:.2f} ± {std[1]:.2f}, cx {camera.cx:.2f} ± {std[2]:.2f}, "
+            f"cy {camera.cy:.2f} ± {std[3]:.2f} px",
+            f"camera.yaml and {PICTURE} are in {self.out}; use it with --calibration {self.out / 'camera.yaml'}",
         )
+        if self.json:
+            return
+        if found.covered < 0.5:
+            say("the board was seen in less than half of the image: distortion is uncertain where it was not")
+        loose = float(max(std[:4])) / camera.fx
+        if loose > LOOSE:
+            say(
+                f"the camera is known to {100 * loose:.1f} % of its focal length only, and a run with it will bend: film "
+                "the board larger, and tilted in all directions"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecalibrateOptions(Printed):
-    """Options of `rbpf recalibrate`."""
+class Recalibrate(Printed):
+    """Find the focal length and k1 that a run's own measurements prefer, and write camera.yaml: for nominal cameras."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder of a finished run of one camera.
     out: Path = Path("recalibration")  #: folder for camera.yaml.
 
+    def __call__(self) -> None:
+        from rbpf.validation.gtsam.self_calibration import recalibrate as from_run
 
-def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) -> None:
-    """Find the focal length and k1 that a run's own measurements prefer, and write camera.yaml: for nominal cameras."""
-    from rbpf.validation.gtsam.self_calibration import recalibrate as from_run
-
-    with progress() as bar:
-        entries, found = from_run(options.run, options.out, bar("adjusting the camera with poses and landmarks"))
-    focal, k1 = entries["fx"], entries["k1"]
-    answer(
-        entries | {"out": str(options.out)},
-        options.json,
-        f"focal length {focal['before']:.2f} → {focal['after']:.2f} px (± {found.std[0] * focal['after']:.2f}), "
-        f"k1 {k1['before']:.4f} → {k1['after']:.4f} (± {found.std[1]:.4f}); "
-        f"half the squared misfit {entries['error_before']:.0f} → {entries['error_after']:.0f}",
-        f"camera.yaml is in {options.out}; use it with --calibration {options.out / 'camera.yaml'}",
-    )
+        with progress() as bar:
+            entries, found = from_run(self.run, self.out, bar("adjusting the camera with poses and landmarks"))
+        focal, k1 = entries["fx"], entries["k1"]
+        answer(
+            entries | {"out": str(self.out)},
+            self.json,
+            f"focal length {focal['before']:.2f} → {focal['after']:.2f} px (± {found.std[0] * focal['after']:.2f}), "
+            f"k1 {k1['before']:.4f} → {k1['after']:.4f} (± {found.std[1]:.4f}); "
+            f"half the squared misfit {entries['error_before']:.0f} → {entries['error_after']:.0f}",
+            f"camera.yaml is in {self.out}; use it with --calibration {self.out / 'camera.yaml'}",
+        )

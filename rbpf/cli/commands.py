@@ -3,15 +3,14 @@
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from difflib import get_close_matches
-from functools import wraps
-from typing import Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
 from tyro.extras import SubcommandApp
 
 from rbpf.errors import InputError
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+Command = TypeVar("Command", bound=Callable[[], None])
 
 
 class Commands(SubcommandApp):
@@ -20,28 +19,29 @@ class Commands(SubcommandApp):
     def __init__(self, help: str | None = None, first: Callable[[], object] | None = None) -> None:
         super().__init__()
         self.__doc__ = help
-        self._groups: dict[str, Commands | Callable[..., Any]] = {}
+        self.kinds: dict[str, Commands | type[Any]] = {}
         self._first = first
 
-    def add(self, name: str) -> Callable[[Function], Function]:
-        """Makes a function a command of this name."""
+    def add(self, name: str) -> Callable[[type[Command]], type[Command]]:
+        """Makes a dataclass a command of this name: its fields are the options, its call is what the command does."""
 
-        def added(function: Any) -> Any:
-            @wraps(function)
-            def called(*arguments: Any, **named: Any) -> Any:
+        def added(kind: type[Command]) -> type[Command]:
+            def called(options: Any) -> None:
                 if self._first is not None:
                     self._first()
-                return function(*arguments, **named)
+                options()
 
-            self._groups[name] = function
+            called.__doc__ = kind.__doc__
+            called.__annotations__["options"] = Annotated[kind, tyro.conf.arg(name="")]
+            self.kinds[name] = kind
             self.command(name=name)(called)
-            return function
+            return kind
 
         return added
 
     def add_group(self, name: str, group: "Commands") -> None:
         """Makes a group of commands a command of this name."""
-        self._groups[name] = group
+        self.kinds[name] = group
         self.command(group, name=name)
 
     def require_known(self, arguments: list[str], before: str) -> None:
@@ -49,10 +49,10 @@ class Commands(SubcommandApp):
         if not arguments or arguments[0].startswith("-"):
             return
         name = arguments[0].replace("_", "-")
-        if name not in self._groups:
-            hint = _nearest(name, self._groups)
+        if name not in self.kinds:
+            hint = _nearest(name, self.kinds)
             raise InputError(f"there is no command `{before} {arguments[0]}`: {hint}")
-        group, before = self._groups[name], f"{before} {name}"
+        group, before = self.kinds[name], f"{before} {name}"
         if isinstance(group, Commands):
             group.require_known(arguments[1:], before)
             return
@@ -70,9 +70,8 @@ def _nearest(name: str, names: Iterable[str]) -> str:
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"
 
 
-def _options(function: Callable[..., Any]) -> list[str]:
-    """All options of a command, which are the fields of its argument."""
-    kind = get_type_hints(function)["options"]
+def _options(kind: type[Any]) -> list[str]:
+    """All options of a command."""
     found, hints = ["--help"], get_type_hints(kind, include_extras=True)
     for field in fields(kind):
         hint, option = hints[field.name], field.name.replace("_", "-")

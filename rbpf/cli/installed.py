@@ -5,7 +5,7 @@ import time
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from io import StringIO
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -16,40 +16,43 @@ from rbpf.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorOptions(Printed):
-    """Options of `rbpf doctor`."""
+class Doctor(Printed):
+    """Say what is installed, in which versions, which parts work here; compile the kernels."""
 
     compile: bool = True  #: compile the kernels, once, so that the first run need not.
 
+    def __call__(self) -> None:
+        from rbpf.validation.installation import machine, parts, versions
 
-def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
-    """Say what is installed, in which versions, which parts work here; compile the kernels."""
-    from rbpf.validation.installation import machine, parts, versions
-
-    found, tried = machine(), parts()
-    libraries = versions()
-    compiled: dict[str, float] = {}
-    if options.compile:
-        started = time.perf_counter()
-        compile_kernels(every=True)
-        compiled = {"kernels_seconds": round(time.perf_counter() - started, 1)}
-    missing = [name for name in kernel_modules() if not cached(name)]
-    broken = [part for part in tried if part.needed and not part.works]
-    entries = {
-        **found,
-        "libraries": libraries,
-        "parts": [part._asdict() for part in tried],
-        **compiled,
-        "kernels_missing": missing,
-        "works": not broken,
-    }
-    marks = {(True, True): "works", (True, False): "BROKEN", (False, True): "works", (False, False): "not installed"}
-    lines = {part.name: f"{marks[part.needed, part.works]}: {part.says}" for part in tried}
-    known = {name: number or "missing" for name, number in libraries.items()}
-    kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"
-    answer(entries, options.json, *table({**found, **known, **lines, "kernels": kernels}, 26))
-    if broken:
-        raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
+        found, tried = machine(), parts()
+        libraries = versions()
+        compiled: dict[str, float] = {}
+        if self.compile:
+            started = time.perf_counter()
+            compile_kernels(every=True)
+            compiled = {"kernels_seconds": round(time.perf_counter() - started, 1)}
+        missing = [name for name in kernel_modules() if not cached(name)]
+        broken = [part for part in tried if part.needed and not part.works]
+        entries = {
+            **found,
+            "libraries": libraries,
+            "parts": [part._asdict() for part in tried],
+            **compiled,
+            "kernels_missing": missing,
+            "works": not broken,
+        }
+        marks = {
+            (True, True): "works",
+            (True, False): "BROKEN",
+            (False, True): "works",
+            (False, False): "not installed",
+        }
+        lines = {part.name: f"{marks[part.needed, part.works]}: {part.says}" for part in tried}
+        known = {name: number or "missing" for name, number in libraries.items()}
+        kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"
+        answer(entries, self.json, *table({**found, **known, **lines, "kernels": kernels}, 26))
+        if broken:
+            raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
 
 
 _ZSH = (
@@ -60,17 +63,15 @@ _ZSH = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompletionOptions:
-    """Options of `rbpf completion`."""
+class Completion:
+    """Print what makes a shell complete the commands and options of rbpf: eval "$(rbpf completion bash)"."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]  #: for which it is.
 
+    def __call__(self) -> None:
+        from rbpf.cli import APP, PROGRAM
 
-def completion(options: Annotated[CompletionOptions, tyro.conf.arg(name="")]) -> None:
-    """Print what makes a shell complete the commands and options of rbpf: eval "$(rbpf completion bash)"."""
-    from rbpf.cli import APP, PROGRAM
-
-    printed = StringIO()
-    with suppress(SystemExit), redirect_stdout(printed):
-        APP.cli(prog=PROGRAM, args=["--tyro-print-completion", options.shell])
-    sys.stdout.write(printed.getvalue().replace(*_ZSH))
+        printed = StringIO()
+        with suppress(SystemExit), redirect_stdout(printed):
+            APP.cli(prog=PROGRAM, args=["--tyro-print-completion", self.shell])
+        sys.stdout.write(printed.getvalue().replace(*_ZSH))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rbpf.cli.options import Printed, Text, Where
-from rbpf.cli.showing import answer, progress, waiting
+from rbpf.cli.showing import CONSOLE, answer, progress
 from rbpf.errors import InputError
 from rbpf.ranges import Count, Range
 
@@ -18,8 +18,8 @@ Format = Literal["tum", "kitti", "ply", "colmap", "rerun", "npz"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ValidateOptions(Printed):
-    """Options of `rbpf validate`."""
+class Validate(Printed):
+    """Compare a run with the truth, an optimum or another path: JSON, pictures, and the lights on top of its report."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
     #: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
@@ -29,35 +29,31 @@ class ValidateOptions(Printed):
     path: Where = None  #: in their place, another path of the same recording, in TUM format; by default none.
     out: Where = None  #: a further folder for the JSON, which is always written into the run's own; by default none.
 
+    def __call__(self) -> None:
+        from rbpf.validation.consistency.comparison import read_comparisons
+        from rbpf.validation.report.validate import validate as compare
 
-def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
-    """Compare a run with the truth, an optimum or another path: JSON, pictures, and the lights on top of its report."""
-    from rbpf.validation.consistency.comparison import read_comparisons
-    from rbpf.validation.report.validate import validate as compare
-
-    if options.relations is not None and options.path is not None:
-        raise InputError("a run is compared with one thing at a time: leave out --relations or --path")
-    file = options.relations or options.path
-    against = options.against if file is None else "path" if options.relations is None else "relations"
-    with waiting(f"comparing with {file or against} …"):
-        verdict = compare(options.run, against, options.out, file)
-    # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
-    asked = [c.accuracy for c in read_comparisons(options.run) if c.against == against]
-    _answer(verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence))
+        if self.relations is not None and self.path is not None:
+            raise InputError("a run is compared with one thing at a time: leave out --relations or --path")
+        file = self.relations or self.path
+        against = self.against if file is None else "path" if self.relations is None else "relations"
+        with CONSOLE.status(f"comparing with {file or against} …"):
+            verdict = compare(self.run, against, self.out, file)
+        # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
+        asked = [c.accuracy for c in read_comparisons(self.run) if c.against == against]
+        _answer(verdict, self.run, self.json, *(found for found in asked if found not in verdict.path.sentence))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportOptions(Printed):
-    """Options of `rbpf report`."""
+class Report(Printed):
+    """Build the report of a run again, from the files in its folder."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
 
+    def __call__(self) -> None:
+        from rbpf.validation.report.page import write_report
 
-def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
-    """Build the report of a run again, from the files in its folder."""
-    from rbpf.validation.report.page import write_report
-
-    _answer(write_report(options.run), options.run, options.json)
+        _answer(write_report(self.run), self.run, self.json)
 
 
 def _answer(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
@@ -67,8 +63,8 @@ def _answer(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions(Printed):
-    """Options of `rbpf export`."""
+class Export(Printed):
+    """Write a run in the formats of other programs."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
     #: one or several: trajectory as TUM or KITTI, map and path as PLY, a COLMAP model, a Rerun recording, everything
@@ -76,19 +72,17 @@ class ExportOptions(Printed):
     format: tuple[Format, ...]
     out: Where = None  #: folder for the files; by default RUN/export.
 
+    def __call__(self) -> None:
+        from rbpf.validation.exports import export_run
 
-def export(options: Annotated[ExportOptions, tyro.conf.arg(name="")]) -> None:
-    """Write a run in the formats of other programs."""
-    from rbpf.validation.exports import export_run
-
-    out = options.out or options.run / "export"
-    paths = [str(path) for path in export_run(options.run, options.format, out)]
-    answer({"files": paths}, options.json, *(f"wrote {path}" for path in paths))
+        out = self.out or self.run / "export"
+        paths = [str(path) for path in export_run(self.run, self.format, out)]
+        answer({"files": paths}, self.json, *(f"wrote {path}" for path in paths))
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions(Printed):
-    """Options of `rbpf sweep`."""
+class Sweep(Printed):
+    """Run particles × seeds × sequences × options in parallel, to one table; call it again to go on."""
 
     #: YAML file with system, sequences, particles, seeds, options and settings.
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
@@ -96,43 +90,39 @@ class SweepOptions(Printed):
     workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes of this machine; -1 is one per core.
     scheduler: Text = None  #: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
 
+    def __call__(self) -> None:
+        from rbpf.validation.sweep.plan import read_plan
+        from rbpf.validation.sweep.sweep import TABLE
+        from rbpf.validation.sweep.sweep import sweep as run_all
 
-def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
-    """Run particles × seeds × sequences × options in parallel, to one table; call it again to go on."""
-    from rbpf.validation.sweep.plan import read_plan
-    from rbpf.validation.sweep.sweep import TABLE
-    from rbpf.validation.sweep.sweep import sweep as run_all
-
-    if options.workers == 0 or options.workers < -1:
-        raise InputError(f"--workers must be at least 1, or -1 for one per core, got {options.workers}")
-    jobs = read_plan(options.config)
-    with progress() as bar:
-        rows = run_all(jobs, options.out, options.workers, options.scheduler, bar("running"))
-    failures = [row["failure"] for row in rows if "failure" in row]
-    path = options.out / TABLE
-    entries = {"runs": len(rows), "failed": len(failures), "table": str(path)}
-    answer(entries, options.json, f"{len(rows)} runs are in {path}")
-    if failures:
-        raise InputError(f"{len(failures)} of {len(rows)} runs were not possible, the first: {failures[0]}")
+        if self.workers == 0 or self.workers < -1:
+            raise InputError(f"--workers must be at least 1, or -1 for one per core, got {self.workers}")
+        jobs = read_plan(self.config)
+        with progress() as bar:
+            rows = run_all(jobs, self.out, self.workers, self.scheduler, bar("running"))
+        failures = [row["failure"] for row in rows if "failure" in row]
+        path = self.out / TABLE
+        entries = {"runs": len(rows), "failed": len(failures), "table": str(path)}
+        answer(entries, self.json, f"{len(rows)} runs are in {path}")
+        if failures:
+            raise InputError(f"{len(failures)} of {len(rows)} runs were not possible, the first: {failures[0]}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions(Printed):
-    """Options of `rbpf compare`."""
+class Compare(Printed):
+    """Which of two runs' settings explains their recording better: difference of log-evidence, with its error."""
 
     run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]  #: folder that `rbpf run` left.
     run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]  #: another one of the same recording.
     seeds: Count = 5  #: runs of each, from which the error is estimated; parts of the draws where it is done in batch.
     workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes; -1 is one per core.
 
+    def __call__(self) -> None:
+        from rbpf.validation.consistency.model_comparison import compare_runs
 
-def compare(options: Annotated[CompareOptions, tyro.conf.arg(name="")]) -> None:
-    """Which of two runs' settings explains their recording better: difference of log-evidence, with its error."""
-    from rbpf.validation.consistency.model_comparison import compare_runs
-
-    a, b = options.run_a, options.run_b
-    with progress() as bar:
-        found = compare_runs(a, b, options.seeds, options.workers, bar("filtering"))
-    sentence = found.sentence(str(a), str(b))
-    entries = {"difference": found.difference, "error": found.error, "sentence": sentence}
-    answer(entries, options.json, sentence)
+        a, b = self.run_a, self.run_b
+        with progress() as bar:
+            found = compare_runs(a, b, self.seeds, self.workers, bar("filtering"))
+        sentence = found.sentence(str(a), str(b))
+        entries = {"difference": found.difference, "error": found.error, "sentence": sentence}
+        answer(entries, self.json, sentence)

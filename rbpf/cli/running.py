@@ -1,34 +1,26 @@
-"""`rbpf run`: one function per system, and the same run again."""
+"""`rbpf run`: one class per system, and the same run again."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels, use_threads
 from rbpf.cli.interrupts import finishing, patient
-from rbpf.cli.options import (
-    ImageRunOptions,
-    LaserRunOptions,
-    MonoOptions,
-    RangeBearingOptions,
-    RunOptions,
-    StereoOptions,
-    given,
-    given_board,
-    given_markers,
-    given_part,
-    given_topics,
-)
+from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
 from rbpf.cli.showing import OnProgress, answer, progress, say
 from rbpf.errors import InputError
+from rbpf.ranges import Count, NotNegative, Range
 
 if TYPE_CHECKING:
     from rbpf.runs.recordings import Recording
     from rbpf.runs.run import Run
+    from rbpf.sensors.readers.part import Part
+    from rbpf.systems.settings import Config
 
 RUN = Commands(
     """Filter a recording; `rbpf run SYSTEM --help` says more.
@@ -39,91 +31,204 @@ It is refused when the recording has changed. Further options are those of the r
 )
 
 
-@RUN.add("range-bearing")
-def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name="")]) -> None:
-    """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
-    from rbpf.runs.recordings import RobotRecording, filter_recording
-    from rbpf.systems.range_bearing.config import RangeBearingConfig
-    from rbpf.systems.settings import load_settings
-    from rbpf.validation.finish import finish_run
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(Printed):
+    """Of every `rbpf run`."""
 
-    named = given(options, "particles", "seed", "association")
-    config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
-    with _prepared(options) as out:
-        with progress() as bar, patient(bar("filtering")) as report:
-            recording = RobotRecording(options.log, given_part(options))
-            run = filter_recording(recording, config, out, options.resume, [listener(report)])
-        say(run.system.why_map)
-        if options.batch:
-            say("solving the batch problem with the same measurements …")
-        with finishing():
-            entries = finish_run(run, out, recording.sources(), batch=options.batch)
-    _finish(entries, options, out, run.failure)
+    #: folder for the results; by default run, or run-2, run-3, … where there are runs already; the last of them to
+    #: resume or to overwrite.
+    out: Where = None
+    particles: WholeCount = None  #: number of particles.
+    #: of the random generators; by default 0, or as in --config.
+    seed: Annotated[Whole, Range(ge=0, le=2**63 - 1)] = None
+    config: Where = None  #: YAML file of settings, such as a former run's config.yaml; by default the system's own.
+    #: a setting as key=value, such as resampling.scheme=residual; may be given several times.
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    resume: Flag = False  #: go on from the checkpoint in the results' folder, if there is one.
+    overwrite: Flag = False  #: write over the run that lies in the results' folder.
+    threads: Annotated[Whole, Range(ge=1, le=4096)] = None  #: threads of the kernels; by default all.
+
+    def settings(self, kind: "type[Config]", system: str, *own: str) -> "Config":
+        """The system's settings by --config, --set and options that are settings, of which the system has some of its own."""
+        from rbpf.systems.settings import load_settings
+
+        named = {name: getattr(self, name) for name in ("particles", "seed", *own)}
+        given = {name: value for name, value in named.items() if value is not None}
+        return load_settings(kind, system, self.config, self.set, given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartOptions(RunOptions):
+    """Of every run over a recording, of which a part may be used."""
+
+    start: NotNegative = 0.0  #: use the frames from so many seconds after the first on; of a log without times, steps.
+    end: RealPositive = None  #: use the frames until so many seconds after the first; by default all.
+    every: Count = 1  #: of these use each so many-th.
+
+    def part(self, resize: int | None = None) -> "Part":
+        """What is used of the recording."""
+        from rbpf.sensors.readers.part import Part
+
+        return Part(self.start, self.end, self.every, resize)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRunOptions(PartOptions):
+    """Of every run over images."""
+
+    #: camera.yaml in place of the sequence's own, of the images before they are resized; by default that one is read.
+    calibration: Where = None
+    #: make the images smaller, to this width in px, and the calibration with them; by default they stay as they are.
+    resize: Annotated[Whole, Range(ge=1, le=MOST_PX)] = None
+    #: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
+    image_topic: Text = None
+    truth_topic: Text = None  #: of a ROS bag, the topic of the camera's true poses; by default none.
+    rerun: Where = None  #: also write a recording (.rrd) for the Rerun viewer; by default none.
+    batch: bool = True  #: also adjust the same measurements in batch with GTSAM.
+    #: iterations after which the batch adjustment is given up, the run's results stay; by default so many that thirty
+    #: million sightings are linearised.
+    batch_limit: WholeCount = None
+    video: bool = True  #: write the annotated video.
+
+
+@RUN.add("range-bearing")
+@dataclass(frozen=True, kw_only=True)
+class RunRangeBearing(PartOptions):
+    """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
+
+    #: recording: a folder of an MRCLAM or MRPT log, or a Victoria Park graph.
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
+    particles: WholeCount = None  #: number of particles; by default 100, or as in --config.
+    #: landmarks named by the log, or by maximum likelihood; by default known, or as in --config.
+    association: Annotated[
+        Literal["known", "ml"] | None, tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
+    ] = None
+    batch: bool = True  #: also solve for the batch optimum with GTSAM.
+
+    def __call__(self) -> None:
+        from rbpf.runs.recordings import RobotRecording
+        from rbpf.systems.range_bearing.config import RangeBearingConfig
+        from rbpf.validation.finish import finish_run
+
+        config = self.settings(RangeBearingConfig, "range-bearing", "association")
+        recording = RobotRecording(self.log, self.part())
+        with _prepared(self) as out:
+            with progress() as bar:
+                run = _filtered(self, recording, config, out, bar("filtering"))
+            say(run.system.why_map)
+            if self.batch:
+                say("solving the batch problem with the same measurements …")
+            with finishing():
+                entries = finish_run(run, out, recording.sources(), batch=self.batch)
+        _finish(entries, self, out, run.failure)
 
 
 @RUN.add("laser")
-def run_laser(options: Annotated[LaserRunOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class RunLaser(PartOptions):
     """Grid SLAM over a laser scanner's log (Grisetti et al. 2007: scan matching in each particle's own map)."""
-    from rbpf.runs.recordings import LaserRecording, filter_recording
-    from rbpf.sensors.readers import LaserOptions
-    from rbpf.systems.laser.config import LaserConfig
-    from rbpf.systems.settings import load_settings
-    from rbpf.validation.finish import finish_run
 
-    config = load_settings(LaserConfig, "laser", options.config, options.set, given(options, "particles", "seed"))
-    told = LaserOptions(options.scanner, options.upside_down, options.max_range, given_part(options))
-    recording = LaserRecording(options.log, told)
-    with _prepared(options) as out:
-        with progress() as bar, patient(bar("filtering")) as report:
-            run = filter_recording(recording, config, out, options.resume, [listener(report)])
-        with finishing():
-            entries = finish_run(run, out, recording.sources())
-    _finish(entries, options, out, run.failure)
+    #: recording: a CARMEN log (FLASER, ROBOTLASER, RAWLASER with ODOM), plain or packed by gzip, or a ROS bag with
+    #: LaserScan.
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
+    particles: WholeCount = None  #: number of particles; by default 30, or as in --config.
+    scanner: Text = None  #: message (CARMEN) or topic (ROS) of the scans; by default the first that the log has.
+    max_range: RealPositive = None  #: what is farther gives no return, m; by default what the log says.
+    upside_down: Flag = False  #: the scanner is mounted upside down, or its readings run clockwise.
+
+    def __call__(self) -> None:
+        from rbpf.runs.recordings import LaserRecording
+        from rbpf.sensors.readers import LaserOptions
+        from rbpf.systems.laser.config import LaserConfig
+        from rbpf.validation.finish import finish_run
+
+        config = self.settings(LaserConfig, "laser")
+        told = LaserOptions(self.scanner, self.upside_down, self.max_range, self.part())
+        recording = LaserRecording(self.log, told)
+        with _prepared(self) as out:
+            with progress() as bar:
+                run = _filtered(self, recording, config, out, bar("filtering"))
+            with finishing():
+                entries = finish_run(run, out, recording.sources())
+        _finish(entries, self, out, run.failure)
 
 
 @RUN.add("mono")
-def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class RunMono(ImageRunOptions):
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
-    from rbpf.runs.recordings import MonoRecording
-    from rbpf.systems.mono.config import MonoConfig
-    from rbpf.systems.settings import load_settings
 
-    named = given(options, "particles", "seed")
-    config = load_settings(MonoConfig, "mono", options.config, options.set, named)
-    board = given_board(options.board, options.square)
-    if options.localize != (options.map is not None):
-        raise InputError("a camera is found in a known map with both: --map RUN --localize")
-    markers, points = given_markers(options), options.known_points
-    recording = MonoRecording(
-        options.sequence,
-        points,
-        options.calibration,
-        board,
-        options.map,
-        markers,
-        given_topics(options),
-        given_part(options),
-    )
-    video = options.video
-    if recording.live is not None:
-        if options.resume or options.rerun is not None:
-            raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
-        video = False
-        say("Ctrl-C ends the recording; the results are written then")
-    _run_images(options, recording, config, video)
+    #: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml), a video with a
+    #: camera.yaml beside it, a ROS bag, or the number of a camera at this computer, as 0.
+    sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
+    particles: WholeCount = None  #: number of particles; by default 50, or as in --config.
+    #: table of points of known position that are seen in the first image; by default none: the world is the first
+    #: camera's and its scale is arbitrary.
+    known_points: Where = None
+    #: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6; the
+    #: world is then the board's; by default none.
+    board: Text = None
+    square: RealPositive = None  #: side of its squares, m; by default none.
+    #: in place of known points, a board of so many ArUco markers, as 5x7, of which some are seen in the first image;
+    #: the world is then the board's; by default none.
+    aruco: Text = None
+    marker: RealPositive = None  #: side of a marker, its black border included, m; by default none.
+    gap: NotNegative = 0.01  #: between two markers, m.
+    dictionary: str = "4x4_50"  #: of the markers' patterns, as 4x4_50 or 6x6_250.
+    #: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
+    map: Where = None
+    localize: Flag = False  #: the map is known: the start is found by recognition, and the map is not changed.
+
+    def __call__(self) -> None:
+        from rbpf.runs.recordings import MonoRecording
+        from rbpf.sensors.calibration import MarkerBoard
+        from rbpf.sensors.readers.images.sequence import Topics
+        from rbpf.systems.mono.config import MonoConfig
+
+        config = self.settings(MonoConfig, "mono")
+        board = given_board(self.board, self.square)
+        if self.localize != (self.map is not None):
+            raise InputError("a camera is found in a known map with both: --map RUN --localize")
+        if (self.aruco is None) != (self.marker is None):
+            raise InputError(
+                "a board of markers needs their number and their side: --aruco 5x7 --marker 0.04 --gap 0.01"
+            )
+        markers = None
+        if self.aruco is not None and self.marker is not None:
+            markers = MarkerBoard.parse(self.aruco, self.marker, self.gap, self.dictionary)
+        topics = Topics.parse(self.image_topic, self.truth_topic)
+        given_files = self.sequence, self.known_points, self.calibration
+        recording = MonoRecording(*given_files, board, self.map, markers, topics, self.part(self.resize))
+        video = self.video
+        if recording.live is not None:
+            if self.resume or self.rerun is not None:
+                raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
+            video = False
+            say("Ctrl-C ends the recording; the results are written then")
+        _run_images(self, recording, config, video)
 
 
 @RUN.add("stereo")
-def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class RunStereo(ImageRunOptions):
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
-    from rbpf.runs.recordings import StereoRecording
-    from rbpf.systems.settings import load_settings
-    from rbpf.systems.stereo.config import StereoConfig
 
-    named = given(options, "particles", "seed", "dof")
-    config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
-    recording = StereoRecording(options.sequence, options.calibration, given_topics(options), given_part(options))
-    _run_images(options, recording, config, options.video)
+    #: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0 and cam1,
+    #: of KITTI odometry with image_0 and image_1, or a ROS bag with two topics of images.
+    sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PAIRS")]
+    particles: WholeCount = None  #: number of particles; by default 400, or as in --config.
+    #: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default 6, or as in --config.
+    dof: Annotated[Literal[3, 6] | None, tyro.conf.arg(metavar="{3,6}", help_behavior_hint="")] = None
+
+    def __call__(self) -> None:
+        from rbpf.runs.recordings import StereoRecording
+        from rbpf.sensors.readers.images.sequence import Topics
+        from rbpf.systems.stereo.config import StereoConfig
+
+        config = self.settings(StereoConfig, "stereo", "dof")
+        topics = Topics.parse(self.image_topic, self.truth_topic)
+        recording = StereoRecording(self.sequence, self.calibration, topics, self.part(self.resize))
+        _run_images(self, recording, config, self.video)
 
 
 def repeated(arguments: list[str]) -> list[str]:
@@ -136,33 +241,32 @@ def repeated(arguments: list[str]) -> list[str]:
     from rbpf.runs.provenance import read_origin
 
     config = Path(arguments[2])
-    origin = read_origin(config)
-    options = ["--config", str(origin.config)]
-    for name, value in origin.sources.items():
-        options += [f"--{name}", value] if value else [f"--{name}"]
-    out = []
+    words, out = read_origin(config), list[str]()
     if not any(word.partition("=")[0] == "--out" for word in arguments):
         last = "--resume" in arguments or "--overwrite" in arguments
-        out = ["--out", str(numbered(Path(f"{origin.config.parent}-again"), last))]
-    return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
+        folder = config if config.is_dir() else config.parent
+        out = ["--out", str(numbered(Path(f"{folder}-again"), last))]
+    return ["run", *words, *out, *arguments[3:]]
 
 
-def listener(report: OnProgress) -> Callable[["Run", object], None]:
-    """What follows a run and reports how many frames are done, and of how many."""
-    return lambda run, _: report(len(run.log), run.expected or 0)
+def _filtered(options: RunOptions, recording: "Recording", config: Any, out: Path, report: OnProgress) -> "Run":
+    """Filters a recording, and reports how many frames are done, and of how many."""
+    from rbpf.runs.recordings import filter_recording
+
+    with patient(report) as patiently:
+        listeners = [lambda run, _: patiently(len(run.log), run.expected or 0)]
+        return filter_recording(recording, config, out, options.resume, listeners)
 
 
 def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, video: bool) -> None:
     """Filters, then writes everything, with a bar for each stage of the work."""
-    from rbpf.runs.recordings import filter_recording
     from rbpf.validation.finish import Callbacks, finish_run
     from rbpf.validation.report.rerun import require_rerun
 
     if options.rerun is not None:
         require_rerun()
     with _prepared(options) as out, progress() as bar:
-        with patient(bar("filtering")) as report:
-            run = filter_recording(recording, config, out, options.resume, [listener(report)])
+        run = _filtered(options, recording, config, out, bar("filtering"))
         solving = bar("batch")
         callbacks = Callbacks(
             on_frame=bar("drawing"),

@@ -4,7 +4,6 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -41,13 +40,6 @@ def progress() -> Iterator[Callable[[str], OnProgress]]:
             bars.stop()
 
 
-@contextmanager
-def waiting(what: str) -> Iterator[None]:
-    """A line with a turning mark, for work that cannot report how far it is."""
-    with CONSOLE.status(what):
-        yield
-
-
 def say(sentence: str) -> None:
     """A sentence, on standard error, whatever names are in it; it is broken between words, and on a terminal alone."""
     CONSOLE.print(printable(sentence), highlight=False, markup=False, emoji=False, soft_wrap=not CONSOLE.is_terminal)
@@ -71,8 +63,3 @@ def _shown(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_shown(item)}" for name, item in value.items())
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def megabytes(folder: Path) -> float:
-    """Size of all files in a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6

@@ -1,77 +1,158 @@
 """`rbpf simulate`: logs and images of worlds whose truth is known."""
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
-from rbpf.cli.options import CorridorOptions, ImagesOptions, LabOptions, LogOptions, given_board
-from rbpf.cli.showing import answer, megabytes, progress
+from rbpf.cli.options import MOST_PX, Flag, Printed, Real, RealPositive, Text, WholeCount, given_board
+from rbpf.cli.showing import answer, progress
 from rbpf.errors import InputError
+from rbpf.ranges import MOST, Count, CountOrNone, Fraction, NotNegative, Range, Seed
 
 if TYPE_CHECKING:
     from rbpf.validation.simulation.textured_scene import ImageWorld
-
-FOCAL_FRACTION = {ImagesOptions: 0.8, LabOptions: 0.78125}
-"""Focal length by default, as a fraction of the images' width."""
 
 SIMULATE = Commands("Make a recording of a world whose truth is known.", compile_kernels)
 
 
 @SIMULATE.add("range-bearing")
-def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SimulateRangeBearing(Printed):
     """A log of a robot among landmarks, with ground truth."""
-    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
-    world = RobotWorld(options.steps, options.landmarks, options.spatial, unnamed=options.unnamed)
-    simulate_robot(world, options.out, options.seed)
-    answer({"out": str(options.out), "steps": options.steps}, options.json, f"wrote {options.out}")
+    out: Path  #: folder for the log.
+    seed: Seed = 0  #: of the random generator.
+    spatial: Flag = False  #: six degrees of freedom instead of three.
+    steps: Annotated[int, Range(ge=2, le=MOST)] = 200  #: number of steps, one a second.
+    landmarks: Count = 60  #: number of landmarks.
+    unnamed: Flag = False  #: the log does not say which landmark was observed.
+
+    def __call__(self) -> None:
+        from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+
+        world = RobotWorld(self.steps, self.landmarks, self.spatial, unnamed=self.unnamed)
+        simulate_robot(world, self.out, self.seed)
+        answer({"out": str(self.out), "steps": self.steps}, self.json, f"wrote {self.out}")
 
 
 @SIMULATE.add("laser")
-def simulate_laser_log(options: Annotated[CorridorOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SimulateLaser(Printed):
     """A log of a robot with a laser scanner that drives round a corridor, with ground truth."""
-    from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 
-    simulate_laser(LaserWorld(options.scans, options.laps), options.out, options.seed)
-    answer({"out": str(options.out), "scans": options.scans}, options.json, f"wrote {options.out}")
+    out: Path  #: folder for the log robot.clf, the path truth.tum, and robot.relations.
+    seed: Seed = 0  #: of the random generator.
+    scans: Annotated[int, Range(ge=2, le=MOST)] = 400  #: number of scans.
+    laps: Annotated[int, Range(ge=1, le=1000)] = 2  #: number of rounds.
+
+    def __call__(self) -> None:
+        from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
+
+        simulate_laser(LaserWorld(self.scans, self.laps), self.out, self.seed)
+        answer({"out": str(self.out), "scans": self.scans}, self.json, f"wrote {self.out}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions(Printed):
+    """Of every `rbpf simulate` that renders images."""
+
+    focal_fraction: ClassVar[float]  #: focal length by default, as a fraction of the width.
+    #: folder for the sequence (EuRoC ASL, with camera.yaml and known_points.csv); must not exist, or be empty.
+    out: Path
+    seed: Seed = 0  #: of the random generator.
+    width: Annotated[int, Range(ge=2, le=MOST_PX)] = 640  #: of the images, px.
+    height: Annotated[int, Range(ge=2, le=MOST_PX)] = 480  #: of the images, px.
+    focal_px: RealPositive = None  #: focal length, px; by default a fraction of the width.
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 of the lens.
+    #: k1, k2, k3, k4 of an equidistant lens in its place; by default none. The ideal one has 0 0 0 0; it sees 140
+    #: degrees where the focal length is 0.41 of the width.
+    fisheye: tuple[float, float, float, float] | None = None
+    baseline_m: Real = None  #: of a second camera to the right, m; None or nothing for none.
+    known: CountOrNone = 6  #: corners in the first image whose positions are given, at least 4; 0 for none.
+    noise_std: NotNegative = 3.0  #: of the sensor, grey levels.
+    blur_s: NotNegative = 0.01  #: the shutter is open this long, s.
+    exposure_drift: Fraction = 0.15  #: greatest change of the exposure, as a fraction.
+    vignetting: Fraction = 0.2  #: fraction of the light that is missing in the corners.
+    contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
+    #: first frame in the dark and number of frames; by default none.
+    blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = None
+    depth: Flag = False  #: also write depth images.
+    #: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
+    jpeg: Annotated[int, Range(ge=0, le=100)] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesOptions(RenderOptions):
+    """Of `rbpf simulate desk` and `rbpf simulate room`."""
+
+    focal_fraction = 0.8
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 300  #: number of images, 30 per second.
+    focal_px: RealPositive = None  #: focal length, px; by default 0.8 of the width.
+    board: Text = None  #: a chessboard of so many inner corners lies on the desk, as 9x6; by default none.
+    square: RealPositive = None  #: side of its squares, m; by default none.
 
 
 @SIMULATE.add("desk")
-def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SimulateDesk(ImagesOptions):
     """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
-    from rbpf.validation.simulation.desk_and_room import TexturedDesk
 
-    lies = TexturedDesk(frames=options.frames, contrast=options.contrast)
-    board = given_board(options.board, options.square)
-    if board is not None:
-        squares = board.columns + 1, board.rows + 1
-        lies = replace(lies, board=squares, square_m=board.square_m)
-    _render(lies, options)
+    def __call__(self) -> None:
+        from rbpf.validation.simulation.desk_and_room import TexturedDesk
+
+        lies = TexturedDesk(frames=self.frames, contrast=self.contrast)
+        board = given_board(self.board, self.square)
+        if board is not None:
+            squares = board.columns + 1, board.rows + 1
+            lies = replace(lies, board=squares, square_m=board.square_m)
+        _render(lies, self)
 
 
 @SIMULATE.add("room")
-def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SimulateRoom(ImagesOptions):
     """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
-    from rbpf.validation.simulation.desk_and_room import TexturedRoom
 
-    if options.board is not None or options.square is not None:
-        raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
-    _render(TexturedRoom(frames=options.frames, contrast=options.contrast), options)
+    def __call__(self) -> None:
+        from rbpf.validation.simulation.desk_and_room import TexturedRoom
+
+        if self.board is not None or self.square is not None:
+            raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
+        _render(TexturedRoom(frames=self.frames, contrast=self.contrast), self)
 
 
 @SIMULATE.add("lab")
-def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SimulateLab(RenderOptions):
     """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
-    from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
-    drive = LabDrive(options.trajectory, options.frames, options.every)
-    _render(TexturedLab(drive, texel_m=options.texel_m, contrast=options.contrast), options)
+    focal_fraction = 0.78125
+    #: a tour of 4,000 images over 68 m through both rooms and back, or 600 images on which the robot twice looks away
+    #: for 5 s and back.
+    trajectory: Literal["tour", "turn_back"] = "tour"
+    frames: WholeCount = None  #: only so many images, the first; by default all.
+    every: Count = 1  #: only each so many-th frame becomes an image.
+    focal_px: RealPositive = None  #: focal length, px; by default 0.78125 of the width, 500 px at 640.
+    #: of a second camera to the right, m; None or nothing for none.
+    baseline_m: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = 0.12
+    noise_std: NotNegative = 8.0  #: of the sensor, grey levels.
+    blur_s: NotNegative = 0.0  #: the shutter is open this long, s.
+    exposure_drift: Fraction = 0.0  #: greatest change of the exposure, as a fraction.
+    vignetting: Fraction = 0.0  #: fraction of the light that is missing in the corners.
+    texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are drawn sooner.
+
+    def __call__(self) -> None:
+        from rbpf.validation.simulation.lab import LabDrive, TexturedLab
+
+        drive = LabDrive(self.trajectory, self.frames, self.every)
+        _render(TexturedLab(drive, texel_m=self.texel_m, contrast=self.contrast), self)
 
 
-def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
+def _render(world: "ImageWorld", options: RenderOptions) -> None:
     from rbpf.sensors.camera import Pinhole
     from rbpf.validation.simulation.images import Imaging, simulate_images
 
@@ -81,7 +162,7 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     model = "radial-tangential"
     if options.fisheye is not None:
         lens, model = options.fisheye, "equidistant"
-    focal = options.focal_px or FOCAL_FRACTION[type(options)] * options.width
+    focal = options.focal_px or options.focal_fraction * options.width
     centre = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
     camera = Pinhole(options.width, options.height, focal, focal, *centre, lens, model)
     first, count = options.blackout or (0, 0)
@@ -97,5 +178,5 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     )
     with progress() as bar:
         simulate_images(world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m)
-    size = megabytes(options.out)
+    size = sum(path.stat().st_size for path in options.out.rglob("*") if path.is_file()) / 1e6
     answer({"out": str(options.out), "megabytes": round(size, 1)}, options.json, f"wrote {options.out}, {size:.0f} MB")
