@@ -8,21 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from rbpf.conformance.models import (
+from rbpf.conformance.checks import (
     conditional_checks,
     groups_of,
     landmark_checks,
     likelihood_checks,
     motion_checks,
+    observation_checks,
     sensor_checks,
 )
-from rbpf.conformance.observation import observation_checks
 from rbpf.conformance.trial import Example, Scene, run
 from rbpf.core.models import Conditional, Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
-__all__ = ["Example", "check_model", "require_sound"]
+__all__ = ["Example", "check_model"]
 
 
 def check_model(
@@ -93,12 +93,3 @@ def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) 
         tried = replace(example, landmark=new.landmark, records=None)
         findings += check_model(new.landmark, space, rng, tried) + check_model(new.model, space, rng, tried)
     return list(dict.fromkeys(findings))
-
-
-def require_sound(
-    model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
-) -> None:
-    """As `check_model`, but raises an InputError that holds all findings."""
-    findings = check_model(model, space, rng, example)
-    if findings:
-        raise InputError("; ".join(findings))

@@ -91,15 +91,9 @@ class Scene:
 
     def moved(self, shape: tuple[int, ...], part: Part) -> "Scene":
         """The same with more axes in front of one part."""
-
-        def more(array: np.ndarray) -> np.ndarray:
-            return np.broadcast_to(array, (*shape, *array.shape))
-
-        if part is Part.STATE:
-            return replace(self, state=more(self.state))
-        if part is Part.LANDMARK:
-            return replace(self, landmark=None if self.landmark is None else more(self.landmark))
-        return replace(self, substate=None if self.substate is None else more(self.substate))
+        name = {Part.STATE: "state", Part.LANDMARK: "landmark"}.get(part, "substate")
+        array = getattr(self, name)
+        return self if array is None else replace(self, **{name: np.broadcast_to(array, (*shape, *array.shape))})
 
     def lanes(self) -> "Scene":
         """All pairs of a particle and a landmark side by side, (N·K, …)."""

@@ -49,13 +49,10 @@ class Euclidean(LieGroup):
         return np.array(x, dtype=float)
 
     def adjoint(self, a: States) -> TangentMatrix:
-        return self._unit_matrices(np.shape(a)[:-1])
+        return np.broadcast_to(np.eye(self.dim), (*np.shape(a)[:-1], self.dim, self.dim)).copy()
 
-    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return self._unit_matrices(np.shape(xi)[:-1])
-
-    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        return self._unit_matrices(np.shape(xi)[:-1])
+    # Storage and tangent are the same, and the group is commutative.
+    left_jacobian = left_jacobian_inverse = rotation = adjoint
 
     def inverse_transform(self, a: States, p: States) -> StateArray:
         """Points p seen from a: the group is that of translations."""
@@ -64,12 +61,6 @@ class Euclidean(LieGroup):
     def transform(self, a: States, p: States) -> StateArray:
         """The inverse of `inverse_transform`."""
         return self.compose(a, p)
-
-    def rotation(self, a: States) -> Float[np.ndarray, "*batch {self.size} {self.size}"]:
-        return self._unit_matrices(np.shape(a)[:-1])
-
-    def _unit_matrices(self, shape: tuple[int, ...]) -> Array:
-        return np.broadcast_to(np.eye(self.dim), (*shape, self.dim, self.dim)).copy()
 
 
 @final
@@ -119,8 +110,7 @@ class Finite(LieGroup):
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
         return np.zeros((*np.shape(xi)[:-1], 0, 0))
 
-    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        return np.zeros((*np.shape(xi)[:-1], 0, 0))
+    left_jacobian_inverse = left_jacobian
 
 
 @final
