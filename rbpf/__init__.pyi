@@ -1,6 +1,7 @@
 """Public names, by the module that defines them; `rbpf/__init__.py` imports each when it is first used."""
 
 from .conformance import check_model as check_model
+from .core.diagnostics import HealthWarning as HealthWarning
 from .core.filter import Filter as Filter
 from .core.filter import StepReport as StepReport
 from .core.likelihoods import Gaussian as Gaussian

@@ -222,20 +222,14 @@ def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
     plain_values, plain_vectors = np.linalg.eigh(cov)
     negative = plain_values[..., 0] < -_NEGATIVE * np.abs(plain_values).max(-1)
     plain = plain_vectors * np.sqrt(np.maximum(plain_values, 0.0))[..., None, :]
-    scale, vectors, values = _scaled_eigen(cov)
+    # That of the correlation matrix, so that radians beside metres keep all their digits.
+    scale = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    reciprocal = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > _NO_SCALE)
+    values, vectors = np.linalg.eigh(symmetrise(cov) * reciprocal[..., :, None] * reciprocal[..., None, :])
     scaled = scale[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     # Beside a variance that is rounding itself, correlations exceed one: there the plain one is nearer.
     sound = values[..., :1, None] >= -_NEGATIVE * values[..., -1:, None]
     return np.where(sound, scaled, plain), negative
-
-
-def _scaled_eigen(cov: Array) -> tuple[Array, Array, Array]:
-    # Of the correlation matrix, so that radians beside metres keep all their digits.
-    scale = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
-    reciprocal = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > _NO_SCALE)
-    correlation = symmetrise(cov) * reciprocal[..., :, None] * reciprocal[..., None, :]
-    values, vectors = np.linalg.eigh(correlation)
-    return scale, vectors, values
 
 
 def _require_symmetric(cov: Array) -> None:

@@ -6,7 +6,6 @@ more than itself. A checkpoint's entry `header` is JSON text: format version, th
 the state of the random generator and a SHA-256 digest of all other entries.
 """
 
-import ast
 import hashlib
 import json
 import math
@@ -16,7 +15,9 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
@@ -27,13 +28,9 @@ from rbpf.lie import SE3, LieGroup
 VERSION = 1
 """Of the format of checkpoints."""
 
-LONGEST_HEADER = 1 << 16
-"""Bytes of an array's header; NumPy's own are of about a hundred."""
-
-_MAGIC = b"\x93NUMPY"
 UNREADABLE = (
     OSError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError, RuntimeError, EOFError, MemoryError,
-    SyntaxError, zipfile.BadZipFile,
+    SyntaxError, TokenError, zipfile.BadZipFile,
 )  # fmt: skip
 """What a file that is cut off, damaged or made up can raise, read by zipfile and NumPy."""
 NOT_PLAIN = "it must hold truth values, numbers or text"
@@ -143,25 +140,18 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """One member; whatever is wrong with it raises an error that `load_arrays` knows."""
     if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
         raise ValueError("a member is compressed or encrypted")
-    data = archive.read(info)
-    # The header, in the `.npy` format, versions 1 to 3: where the numbers begin, and what they are.
-    if data[:6] != _MAGIC or data[6:8] not in (b"\x01\x00", b"\x02\x00", b"\x03\x00"):
-        raise ValueError("a member is no array")
-    first = 10 if data[6] == 1 else 12
-    start = first + int.from_bytes(data[8:first], "little")
-    if start > min(len(data), LONGEST_HEADER):
-        raise ValueError("a member's header is longer than it can be")
-    entries = ast.literal_eval(data[first:start].decode("latin1").strip())
-    descr, is_fortran, shape = (entries[name] for name in ("descr", "fortran_order", "shape"))
-    if not (isinstance(descr, str) and _PLAIN.fullmatch(descr) and isinstance(shape, tuple)):
+    member = BytesIO(archive.read(info))
+    # The header: what the numbers are. NumPy writes plain arrays in version 1 of its format.
+    if np.lib.format.read_magic(member) != (1, 0):
+        raise ValueError("a member is no plain array")
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(member)
+    if not _PLAIN.fullmatch(dtype.str):
         raise ValueError(NOT_PLAIN)
-    if not all(type(size) is int for size in shape):
-        raise ValueError("a member's shape is none")
-    dtype = np.dtype(descr)
-    if math.prod(shape) * max(dtype.itemsize, 1) != len(data) - start or min(shape, default=0) < 0:
+    data = member.read()
+    if math.prod(shape) * max(dtype.itemsize, 1) != len(data) or min(shape, default=0) < 0:
         raise ValueError("a member has another size than its header claims")
     # The numbers: no bit pattern that is no truth value or no text.
-    flat = np.frombuffer(data, dtype, offset=start)
+    flat = np.frombuffer(data, dtype)
     _require_plain(flat)
     return flat.reshape(shape, order="F" if is_fortran else "C").copy(order="K")
 

@@ -17,8 +17,8 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.arrays import numbers
 from rbpf.core import checkpoint
+from rbpf.core.diagnostics import Health
 from rbpf.core.genealogy import History, Lineage
-from rbpf.core.health import Health
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import (
     Belief,
@@ -186,7 +186,7 @@ class Filter:
         it was; otherwise it stands between two steps: `load` a checkpoint.
         """
         proposal = proposal or self.proposal
-        with self._draws_undone_by_failure():
+        with self._unchanged_by_failure():
             # Predict, and observe given the prediction.
             stamp_ns, dt = self._clock(stamp_ns)
             prior = self._predict(control, dt)
@@ -256,7 +256,10 @@ class Filter:
         self.log_evidence += evidence
         ess = effective_sample_size(weights)
         nis = float("nan") if proposed.nis is None else float((weights * proposed.nis).sum())
-        rows = 0.0 if proposed.rows is None else mean_count(proposed.rows, weights)
+        rows = 0.0
+        if proposed.rows is not None:
+            # A weighted mean, exact where all are the same.
+            rows = float(proposed.rows[0] + (weights * (proposed.rows - proposed.rows[0])).sum())
         if groups:
             self.health.innovations(self.steps, nis, rows, ess)
             self.health.evidence(self.steps, evidence / max(sum(group.z.size for group in groups), 1))
@@ -387,17 +390,8 @@ class Filter:
         }
 
     @contextmanager
-    def _draws_undone_by_failure(self) -> Iterator[None]:
-        before = self.rng.bit_generator.state
-        try:
-            yield
-        except InputError:
-            self.rng.bit_generator.state = before
-            raise
-
-    @contextmanager
     def _unchanged_by_failure(self) -> Iterator[None]:
-        """Puts the filter back as it was if it cannot be restored; what is restored takes new objects, never the old ones."""
+        """Puts the filter back as it was where it is refused; what it would be takes new objects, never the old ones."""
         held = [(item, dict(vars(item))) for item in (self, *self.marginals.parts.values())]
         rng_state = self.rng.bit_generator.state
         try:
@@ -432,8 +426,12 @@ class Filter:
     def _observe(self, frame: object, belief: Belief) -> list[Observations]:
         observed = []
         for sensor in self.sensors:
-            groups = sensor.observe(frame, told(belief, sensor))
-            observed.append([in_map(checked_observations(group), sensor) for group in groups])
+            groups = [checked_observations(group) for group in sensor.observe(frame, told(belief, sensor))]
+            if sensor.part != Part.LANDMARK:
+                # The landmarks of its groups are those of its own map.
+                its = [group.part is None and Part.LANDMARK in group.model.reads for group in groups]
+                groups = [replace(g, part=sensor.part) if own else g for g, own in zip(groups, its, strict=True)]
+            observed.append(groups)
         self._ends = list(accumulate(len(groups) for groups in observed))
         return self.marginals.decided([group for groups in observed for group in groups], belief)
 
@@ -482,17 +480,6 @@ def are_same(one: Observations, other: Observations) -> bool:
 def told(belief: Belief, sensor: Sensor) -> Belief:
     """The belief for a sensor, whose landmarks may be in a map of their own."""
     return belief if sensor.part == Part.LANDMARK else replace(belief, landmarks=sensor.part)
-
-
-def in_map(group: Observations, sensor: Sensor) -> Observations:
-    """A sensor's group, whose landmarks are those of the sensor's map."""
-    other = sensor.part != Part.LANDMARK and group.part is None and Part.LANDMARK in group.model.reads
-    return replace(group, part=sensor.part) if other else group
-
-
-def mean_count(counts: np.ndarray, weights: np.ndarray) -> float:
-    """Weighted mean of whole numbers (N,); exact where all are the same."""
-    return float(counts[0] + (weights * (counts - counts[0])).sum())
 
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:

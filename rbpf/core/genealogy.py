@@ -130,10 +130,6 @@ class Lineage:
             self._settled.pop(generation, None)
             self._members.pop(generation, None)
 
-    def is_retained(self, generation: int) -> bool:
-        """Whether `rows` may be asked for a generation."""
-        return generation == self.generation or self._retained[generation] > 0
-
     def arrays(self) -> dict[str, np.ndarray]:
         names = ("parent", "children", "generation", "row", "leaves", "free")
         arrays = {f"lineage/{name}": getattr(self, f"_{name}") for name in names}
@@ -255,34 +251,27 @@ class History:
         self.lineage = lineage
         self.lag = lag
         self.clouds = clouds
-        self.blocks: list[PathBlock] = []
-        self._by_generation: dict[int, PathBlock] = {}
+        self._blocks: dict[int, PathBlock] = {}
         self._schedule = Schedule()
         self._steps = 0
 
     def record(self, stamp_ns: int, state: np.ndarray, log_weights: np.ndarray) -> None:
-        """Stores the states (N, E) after a step.
-
-        Raises:
-            InputError: the paths no longer fit into the machine's memory.
-        """
+        """Stores the states (N, E) after a step. Raises InputError: the paths no longer fit into the machine's memory."""
         if self._steps % _MEMORY_CHECK == 0:
             paths = (
                 f"the paths of {self.lineage.n} particles over {self._steps + _MEMORY_CHECK} steps (a lag keeps fewer)"
             )
             require_memory(8.0 * state[0].size * (self.stored_states + _MEMORY_CHECK * self.lineage.n), paths)
         now = self.lineage.generation
-        block = self._by_generation.get(now)
+        block = self._blocks.get(now)
         if block is None:
-            block = PathBlock(now, np.arange(state.shape[0]), [], [], [])
-            self.blocks.append(block)
-            self._by_generation[now] = block
+            block = self._blocks[now] = PathBlock(now, np.arange(state.shape[0]), [], [], [])
             self.lineage.retain(now)
             if not self.clouds:
                 self._schedule.add(now, now)
             # Blocks whose lineages have coalesced shrink to the rows that still have descendants.
             for generation in self._schedule.pop(now):
-                past = self._by_generation.get(generation)
+                past = self._blocks.get(generation)
                 if past is None:
                     continue
                 alive = self.lineage.survivors(generation)
@@ -298,13 +287,17 @@ class History:
             block.log_weights.append(log_weights.copy())
         self._steps += 1
         if self.lag is not None and self._steps > self.lag:
-            first = self.blocks[0]
+            first = next(iter(self._blocks.values()))
             del first.stamps_ns[0], first.states[0], first.log_weights[:1]
             self._steps -= 1
             if not first.states:
-                self.blocks.pop(0)
-                del self._by_generation[first.generation]
+                del self._blocks[first.generation]
                 self.lineage.release(first.generation)
+
+    @property
+    def blocks(self) -> list[PathBlock]:
+        """One per generation, in order of time."""
+        return list(self._blocks.values())
 
     @property
     def stamps_ns(self) -> np.ndarray:
@@ -341,7 +334,7 @@ class History:
 
     def restore(self, arrays: dict[str, np.ndarray], size: int | None = None) -> None:
         """The inverse of `arrays`, of states of so many numbers; errors as `rbpf.core.checkpoint.read`."""
-        self.blocks, self._by_generation = [], {}
+        self._blocks = {}
         self._schedule = Schedule.of(read_one(arrays, "history/due", DUE))
         generations = read_one(arrays, "history/generations", integers("blocks", ascending=True)).tolist()
         shape = ("steps", "n") if self.clouds else (0,)
@@ -352,7 +345,5 @@ class History:
             kept, stamps, states, log_weights = read(arrays, block, f"history/{number}/", **sizes).values()
             if not stamps.size or np.setdiff1d(self.lineage.survivors(generation), kept).size:
                 raise InputError(f"the array history/{number}/kept lacks particles that have descendants")
-            past = PathBlock(generation, kept, stamps.tolist(), list(states), list(log_weights))
-            self.blocks.append(past)
-            self._by_generation[generation] = past
+            self._blocks[generation] = PathBlock(generation, kept, stamps.tolist(), list(states), list(log_weights))
         self._steps = self.stamps_ns.size

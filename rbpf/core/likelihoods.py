@@ -25,9 +25,6 @@ class Gaussian(Likelihood):
 
     kernel_id = 0
 
-    def __init__(self) -> None:
-        self.params = np.zeros(1)
-
     def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
         return gaussian.log_density(nu, cov)
 

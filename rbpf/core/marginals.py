@@ -294,20 +294,19 @@ class Marginals(Conditional):
         return [found[id(group)] for group in groups]
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        total: Information | None = None
-        for supplies, routed in self._routed(groups).items():
-            if routed:
-                found = self.parts[supplies].information(state, routed, prior)
-                if total is None:
-                    total = found
-                else:
-                    total.add(found)
-        return Information.zeros(state.shape[0], self.space.dim) if total is None else total
+        by_part = {supplies: routed for supplies, routed in self._routed(groups).items() if routed}
+        found = [self.parts[supplies].information(state, routed, prior) for supplies, routed in by_part.items()]
+        total = found[0] if found else Information.zeros(state.shape[0], self.space.dim)
+        for other in found[1:]:
+            total.add(other)
+        return total
 
     def linearised(self, prior: Prior, groups: Sequence[Observations]) -> LineariseAt:
         """What the observations say about the state, to be linearised wherever a proposal asks."""
-        weighing = [_for_look_ahead(group) for group in groups]
-        is_other = any(one is not other for one, other in zip(weighing, groups, strict=True))
+        # What may move the state weighs it, too, unless a likelihood says otherwise.
+        ahead = [group.likelihood and group.likelihood.of_look_ahead() for group in groups]
+        is_other = any(likelihood is not group.likelihood for likelihood, group in zip(ahead, groups, strict=True))
+        weighing = [replace(group, likelihood=other) for other, group in zip(ahead, groups, strict=True)]
 
         def information_at(state: np.ndarray) -> Information:
             found = self.information(state, groups, prior)
@@ -392,12 +391,6 @@ class Marginals(Conditional):
 def prefix(part: Part) -> str:
     """What stands before the names of a part's arrays in a checkpoint: nothing for those that every filter may have."""
     return "" if part in EVERYTHING else f"{part}/"
-
-
-def _for_look_ahead(group: Observations) -> Observations:
-    """The group itself where what may move the state weighs it, too."""
-    likelihood = None if group.likelihood is None else group.likelihood.of_look_ahead()
-    return group if likelihood is group.likelihood else replace(group, likelihood=likelihood)
 
 
 def _all_outliers(groups: Sequence[Observations], like: Information) -> Information | None:

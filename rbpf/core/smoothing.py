@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.core.genealogy import History
 from rbpf.core.models import MotionModel, draws
 from rbpf.errors import InputError
@@ -70,17 +71,11 @@ def _transition_log_density(
     if transition.coupling is not None and transition.coupling.shape[-1]:
         raise InputError("backward simulation takes motion models without a substate")
     factor = transition.noise_factor
-    cov = factor @ np.swapaxes(factor, -1, -2)
     if (np.linalg.matrix_rank(factor) < motion.space.dim).any():
         raise InputError("backward simulation needs a motion model with regular noise")
-    log_det = np.linalg.slogdet(cov)[1]
     increment = motion.space.local(transition.mean[None], after[:, None])
-    solved = np.einsum(
-        "nab,jnb->jna", np.broadcast_to(np.linalg.inv(cov), (before.shape[0], *cov.shape[1:])), increment
-    )
-    jacobian = motion.space.right_jacobian_inverse(increment)
-    chart = np.linalg.slogdet(jacobian)[1]
-    return -0.5 * ((increment * solved).sum(-1) + log_det) + chart
+    chart = np.linalg.slogdet(motion.space.right_jacobian_inverse(increment))[1]
+    return gaussian.log_density(increment, gaussian.gram(factor)) + chart
 
 
 def _draw(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rbpf.core.diagnostics import Health, HealthWarning
 from rbpf.core.filter import Filter
-from rbpf.core.health import Health, HealthWarning
 from rbpf.core.models import LikelihoodSensor, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE2, Euclidean, Product
