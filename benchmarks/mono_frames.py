@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from benchmarks.rows import Row, Settings
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
@@ -56,7 +56,7 @@ def run(settings: Settings) -> list[Row]:
 
 def figure(width: int, timed: int) -> Row:
     sequence, known = rendered(width, SETTLING + timed)
-    done = filter_images(sequence, MonoConfig(particles=50), known)
+    done = filter_opened(open_mono(sequence, MonoConfig(particles=50), known))
     stages = {name: float(np.median(part[SETTLING:])) * 1e3 for name, part in by_stage(done).items()}
     peer = optical_flow(sequence)
     whole = done.log["seconds"][SETTLING:]

@@ -9,7 +9,7 @@ from benchmarks.rows import Row, Settings
 from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.system import Tracked
@@ -34,7 +34,7 @@ def run(settings: Settings) -> list[Row]:
             if len(run.log) == 1 and more:
                 add_elsewhere(run, more)
 
-        done = filter_images(replace(sequence), MonoConfig(particles=50), known, [fill])
+        done = filter_opened(open_mono(replace(sequence), MonoConfig(particles=50), known), [fill])
         assert not done.log.lost().any()
         spent = done.log["seconds"]
         seconds[more] = spent[SETTLING:]

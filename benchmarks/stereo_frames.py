@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.mono_frames import Decoded
 from benchmarks.rows import Row, Settings
-from rbpf.runs.recordings import filter_pairs
+from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.systems.stereo.config import StereoConfig
@@ -37,7 +37,7 @@ def rendered(pairs: int) -> ImageSequence:
 def run(settings: Settings) -> list[Row]:
     """The system beside OpenCV's SIFT alone on both whole images, without matching, map or filter."""
     sequence = rendered(SETTLING + settings.repetitions(TIMED))
-    log = filter_pairs(sequence, StereoConfig()).log
+    log = filter_opened(open_pairs(sequence, StereoConfig())).log
     whole = 1e3 * log["seconds"][SETTLING:]
     plain = 1e3 * sift_alone(sequence)
     median = float(np.median(whole))

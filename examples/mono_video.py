@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from rbpf.runs.recordings import MonoRecording, filter_images
+from rbpf.runs.recordings import MonoRecording, filter_opened, open_mono
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
@@ -21,7 +21,7 @@ def slam(images: Path, known_points: Path | None, particles: int, out: Path) -> 
     """The ten lines."""
     sequence = open_images(images)
     known = None if known_points is None else read_known_points(known_points)
-    run = filter_images(sequence, MonoConfig(particles=particles), known)
+    run = filter_opened(open_mono(sequence, MonoConfig(particles=particles), known))
     print(f"the camera ended at {run.log.poses[-1, 4:].round(3)} m, lost in {int(run.log.lost().sum())} frames")
     return finish_run(run, out, MonoRecording(images, known_points).sources())
 

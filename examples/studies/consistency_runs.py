@@ -24,7 +24,7 @@ from rbpf.core.diagnostics import Band, ancestors_by_step, chi_square_band, coal
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_features, filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.run import Run
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.feature_log import FeatureLog
@@ -83,7 +83,7 @@ class RobotTrial:
         """Simulates and filters."""
         log = simulated_log(self.world, seed)
         given = log if self.spoil is None else self.spoil(log, np.random.default_rng(seed))
-        done = filter_robot_log(given, replace(self.config, seed=seed))
+        done = filter_opened(open_robot_log(given, replace(self.config, seed=seed)))
         path, found = done.log, done.system.map()
         assert log.truth is not None
         truth = truth_at(log.space, log.truth, path.stamps_ns, "first frame")

@@ -27,7 +27,7 @@ from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import filter_features, filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.trajectory import Alignment, Trajectory, in_space
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera.points import CameraRay
@@ -105,7 +105,7 @@ def robot_causes(
         ours, true = (in_space(stamps[truth.rows], poses[truth.rows]), in_space(stamps[truth.rows], truth.poses))
         return ate(ours, true, "rigid").rmse
 
-    runs = [filter_robot_log(log, replace(config, seed=seed)) for seed in seeds]
+    runs = [filter_opened(open_robot_log(log, replace(config, seed=seed))) for seed in seeds]
     measured = runs[0].system.measurements(log.name, runs[0].log)
     batch = robot.solve(measured, marginals=False, incremental=len(stamps) > AFAR)
     start = InitialEstimate(runs[0].log.poses, dict(batch.landmarks))
@@ -123,7 +123,7 @@ def robot_causes(
     }
     for name, changed in changes.items():
         on_change(name)
-        means = [filter_robot_log(log, replace(changed, seed=seed)).log.poses for seed in seeds]
+        means = [filter_opened(open_robot_log(log, replace(changed, seed=seed))).log.poses for seed in seeds]
         out.append(Cause(name, tuple(map(error, means)), found))
     return out
 

@@ -19,7 +19,14 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import MonoRecording, StereoRecording, filter_features, filter_recording, filter_robot_log
+from rbpf.runs.recordings import (
+    MonoRecording,
+    StereoRecording,
+    filter_features,
+    filter_opened,
+    filter_recording,
+    open_robot_log,
+)
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Alignment, Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
@@ -87,7 +94,7 @@ def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int
         InputError: the recording is wrong, or has too little ground truth.
     """
     log = open_log(recording, config.noise)
-    errors = _over_seeds(lambda seed: filter_robot_log(log, _seeded(config, seed)), seeds)
+    errors = _over_seeds(lambda seed: filter_opened(open_robot_log(log, _seeded(config, seed))), seeds)
     return ErrorRatio(log.name, config.particles, *errors, "rigid")
 
 

@@ -33,7 +33,7 @@ from examples.studies.image_faults import (
 from examples.studies.mono_blackouts import pose_differences
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_images, filter_pairs
+from rbpf.runs.recordings import filter_opened, open_mono, open_pairs
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import ImageSequence, KnownPixels, open_images, open_stereo, read_known_points
@@ -126,7 +126,7 @@ def try_mono(
     """
 
     def run(damaged: ImageSequence) -> Told:
-        done = filter_images(damaged, config, known)
+        done = filter_opened(open_mono(damaged, config, known))
         return Told(done.log.stamps_ns, done.log.poses, done.log.lost(), done.messages, done.failure)
 
     return _try_all("mono", sequence, run, faults)
@@ -140,7 +140,7 @@ def try_stereo(sequence: ImageSequence, config: StereoConfig, faults: Mapping[st
     """
 
     def run(damaged: ImageSequence) -> Told:
-        done = filter_pairs(damaged, config)
+        done = filter_opened(open_pairs(damaged, config))
         log, blind = done.log, done.log["assumed"] > 0
         poses = SE3.compose(_truth(damaged, log.stamps_ns)[0], log.poses)
         return Told(log.stamps_ns, poses, blind, done.messages, done.failure)

@@ -21,7 +21,7 @@ from examples.studies.parallel import in_parallel
 from examples.studies.point_worlds import STEREO, Measuring, RoomWorld, simulate_features
 from rbpf.lie import SE3
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_features, filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
@@ -73,7 +73,7 @@ class EkfTrial:
 
 def of_ekf(log: RobotLog) -> Trial:
     """One Gaussian of pose and landmarks, linearised once per step."""
-    done = filter_robot_log(log, replace(JOINT, particles=1, window=1))
+    done = filter_opened(open_robot_log(log, replace(JOINT, particles=1, window=1)))
     found = joint_ekf(done.system.measurements(log.name, done.log))
     assert log.truth is not None
     truth = truth_at(log.space, log.truth, done.log.stamps_ns, "first frame")
@@ -129,7 +129,7 @@ def recorded(folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]) -
         for name, config in configs.items():
             errors, evidence, speed = [], [], []
             for seed in range(seeds):
-                done = filter_robot_log(log, replace(config, seed=seed))
+                done = filter_opened(open_robot_log(log, replace(config, seed=seed)))
                 scores = score_estimate(PathAndMap.of_run(done), done.truth, False)
                 errors.append([scores[key] for key in names])
                 evidence.append(float(done.log["log_evidence"].sum()))

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from examples.studies.parallel import in_parallel
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
@@ -223,7 +223,7 @@ def black_out(job: Job) -> Outcome:
     # The checkpoint stays as it is.
     config = replace(job.config, checkpoint_every=job.end + 1)
     with suppress(_EnoughError):
-        filter_images(dark, config, known_of(job.folder), [watch], job.checkpoint, resume=True)
+        filter_opened(open_mono(dark, config, known_of(job.folder)), [watch], job.checkpoint, resume=True)
     run, done = watch.run, watch.done
     assert run is not None
     lit = np.arange(job.dark.stop, done)
@@ -291,7 +291,7 @@ def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int]
         if len(run.log) in starts:
             run.save(out / f"{len(run.log):05d}.npz")
 
-    return filter_images(sequence, blackouts.config, known_of(blackouts.folder), [keep])
+    return filter_opened(open_mono(sequence, blackouts.config, known_of(blackouts.folder)), [keep])
 
 
 def in_view(run: Run, truth: np.ndarray) -> int:

@@ -21,7 +21,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.runs.plots import save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, read_known_points
@@ -133,7 +133,7 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
         if (len(run.log) - 1) % every == 0 and run.frame.image is not None:
             looks.append(_look(run.frame.image))
 
-    run = filter_images(sequence, config, known, [note])
+    run = filter_opened(open_mono(sequence, config, known), [note])
     table = run.system.sensor.table
     noise, contrast = np.median(looks, axis=0).tolist()
     return SearchStatistics(

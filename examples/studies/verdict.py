@@ -27,7 +27,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.runs.folder import write_run
 from rbpf.runs.plots import new_axes, save_figures
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import filter_features, filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.run import Run
 from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.sensors.range_bearing import RangeBearing
@@ -139,7 +139,7 @@ def robot(
 
     def run() -> Run:
         with wrong_derivative() if derivative else nullcontext():
-            return filter_robot_log(fault(simulated_log(world, seed)), config)
+            return filter_opened(open_robot_log(fault(simulated_log(world, seed)), config))
 
     return run
 

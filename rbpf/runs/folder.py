@@ -26,7 +26,8 @@ known_map.npz            the points with what they look like, for --map; see `rb
 and of the laser's
 
 grid.npz                 log-odds of the cells of the particle of highest weight, see `rbpf.maps.grid.Picture`
-grid.pgm, grid.yaml      the same for programs that read map_server's files, see `rbpf.runs.grid_files`
+grid.pgm, grid.yaml      the same as ROS's map_server and its successors read it: one byte per cell, the highest y in the first
+                         row, 0 where something is, 254 where beams have passed, 205 where nothing is known
 """
 
 import json
@@ -42,8 +43,18 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays
-from rbpf.runs.files import GRID, MAP, POSTERIOR, SUMMARY, TRAJECTORY, VERSION, prepare_folder, write_csv, write_text
-from rbpf.runs.grid_files import write_grid
+from rbpf.runs.files import (
+    GRID,
+    MAP,
+    POSTERIOR,
+    SUMMARY,
+    TRAJECTORY,
+    VERSION,
+    prepare_folder,
+    whole,
+    write_csv,
+    write_text,
+)
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.run import Run
@@ -51,6 +62,9 @@ from rbpf.runs.trajectory import in_space, write_tum
 from rbpf.runs.truth import write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
+
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205
+"""Bytes of grid.pgm."""
 
 STILL = 0.01
 """A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth."""
@@ -95,18 +109,23 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
 def summarise(run: Run) -> dict[str, Any]:
     """The entries of summary.json that need no comparison."""
     log, config = run.log, run.system.config
-    evidence = log["log_evidence"]
+    evidence, milliseconds = log["log_evidence"], 1e3 * log["seconds"]
+    linearised = np.isfinite(log["nis"]) & (log["nis_dof"] > 0)
+    nis, dof = log["nis"][linearised], log["nis_dof"][linearised]
     return {
         "system": run.system.name,
         "recording": run.name,
         "frames": len(log),
         "particles": config.particles,
         "seed": config.seed,
-        "ms_per_frame": milliseconds_per_frame(log["seconds"]),
+        "ms_per_frame": {
+            "median": round(float(np.median(milliseconds)), 3),
+            "p95": round(float(np.percentile(milliseconds, 95)), 3),
+        },
         "resamplings": int(log["resampled"].sum()),
         "ess_mean": float(log["ess"].mean()),
         "log_evidence": float(np.sum(evidence)) if np.isfinite(evidence).all() else None,
-        "nis_per_dof": nis_ratio(log["nis"], log["nis_dof"]),
+        "nis_per_dof": float(nis.sum() / dof.sum()) if nis.size else None,
         "peak_memory_mb": peak_memory_mb(),
         **run.system.summary(log),
         **({"remarks": found} if (found := remarks(run)) else {}),
@@ -156,16 +175,23 @@ def write_map(out: Path, found: MapEstimate) -> None:
     write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names, *found.columns], rows)
 
 
-def milliseconds_per_frame(seconds: np.ndarray) -> dict[str, float]:
-    """Median and 95th percentile of times (T,) [s], in ms."""
-    milliseconds = seconds * 1e3
-    return {"median": round(float(np.median(milliseconds)), 3), "p95": round(float(np.percentile(milliseconds, 95)), 3)}
-
-
-def nis_ratio(nis: np.ndarray, dof: np.ndarray) -> float | None:
-    """NIS per degree of freedom over all frames (T,); None without a linearised innovation."""
-    used = np.isfinite(nis) & (dof > 0)
-    return float(nis[used].sum() / dof[used].sum()) if used.any() else None
+def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
+    """grid.pgm and grid.yaml of what grid.npz holds."""
+    log_odds, (x, y) = grid["log_odds"], grid["corner"].tolist()
+    cells = np.select([log_odds > 0.0, log_odds < 0.0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
+    height, width = cells.shape
+    with whole(out / "grid.pgm") as temporary:
+        temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode() + cells[::-1].tobytes())
+    words = {
+        "image": "grid.pgm",
+        "mode": "trinary",
+        "resolution": f"{float(grid['cell_m']):g}",
+        "origin": f"[{x:.6f}, {y:.6f}, 0.0]",
+        "negate": "0",
+        "occupied_thresh": "0.65",
+        "free_thresh": "0.196",
+    }
+    write_text(out / "grid.yaml", "".join(f"{name}: {value}\n" for name, value in words.items()))
 
 
 def peak_memory_mb() -> float:

@@ -21,7 +21,6 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import GRID, whole
-from rbpf.runs.grid_files import read_grid
 from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH
@@ -119,7 +118,7 @@ def map_figure(found: RunFolder) -> Any:
 
 def _grid_figure(found: RunFolder, world: "World", path: Trajectory, motion: Similarity) -> Any:
     """Path and occupancy grid: black where something is, white where beams have passed, grey where none has."""
-    grid, figure, axes = read_grid(found.folder), *new_axes(f"{found.name}: map in {world.name}")
+    grid, figure, axes = found.grid, *new_axes(f"{found.name}: map in {world.name}")
     height, width = grid.log_odds.shape
     x = grid.corner[0] + grid.cell_m * np.arange(width + 1)
     y = grid.corner[1] + grid.cell_m * np.arange(height + 1)

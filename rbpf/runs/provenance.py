@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -28,19 +28,9 @@ _MADE = "video", "batch"
 """What a run makes besides its data, unless it is asked not to."""
 _HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
 _INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
-_CHUNK = 1 << 20
 
 FREE = ("checkpoint_every",)
 """Settings that cannot change the results: a run may go on with others. All else must be the same."""
-
-
-class Origin(NamedTuple):
-    """How a run was started: its system, its recording, its other sources by option, its settings' file."""
-
-    system: str
-    recording: str
-    sources: dict[str, str]
-    config: Path
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -112,8 +102,7 @@ def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str |
             whole.update(f"{relative}\n{file.stat().st_size}\n".encode())
             try:
                 with file.open("rb") as content:
-                    while chunk := content.read(_CHUNK):
-                        whole.update(chunk)
+                    hashlib.file_digest(content, lambda: whole)
             except OSError as error:
                 raise InputError(f"{file} cannot be read: {error.strerror}") from error
     return whole.hexdigest()
@@ -164,8 +153,11 @@ def _shown(value: str | None) -> str:
     return f"{value[:31]}…" if value.startswith("content of SHA-256 ") else value
 
 
-def read_origin(config: Path) -> Origin:
-    """What a run was started with, from its config.yaml; refused where what the run read has changed or is gone."""
+def read_origin(config: Path) -> list[str]:
+    """System, recording and options that a run was started with, from its config.yaml or the folder of it.
+
+    Refused where what the run read has changed or is gone.
+    """
     if config.is_dir():
         config = config / CONFIG
     if config.name != CONFIG:
@@ -184,12 +176,13 @@ def read_origin(config: Path) -> Origin:
             "alone give --config"
         )
     # What else a run was started with: an entry has its option's name, and perhaps a unit behind it.
-    named = [name for name in HEADER if name in entries and name not in (*_HEAD, *_FLAGS, *_MADE)]
-    options = {name: re.sub(r"_(m|s|px)$", "", name).replace("_", "-") for name in named} | {"known_map": "map"}
-    sources = {options[name]: str(entries[name]) for name in named}
-    sources |= {name: "" for name in _FLAGS if entries.get(name)}
-    sources |= {f"no-{name}": "" for name in _MADE if entries.get(name) is False}
-    return Origin(str(entries["system"]), str(entries["recording"]), sources, config)
+    words = [str(entries["system"]), str(entries["recording"]), "--config", str(config)]
+    for name in HEADER:
+        if name in entries and name not in (*_HEAD, *_FLAGS, *_MADE):
+            option = "map" if name == "known_map" else re.sub(r"_(m|s|px)$", "", name).replace("_", "-")
+            words += [f"--{option}", str(entries[name])]
+    words += [f"--{name}" for name in _FLAGS if entries.get(name)]
+    return words + [f"--no-{name}" for name in _MADE if entries.get(name) is False]
 
 
 def _files(path: Path, without: Path | None) -> list[Path]:

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from rbpf.core.checkpoint import fitting, integers, load_arrays, numbers, read
 from rbpf.errors import InputError, printable
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
-from rbpf.runs.files import MAP, TRAJECTORY, VERSION
+from rbpf.maps.grid import Picture
+from rbpf.runs.files import GRID, MAP, TRAJECTORY, VERSION
 from rbpf.runs.measurement_files import read_measurements
 from rbpf.runs.provenance import read_config, require_own_version
 from rbpf.runs.run import Run
@@ -48,6 +49,7 @@ _MAP = {
     "cov": numbers("landmarks", "axes", "axes", values="any"),
     "ray_ends": numbers("landmarks", 2, 3, values="any"),
 }
+_GRID = {"log_odds": numbers("rows", "columns"), "cell_m": numbers(), "corner": numbers(2)}
 _PARTICLES = {"particles": numbers("particles", "size"), "weights": numbers("particles", least=0)}
 
 
@@ -119,7 +121,14 @@ class RunFolder:
         for name in ("config.yaml", "summary.json"):
             if not (folder / name).is_file():
                 raise InputError(f"{folder} has no {name}: expected the folder that a finished `rbpf run` left")
-        return cls(folder, read_config(folder), _summary(folder / "summary.json"))
+        config, path = read_config(folder), folder / "summary.json"
+        try:
+            summary = json.loads(_text(path))
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+        if not isinstance(summary, dict):
+            raise InputError(f"{path} is damaged: expected names with values")
+        return cls(folder, config, summary)
 
     @property
     def system(self) -> str:
@@ -182,6 +191,15 @@ class RunFolder:
         return MapEstimate(ids, mean, cov, ray_ends=found.pop("ray_ends", None), columns=found)
 
     @cached_property
+    def grid(self) -> Picture:
+        """The occupancy grid of a laser scanner's run."""
+        file = self.folder / GRID
+        arrays = load_arrays(file)
+        with fitting(file):
+            found = read(arrays, _GRID)
+        return Picture(found["log_odds"], float(found["cell_m"]), found["corner"])
+
+    @cached_property
     def particles(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (N, E) of the last frame's particles in the reported world, and their weights (N,)."""
         file = self.folder / TRAJECTORY
@@ -212,16 +230,6 @@ class RunFolder:
         except ValueError as error:
             raise InputError(f"{path}: expected numbers below the header: {error}") from error
         return dict(zip(rows[0], values.T, strict=True))
-
-
-def _summary(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
-    if not isinstance(found, dict):
-        raise InputError(f"{path} is damaged: expected names with values")
-    return {str(name): value for name, value in found.items()}
 
 
 def _text(path: Path) -> str:

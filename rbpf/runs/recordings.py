@@ -48,6 +48,9 @@ from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
 
+Sources = dict[str, str | float | bool]
+"""What a run reads, by the name that it has in config.yaml."""
+
 
 class Opened(NamedTuple):
     """A recording that is ready to be filtered: a new system, the source of its frames, their times (T,), and the truth.
@@ -85,7 +88,7 @@ class RobotRecording:
     def open(self, config: RangeBearingConfig) -> Opened:
         return open_robot_log(part_of_log(open_log(self.log, config.noise), self.part), config)
 
-    def sources(self) -> dict[str, str | float | bool]:
+    def sources(self) -> Sources:
         return {"recording": str(self.log)} | self.part.entries()
 
 
@@ -119,7 +122,8 @@ class MonoRecording:
 
     def open(self, config: MonoConfig) -> Opened:
         known_map = None if self.map is None else read_known_map(self.map)
-        return open_mono(*self.sequence(), config, known_map)
+        sequence, known = self.sequence()
+        return open_mono(sequence, config, known, known_map)
 
     @property
     def live(self) -> int | None:
@@ -154,22 +158,17 @@ class MonoRecording:
             known = find_markers(first_image(sequence), self.markers)
         return sequence, known
 
-    def sources(self) -> dict[str, str | float | bool]:
-        paths = {
-            "recording": self.images,
-            "known_points": self.known_points,
-            "calibration": self.calibration,
-            "known_map": self.map,
-        }
-        found: dict[str, str | float | bool] = {name: str(path) for name, path in paths.items() if path is not None}
+    def sources(self) -> Sources:
+        found = _given(recording=self.images, known_points=self.known_points, calibration=self.calibration)
         if self.board is not None:
             found |= {"board": f"{self.board.columns}x{self.board.rows}", "square_m": self.board.square_m}
         if self.markers is not None:
             board = self.markers
             found |= {"aruco": f"{board.columns}x{board.rows}", "marker_m": board.side_m, "gap_m": board.gap_m}
             found["dictionary"] = board.dictionary
-        localize = {} if self.map is None else {"localize": True}
-        return found | localize | self.topics.entries() | self.part.entries()
+        if self.map is not None:
+            found |= {"known_map": str(self.map), "localize": True}
+        return found | self.topics.entries() | self.part.entries()
 
 
 @dataclass(frozen=True)
@@ -184,9 +183,8 @@ class StereoRecording:
     def open(self, config: StereoConfig) -> Opened:
         return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
 
-    def sources(self) -> dict[str, str | float | bool]:
-        named = {"recording": self.pairs, "calibration": self.calibration}
-        found: dict[str, str | float | bool] = {name: str(path) for name, path in named.items() if path is not None}
+    def sources(self) -> Sources:
+        found = _given(recording=self.pairs, calibration=self.calibration)
         return found | self.topics.entries() | self.part.entries()
 
 
@@ -201,11 +199,15 @@ class LaserRecording:
         log = read_laser_log(self.log, self.options)
         return Opened(LaserSlam(log.scanner, config), LogSource(log), log.stamps_ns, None)
 
-    def sources(self) -> dict[str, str | float | bool]:
+    def sources(self) -> Sources:
         options = self.options
-        named = {"recording": str(self.log), "scanner": options.scanner, "max_range": options.max_range_m}
-        found: dict[str, str | float | bool] = {name: value for name, value in named.items() if value is not None}
+        found = _given(recording=self.log, scanner=options.scanner, max_range=options.max_range_m)
         return found | ({"upside_down": True} if options.upside_down else {}) | options.part.entries()
+
+
+def _given(**named: Path | str | float | None) -> Sources:
+    """What is not None; paths as text."""
+    return {name: str(v) if isinstance(v, Path) else v for name, v in named.items() if v is not None}
 
 
 def part_of_log(log: RobotLog, part: Part) -> RobotLog:
@@ -236,8 +238,8 @@ def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
 
 def open_mono(
     sequence: ImageSequence | LiveCamera,
-    known: KnownPixels | None,
     config: MonoConfig,
+    known: KnownPixels | None = None,
     known_map: KnownMap | None = None,
 ) -> Opened:
     """A sequence of images; with known points in the first one, a known map, or without either."""
@@ -291,7 +293,7 @@ class Recording(Protocol):
     def open(self, config: Any) -> Opened:
         """A new system with these settings, and the source of its frames."""
 
-    def sources(self) -> dict[str, str | float | bool]:
+    def sources(self) -> Sources:
         """For config.yaml: `recording`, and what else was read."""
 
 
@@ -303,31 +305,24 @@ def filter_recording(
     if out is None:
         return filter_opened(opened, listeners)
     prepare_folder(out)
-    inputs = decisive_inputs(recording.sources(), out)
-    return filter_opened(opened, listeners, out / CHECKPOINT, config.checkpoint_every, resume, inputs)
+    return filter_opened(opened, listeners, out / CHECKPOINT, resume, decisive_inputs(recording.sources(), out))
 
 
 def filter_opened(
     opened: Opened,
     listeners: Iterable[Listener] = (),
     checkpoint: Path | None = None,
-    every: int = 500,
     resume: bool = False,
     inputs: Mapping[str, str] | None = None,
 ) -> Run:
-    """Takes all frames of an opened recording; see `drive`, and `Run` for `inputs`. It then knows the truth at them."""
+    """Filters what is opened to its end; see `drive`, and `Run` for `inputs`. The run then knows the truth."""
     system, source, stamps_ns, truth = opened
     expected = None if stamps_ns is None else len(stamps_ns)
     run = Run(source, system, expected=expected, inputs=inputs or {})
-    drive(run, listeners, checkpoint, every, resume, stamps_ns)
+    drive(run, listeners, checkpoint, system.config.checkpoint_every, resume, stamps_ns)
     if truth is not None:
         run.truth = truth_at(system.space, truth, run.log.stamps_ns, system.gauge)
     return run
-
-
-def filter_robot_log(log: RobotLog, config: RangeBearingConfig) -> Run[RangeBearingSlam]:
-    """A robot's log in memory, filtered to its end."""
-    return filter_opened(open_robot_log(log, config))
 
 
 def filter_features(
@@ -341,28 +336,3 @@ def filter_features(
     if run.failure is not None:
         raise InputError(run.failure)
     return run
-
-
-def filter_images(
-    sequence: ImageSequence,
-    config: MonoConfig,
-    known: KnownPixels | None = None,
-    listeners: Iterable[Listener] = (),
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    known_map: KnownMap | None = None,
-) -> Run[MonoSlam]:
-    """A sequence of images, filtered to its end; errors as `open_mono` and `drive`."""
-    opened = open_mono(sequence, known, config, known_map)
-    return filter_opened(opened, listeners, checkpoint, config.checkpoint_every, resume)
-
-
-def filter_pairs(
-    sequence: ImageSequence,
-    config: StereoConfig,
-    listeners: Iterable[Listener] = (),
-    checkpoint: Path | None = None,
-    resume: bool = False,
-) -> Run[StereoSlam]:
-    """A sequence of pairs of images, filtered to its end; errors as `drive`."""
-    return filter_opened(open_pairs(sequence, config), listeners, checkpoint, config.checkpoint_every, resume)

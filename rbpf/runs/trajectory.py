@@ -115,8 +115,11 @@ def associate(
     """
     if not len(estimate) or not len(reference):
         raise InputError("Expected trajectories with poses to associate, found an empty one.")
-    wanted = _nearest(estimate.stamps_ns, reference.stamps_ns)
-    difference = np.abs(estimate.stamps_ns - reference.stamps_ns[wanted])
+    stamps, others = estimate.stamps_ns, reference.stamps_ns
+    after = np.searchsorted(others, stamps).clip(max=len(others) - 1)
+    before = (after - 1).clip(min=0)
+    wanted = np.where(np.abs(stamps - others[before]) <= np.abs(others[after] - stamps), before, after)
+    difference = np.abs(stamps - others[wanted])
     near = np.flatnonzero(difference <= max_difference_ns)
     if not len(near):
         raise InputError(
@@ -127,13 +130,6 @@ def associate(
     _, first = np.unique(wanted[best_first], return_index=True)
     rows = best_first[first]
     return estimate.at(rows), reference.at(wanted[rows])
-
-
-def _nearest(stamps_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    after = np.searchsorted(others_ns, stamps_ns).clip(max=len(others_ns) - 1)
-    before = (after - 1).clip(min=0)
-    earlier = np.abs(stamps_ns - others_ns[before]) <= np.abs(others_ns[after] - stamps_ns)
-    return np.where(earlier, before, after)
 
 
 def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: bool = False) -> Similarity:
@@ -148,7 +144,10 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
     dx, dy = x - centre_x, y - centre_y
     cov_yx = np.einsum("ni,nj->ij", dy, dx) / len(x)
     u, singular, vt = np.linalg.svd(cov_yx)
-    rank = int((singular > _rounding(x, y, dx, dy)).sum())
+    # What rounding of coordinates far from the origin leaves in the cross-covariance.
+    spread_x, spread_y = (float(np.sqrt(np.square(d).sum(1).mean())) for d in (dx, dy))
+    noise = float(np.abs(x).max()) * spread_y + float(np.abs(y).max()) * spread_x
+    rank = int((singular > 32.0 * float(np.finfo(float).eps) * noise).sum())
     rotation = _closest_rotation(u, vt.T, rank)
     variance = np.square(dx).sum() / len(x)
     scale = float((rotation * cov_yx).sum() / variance) if with_scale and rank else 1.0
@@ -177,13 +176,6 @@ def _checked(estimate_points: ArrayLike, reference_points: ArrayLike) -> tuple[A
     return x, y
 
 
-def _rounding(x: Array, y: Array, dx: Array, dy: Array) -> float:
-    # What rounding of coordinates far from the origin leaves in the cross-covariance.
-    spread_x, spread_y = (float(np.sqrt(np.square(d).sum(1).mean())) for d in (dx, dy))
-    noise = float(np.abs(x).max()) * spread_y + float(np.abs(y).max()) * spread_x
-    return 32.0 * float(np.finfo(float).eps) * noise
-
-
 def _closest_rotation(u: Array, v: Array, rank: int) -> Array:
     # Within the null spaces every orthogonal matrix fits; the one of largest trace turns least.
     left, _, right_t = np.linalg.svd(np.einsum("ki,kj->ij", u[:, rank:], v[:, rank:]))
@@ -195,7 +187,6 @@ def _closest_rotation(u: Array, v: Array, rank: int) -> Array:
 
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-KITTI_COLUMNS = tuple(f"{name}{row}" for row in "123" for name in ("r1", "r2", "r3", "t"))
 UNIT_TOLERANCE = 0.01  # files print few digits; more than this is no rotation
 NS_PER_S = 1_000_000_000
 
@@ -228,20 +219,3 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """Writes a trajectory in KITTI format, with every digit and without times; the file appears when it is complete."""
     rows = SE3.matrix(trajectory.world_from_body)[:, :3].reshape(-1, 12).tolist()
     write_text(path, "".join(" ".join(map(repr, row)) + "\n" for row in rows))
-
-
-def read_kitti(path: Path) -> Trajectory:
-    """Trajectory of a file in KITTI format, stamped with the number of the row from 0. An InputError names file and line."""
-    table = read_columns(path, KITTI_COLUMNS, "a trajectory in KITTI format")
-    matrices = table.values.reshape(-1, 3, 4)
-    wrong = _distance_from_rotation(matrices[:, :, :3]) > UNIT_TOLERANCE
-    if wrong.any():
-        problem = "expected a rotation matrix in columns 1-3, 5-7 and 9-11, found one that is not orthonormal"
-        raise table.error(int(np.argmax(wrong)), problem)
-    return Trajectory(np.arange(len(matrices)), SE3.from_matrix(matrices))
-
-
-def _distance_from_rotation(matrices: Array) -> Array:
-    gram = np.einsum("nij,nkj->nik", matrices, matrices)
-    skewed = np.abs(gram - np.eye(3)).max((1, 2))
-    return np.where(np.linalg.det(matrices) > 0.0, skewed, np.inf)

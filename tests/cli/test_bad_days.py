@@ -11,7 +11,7 @@ from examples.studies.file_faults import FILE_FAULTS, damaged_copy
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.runs.files import whole
-from rbpf.runs.recordings import RobotRecording, filter_images, filter_pairs, filter_recording
+from rbpf.runs.recordings import RobotRecording, filter_opened, filter_recording, open_mono, open_pairs
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.systems.mono.config import MonoConfig
@@ -87,8 +87,8 @@ def test_no_room_for_checkpoints(desk, tmp_path):
     mono, stereo = MonoConfig(particles=8, checkpoint_every=5), StereoConfig(particles=20, checkpoint_every=5)
     robot = RangeBearingConfig(particles=5, checkpoint_every=5)
     runs = {
-        "mono": lambda: filter_images(open_images(desk), mono, checkpoint=place),
-        "stereo": lambda: filter_pairs(open_stereo(desk), stereo, checkpoint=place),
+        "mono": lambda: filter_opened(open_mono(open_images(desk), mono), checkpoint=place),
+        "stereo": lambda: filter_opened(open_pairs(open_stereo(desk), stereo), checkpoint=place),
         "range-bearing": lambda: filter_recording(RobotRecording(tmp_path / "log"), robot, place.parent),
     }
     for run in runs.values():

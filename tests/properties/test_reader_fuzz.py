@@ -14,7 +14,7 @@ from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_f
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log, read_measurements, write_measurements
-from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
+from rbpf.runs.trajectory import Trajectory, read_tum, write_tum
 from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, read_known_points, text
 from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
@@ -100,7 +100,6 @@ def bag(name: str) -> tuple[Callable[[Path], object], Read, str]:
 
 def results(folder: Path) -> None:
     write_tum(folder / "path.tum", Trajectory(np.arange(3) * 10**8, POSES))
-    (folder / "path.kitti").write_text("".join(folders.matrix_row(pose) for pose in POSES))
     (folder / "known_points.csv").write_text(KNOWN)
 
 
@@ -132,7 +131,6 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "wheel odometry": (lambda f: small.write(f, small.WHEELS), read_wheel_odometry, "odometry.*"),
     "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),
     "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
-    "path of KITTI": (results, lambda f: read_kitti(f / "path.kitti"), "path.kitti"),
     "features": (features, read_feature_log, "observations*.csv"),
     "measurements": (lambda f: write_measurements(f, world(2, "position")), read_measurements, "*.csv"),
 }

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_robot_log as run
+from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
@@ -19,7 +19,7 @@ def mean_scores(path, seeds, *settings):
     for seed in range(seeds):
         config = load_settings(RangeBearingConfig, "range-bearing", None, settings, {"seed": seed})
         log = open_log(path, config.noise)
-        finished = run(log, config)
+        finished = filter_opened(open_robot_log(log, config))
         found = score_estimate(PathAndMap.of_run(finished), finished.truth, config.association == "ml")
         names = "path_rmse_m", "ate_rmse_m", "landmark_error_mean_m", "landmark_error_aligned_mean_m"
         rows.append([found.get(name, np.nan) for name in names])
@@ -69,6 +69,7 @@ def test_robot_with_motion_capture(data_dir):
 
 def test_victoria_park_runs_through(data_dir):
     log = open_log(data_dir / "victoria_park")
-    finished = run(log, load_settings(RangeBearingConfig, "range-bearing", None, ["particles=20", "map=particles"], {}))
+    config = load_settings(RangeBearingConfig, "range-bearing", None, ["particles=20", "map=particles"], {})
+    finished = filter_opened(open_robot_log(log, config))
     assert np.isfinite(finished.log.poses).all()
     assert len(finished.system.filter.belief().map.ids) == 151

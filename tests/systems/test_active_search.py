@@ -8,7 +8,7 @@ import pytest
 from examples.studies.image_faults import cover_view
 from rbpf.core.models import Part
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
@@ -149,7 +149,7 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     worst = {}
     credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0))
     for name, config, seeds in (("credulous", credulous, (2,)), ("usual", MonoConfig(), (1, 2))):
-        runs = [filter_images(damaged, replace(config, seed=seed), known) for seed in seeds]
+        runs = [filter_opened(open_mono(damaged, replace(config, seed=seed), known)) for seed in seeds]
         stamps = recording.stamps_ns
         paths = [Trajectory(stamps, poses) for poses in (*(run.log.poses for run in runs), runs[0].truth.poses)]
         worst[name] = max(ate(path, paths[-1]).rmse for path in paths[:-1])
@@ -158,7 +158,7 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
 
 
 def test_what_is_often_missed_only_updates_the_map():
-    run = filter_images(sequence(8), SMALL, known_points())
+    run = filter_opened(open_mono(sequence(8), SMALL, known_points()))
     sensor, belief, used = run.system.sensor, run.system.filter.belief(), run.system.measurement.used
     untrusted = [row for row in used.landmarks.tolist() if sensor.table.member[row] < 0][:3]
     assert len(untrusted) == 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE2
-from rbpf.runs.recordings import filter_robot_log, part_of_log
+from rbpf.runs.recordings import filter_opened, open_robot_log, part_of_log
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.readers import Frame, Part, RobotLog
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -42,7 +42,7 @@ def blind_turn(seed: int) -> RobotLog:
 def headings(seed: int, config: RangeBearingConfig) -> tuple[np.ndarray, np.ndarray]:
     """Error and σ of the heading (T,) after the turn."""
     log = blind_turn(seed)
-    run = filter_robot_log(log, replace(config, seed=seed))
+    run = filter_opened(open_robot_log(log, replace(config, seed=seed)))
     _, truth = poses_at(SE2, log.truth.stamps_ns, log.truth.poses, run.log.stamps_ns)
     after = run.log.stamps_ns >= BLIND[1]
     return SE2.between(truth, run.log.poses)[after, 0], np.sqrt(run.log.covs[after, 0, 0])
@@ -65,7 +65,7 @@ def test_a_landmark_is_begun_anew_when_its_second_reading_contradicts_the_first(
     z = log.frames[step].z.copy()
     z[names[step].index(name)] += [2.0, 0.5]
     log.frames[step] = replace(log.frames[step], z=z)
-    run = filter_robot_log(replace(log, misread=True), RangeBearingConfig())
+    run = filter_opened(open_robot_log(replace(log, misread=True), RangeBearingConfig()))
     found = run.system.map()
     error = found.mean[found.ids == name][0] - run.truth.landmarks[name]
     assert np.linalg.norm(error) < 0.15

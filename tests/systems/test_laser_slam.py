@@ -10,7 +10,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.runs.grid_files import read_grid
+from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Trajectory, read_tum
 from rbpf.sensors.laser import Scan, Scanner
 from rbpf.sensors.readers import read_laser_log
@@ -126,7 +126,7 @@ def test_a_run_leaves_a_map_that_map_server_reads(tmp_path: Path):
     meaning = yaml.safe_load((out / "grid.yaml").read_text())
     # As map_server takes it: the share of black, against two thresholds; the first row is the highest.
     share = (255.0 - image[::-1]) / 255.0
-    grid = read_grid(out)
+    grid = RunFolder.open(out).grid
     np.testing.assert_array_equal(share > meaning["occupied_thresh"], grid.log_odds > 0.0)
     np.testing.assert_array_equal(share < meaning["free_thresh"], grid.log_odds < 0.0)
     assert meaning["image"] == "grid.pgm" and meaning["resolution"] == grid.cell_m == 0.05

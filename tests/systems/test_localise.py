@@ -8,7 +8,7 @@ import pytest
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence, Source
 from rbpf.systems.mono.config import MonoConfig
@@ -35,13 +35,13 @@ def from_frame(whole: ImageSequence, first: int) -> ImageSequence:
 
 @pytest.fixture(scope="module")
 def mapped() -> KnownMap:
-    run = filter_images(sequence(MAPPED), MonoConfig(particles=20), known_points())
+    run = filter_opened(open_mono(sequence(MAPPED), MonoConfig(particles=20), known_points()))
     return run.system.export_map(run.log.poses)
 
 
 @pytest.fixture(scope="module")
 def localised(mapped):
-    return filter_images(from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20), known_map=mapped)
+    return filter_opened(open_mono(from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20), known_map=mapped))
 
 
 def test_the_map_is_that_of_the_run(mapped):
@@ -79,7 +79,7 @@ def test_uncertain_points_make_an_uncertain_pose(mapped):
     vague = replace(mapped, cov=mapped.cov + 0.03**2 * np.eye(3))
     stds = []
     for known in (mapped, vague):
-        run = filter_images(few, MonoConfig(particles=20), known_map=known)
+        run = filter_opened(open_mono(few, MonoConfig(particles=20), known_map=known))
         assert not run.log.lost()[-1]
         stds.append(np.sqrt(np.trace(run.log.covs[-1, 3:, 3:])))
     assert stds[1] > 1.5 * stds[0]
@@ -89,7 +89,7 @@ def test_uncertain_points_make_an_uncertain_pose(mapped):
 def test_a_camera_that_sees_something_else_is_lost_and_says_how_little_it_knows(mapped):
     blank = from_frame(sequence(MAPPED + 4, lambda _t, image: image // 4 + 100), MAPPED)
     other = replace(mapped, windows=np.random.default_rng(1).integers(0, 256, mapped.windows.shape, dtype=np.uint8))
-    run = filter_images(blank, MonoConfig(particles=20), known_map=other)
+    run = filter_opened(open_mono(blank, MonoConfig(particles=20), known_map=other))
     assert run.log.lost().all()
     assert np.sqrt(run.log.covs[:, 3:, 3:].diagonal(axis1=1, axis2=2)).min() >= mapped.size_m
 
@@ -103,8 +103,8 @@ def test_a_resumed_run_has_the_same_bytes(localised, mapped, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        filter_images(whole, config, None, [stop], checkpoint, known_map=mapped)
-    run = filter_images(whole, config, None, (), checkpoint, resume=True, known_map=mapped)
+        filter_opened(open_mono(whole, config, known_map=mapped), [stop], checkpoint)
+    run = filter_opened(open_mono(whole, config, known_map=mapped), checkpoint=checkpoint, resume=True)
     np.testing.assert_array_equal(run.log.poses, localised.log.poses)
     np.testing.assert_array_equal(run.log.covs, localised.log.covs)
 
@@ -156,7 +156,7 @@ def test_no_map_too_small_a_map_and_another_camera(tmp_path, mapped):
         read_known_map(tmp_path)
     wide = replace(mapped, camera=Pinhole(320, 240, 180.0, 180.0, 159.5, 119.5))
     with pytest.raises(InputError, match="the map was made with images of 320x240"):
-        filter_images(sequence(3), MonoConfig(particles=5), known_map=wide)
+        filter_opened(open_mono(sequence(3), MonoConfig(particles=5), known_map=wide))
     words = "made through a lens with equidistant distortion, .* has radial-tangential distortion"
     with pytest.raises(InputError, match=words):
-        filter_images(sequence(3), MonoConfig(particles=5), known_map=replace(mapped, camera=FISHEYE))
+        filter_opened(open_mono(sequence(3), MonoConfig(particles=5), known_map=replace(mapped, camera=FISHEYE)))

@@ -9,7 +9,7 @@ from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.frame_log import FrameLog
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.mono.active_search import MotionFit, OutlierGate, RobustMotionGate
@@ -37,7 +37,7 @@ def tracked_all(slam: MonoSlam, frames: list) -> list[Tracked]:
 
 def test_images_from_anywhere_give_the_bytes_of_a_run_over_a_recording():
     """Though a driver writes all of them into the same memory."""
-    run = filter_images(sequence(10), CONFIG)
+    run = filter_opened(open_mono(sequence(10), CONFIG))
     slam, buffer = MonoSlam(CAMERA, CONFIG), np.empty_like(DARK)
     log = FrameLog.of(slam)
     for frame in images(10):
@@ -99,7 +99,7 @@ def test_memory_is_that_of_the_map(start):
 
 
 def test_a_lag_keeps_the_last_frames_and_changes_no_estimate():
-    whole, last = (filter_images(sequence(12), replace(CONFIG, lag=lag)) for lag in (None, 5))
+    whole, last = (filter_opened(open_mono(sequence(12), replace(CONFIG, lag=lag))) for lag in (None, 5))
     np.testing.assert_array_equal(last.log.poses, whole.log.poses)
     assert whole.system.particle_paths().shape == (12, 5, 7)
     np.testing.assert_array_equal(last.system.particle_paths(), whole.system.particle_paths()[-5:])

@@ -12,7 +12,7 @@ from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.sensors.camera.resection import GATE, Resected, squared_distances
 from rbpf.systems.mono.config import MonoConfig
@@ -54,7 +54,7 @@ def tracked(tmp_path_factory):
         if len(run.log) == START:
             (folder / "latest.npz").rename(folder / "start.npz")
 
-    run = filter_images(sequence(FRAMES), CONFIG, known_points(), [keep], folder / "latest.npz")
+    run = filter_opened(open_mono(sequence(FRAMES), CONFIG, known_points()), [keep], folder / "latest.npz")
     return Tracked(run, folder / "start.npz")
 
 
@@ -63,7 +63,7 @@ def resumed(tracked, tmp_path, change):
     copy = tmp_path / "start.npz"
     copy.write_bytes(tracked.checkpoint.read_bytes())
     config = replace(CONFIG, checkpoint_every=10 * FRAMES)
-    return filter_images(sequence(FRAMES, change), config, known_points(), (), copy, resume=True)
+    return filter_opened(open_mono(sequence(FRAMES, change), config, known_points()), checkpoint=copy, resume=True)
 
 
 def errors(run):

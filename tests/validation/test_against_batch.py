@@ -11,8 +11,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_run, write_trajectory
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.runs.recordings import filter_features
-from rbpf.runs.recordings import filter_robot_log as run
+from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -36,7 +35,7 @@ from tests.validation.linear_worlds import linear_log
 
 @pytest.fixture(scope="module")
 def linear_run():
-    return run(linear_log(), RangeBearingConfig(particles=2000, anchor_every=0))
+    return filter_opened(open_robot_log(linear_log(), RangeBearingConfig(particles=2000, anchor_every=0)))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from rbpf.lie import SE3
 from rbpf.runs import plots
 from rbpf.runs.folder import write_map, write_run, write_trajectory
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.runs.results import load
 from rbpf.runs.trajectory import Similarity, read_tum, write_tum
 from rbpf.runs.truth import RunTruth, write_truth
@@ -28,7 +28,7 @@ AWAY = Similarity(2.5, SE3.rotation(SE3.exp(np.array([[0.4, -0.7, 1.1, 0, 0, 0]]
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gauge") / "run"
     log = simulated_log(RobotWorld(steps=30, landmarks=30, spatial=True), 0)
-    write_run(filter_robot_log(log, RangeBearingConfig(particles=60)), folder, {"recording": "here"})
+    write_run(filter_opened(open_robot_log(log, RangeBearingConfig(particles=60))), folder, {"recording": "here"})
     return folder
 
 

@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 
 from examples.studies.joint_ekf import joint_ekf
 from rbpf.lie import SE2
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.gtsam import path_sampling
@@ -32,7 +32,7 @@ def log_normal(e, cov):
 @pytest.fixture(scope="module")
 def linear():
     """Positions measured by a robot whose heading has no noise at all."""
-    done = filter_robot_log(linear_log(), RangeBearingConfig(particles=2))
+    done = filter_opened(open_robot_log(linear_log(), RangeBearingConfig(particles=2)))
     m = done.system.measurements("linear", done.log)
     covs = m.covs.copy()
     covs[:, 0] = covs[:, :, 0] = 0.0

@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.runs.plots import Views
-from rbpf.runs.recordings import filter_pairs
+from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.runs.run import Run
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
@@ -23,7 +23,7 @@ def sequence():
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    return filter_pairs(sequence(), CONFIG)
+    return filter_opened(open_pairs(sequence(), CONFIG))
 
 
 def test_what_each_feature_was(run):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.runs.folder import remarks
-from rbpf.runs.recordings import filter_pairs
+from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 from rbpf.systems.stereo.config import StereoConfig
@@ -36,7 +36,7 @@ class Repeated(Source):
 def run_over(pair, count=4):
     stamps = np.arange(count) * 100_000_000
     sequence = ImageSequence("pair", CAMERA, stamps, None, 0.12, Repeated(pair, count))
-    return filter_pairs(sequence, StereoConfig(particles=8))
+    return filter_opened(open_pairs(sequence, StereoConfig(particles=8)))
 
 
 @pytest.mark.parametrize("pair", USELESS.values(), ids=USELESS)

@@ -23,7 +23,7 @@ import numpy as np
 from rbpf.core.likelihoods import Gaussian
 from rbpf.errors import InputError
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import RobotRecording, filter_features, filter_recording, filter_robot_log
+from rbpf.runs.recordings import RobotRecording, filter_features, filter_opened, filter_recording, open_robot_log
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import Part, RobotLog
@@ -250,7 +250,7 @@ def _filtered(config: RangeBearingConfig, data: Data) -> Run[RangeBearingSlam]:
     if config.noise.given():
         raise InputError("a log that was read already has its noise: give the recording's path to change it")
     if isinstance(data, RobotLog):
-        return filter_robot_log(data, config)
+        return filter_opened(open_robot_log(data, config))
     raise _no_filter(config, data)
 
 

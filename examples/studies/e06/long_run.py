@@ -10,7 +10,7 @@ from examples.studies.e06.setting import Row, Setting, true_poses
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import Tracked
@@ -40,7 +40,7 @@ def reproduce(setting: Setting) -> list[Row]:
     def note(run: Run, _: Tracked) -> None:
         clock.append(time.process_time())
 
-    run = filter_images(sequence, setting.config(), known, [note])
+    run = filter_opened(open_mono(sequence, setting.config(), known), [note])
     mapped = run.system.map()
     cpu = np.diff(clock, prepend=clock[0])
     save_figures({"figure_6.png": _draw(run, mapped, true_poses(sequence), cpu)}, setting.out)

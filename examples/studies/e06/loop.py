@@ -9,7 +9,7 @@ from examples.studies.e06.new_landmarks import round_a_desk
 from examples.studies.e06.setting import Row, Setting, true_poses
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
 
@@ -66,7 +66,7 @@ def started_until(frames: list[dict[str, np.ndarray]], until: int) -> int:
 def reproduce(setting: Setting) -> list[Row]:
     """Filters the loop."""
     sequence, known = round_a_desk(setting)
-    run = filter_images(sequence, setting.config(), known)
+    run = filter_opened(open_mono(sequence, setting.config(), known))
     mapped = run.system.map()
     first = started_until(run.log.all_observed(), START)
     closure = find_closure(run.log.all_observed(), first)

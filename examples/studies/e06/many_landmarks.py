@@ -11,7 +11,7 @@ from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.runs.plots import label, save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.system import Tracked
@@ -85,7 +85,7 @@ def measure_times(setting: Setting, sizes: tuple[int, ...], rounds: int) -> np.n
     found: dict[int, list[list[float]]] = {size: [] for size in sizes}
     for turn in range(rounds):
         watch = _Watch(sizes, np.random.default_rng(turn))
-        filter_images(sequence, setting.config(), known, [watch])
+        filter_opened(open_mono(sequence, setting.config(), known), [watch])
         for size, seconds in watch.seconds.items():
             found[size] += seconds
     return np.array([np.median(found[size], axis=0) for size in sizes])

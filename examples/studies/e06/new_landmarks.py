@@ -10,7 +10,7 @@ from examples.studies.e06.setting import Row, Setting
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, label, outline, save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.sensors.readers import ImageSequence, KnownPixels
 from rbpf.systems.map_estimate import MapEstimate
@@ -76,7 +76,7 @@ def reproduce(setting: Setting) -> list[Row]:
         path = run.log.poses[: t + 1].copy()
         best[:] = [Shown(t, frame.image, observation, lines, run.system.map(), path)]
 
-    run = filter_images(sequence, setting.config(), known, [watch])
+    run = filter_opened(open_mono(sequence, setting.config(), known), [watch])
     (shown,) = best
     figures = {"figure_7.png": _draw_map(shown), "figure_8.png": _draw_image(shown, run)}
     save_figures(figures, setting.out)

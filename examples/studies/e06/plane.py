@@ -10,7 +10,7 @@ from examples.studies.e06.worlds import flat_desk
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
 
@@ -71,7 +71,7 @@ def reproduce(setting: Setting) -> list[Row]:
     """Filters 20 s over a flat desk."""
     frames = 90 if setting.quick else 600
     sequence, known = setting.sequence("flat_desk", flat_desk(frames, 0.002 if setting.quick else 0.001))
-    run = filter_images(sequence, setting.config(), known)
+    run = filter_opened(open_mono(sequence, setting.config(), known))
     mapped = run.system.map()
     full = unknown_points(run, mapped)
     plane = fit_plane(mapped.mean[full])

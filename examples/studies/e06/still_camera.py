@@ -9,7 +9,7 @@ from examples.studies.e06.worlds import StillTarget
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.slam import world_of
 from rbpf.validation.consistency.statistic import whitened_errors
@@ -52,7 +52,7 @@ def reproduce(setting: Setting) -> list[Row]:
     for treatment in TREATMENTS:
         ray = InverseDepthConfig(pose_update=treatment, promote_std_ratio=NEVER)  # type: ignore[arg-type]
         config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray)
-        run = filter_images(sequence, config, known)
+        run = filter_opened(open_mono(sequence, config, known))
         errors = whitened_errors(SE3, run.log.poses[-1:], run.log.covs[-1:], truth)
         pose, position = (np.sqrt(np.linalg.det(part)) for part in (run.log.covs[-1], run.log.covs[-1, 3:, 3:]))
         cloud = camera_cloud(run.system.filter, np.random.default_rng(setting.seed))
