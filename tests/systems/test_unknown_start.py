@@ -8,7 +8,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import velocity_walk
 from rbpf.runs.recordings import filter_features as run
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
@@ -35,14 +35,14 @@ def of_plane(done: Run) -> float:
 @pytest.fixture(scope="module")
 def plane() -> Run:
     """A textured wall that leans away: flat, so that two shapes and two motions look alike at first."""
-    return filter_images(sequence(60), SMALL)
+    return filter_opened(open_mono(sequence(60), SMALL))
 
 
 @pytest.mark.slow
 def test_a_flat_scene_is_not_bent(plane):
     assert plane.system.start.over
     resampled, bent = (
-        np.mean([of_plane(filter_images(sequence(60), replace(config, seed=seed))) for seed in (1, 2)])
+        np.mean([of_plane(filter_opened(open_mono(sequence(60), replace(config, seed=seed)))) for seed in (1, 2)])
         for config in (SMALL, NEVER)
     )
     assert resampled < 0.5 * bent and resampled < 0.012
@@ -120,7 +120,7 @@ def test_nothing_is_resampled_when_frames_have_too_little_in_common():
 
 def test_a_camera_that_was_lost_is_not_adjusted_any_more(adjusted):
     """Black images after the fourth: the start is over when it is lost, and what was kept for it is gone."""
-    done = filter_images(sequence(20, lambda t, image: np.zeros_like(image) if 4 <= t < 8 else image), SMALL)
+    done = filter_opened(open_mono(sequence(20, lambda t, image: np.zeros_like(image) if 4 <= t < 8 else image), SMALL))
     assert done.log.lost()[6] and done.system.start.over and not adjusted
     assert not any(name.startswith("start/frames") for name in done.system.arrays())
 
@@ -134,15 +134,15 @@ def test_a_start_that_shows_nothing_at_first_begins_later(resampled):
     assert np.isfinite(run(blank, SMALL).log.poses).all() and resampled
     resampled.clear()
     ramp = np.tile(np.linspace(60, 200, 320).astype(np.uint8), (240, 1))
-    done = filter_images(sequence(24, lambda t, image: ramp if t < 8 else image), SMALL)
+    done = filter_opened(open_mono(sequence(24, lambda t, image: ramp if t < 8 else image), SMALL))
     assert done.failure is None and np.isfinite(done.log.poses).all() and resampled
     resampled.clear()
-    done = filter_images(sequence(24, lambda t, image: np.zeros_like(image) if 0 < t < 5 else image), SMALL)
+    done = filter_opened(open_mono(sequence(24, lambda t, image: np.zeros_like(image) if 0 < t < 5 else image), SMALL))
     assert done.failure is None
 
 
 def test_a_frame_without_an_image_is_not_what_is_resampled_after(resampled):
-    done = filter_images(sequence(12, lambda t, image: None if t == 5 else image), SMALL)
+    done = filter_opened(open_mono(sequence(12, lambda t, image: None if t == 5 else image), SMALL))
     assert resampled[0] == 7 and done.failure is None
 
 

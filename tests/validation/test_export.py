@@ -13,7 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_run
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.runs.results import load
 from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.camera import Pinhole
@@ -165,7 +165,7 @@ def test_names_that_are_no_text_reach_rerun_in_part(tmp_path):
 def run(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     log = simulated_log(RobotWorld(steps=20, spatial=request.param == "spatial"), 0)
-    write_run(filter_robot_log(log, RangeBearingConfig(particles=20)), folder, {"recording": "here"})
+    write_run(filter_opened(open_robot_log(log, RangeBearingConfig(particles=20))), folder, {"recording": "here"})
     return folder
 
 
