@@ -166,16 +166,8 @@ def _render(world: "ImageWorld", options: RenderOptions) -> None:
     centre = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
     camera = Pinhole(options.width, options.height, focal, focal, *centre, lens, model)
     first, count = options.blackout or (0, 0)
-    imaging = Imaging(
-        noise_std=options.noise_std,
-        exposure_drift=options.exposure_drift,
-        blur_s=options.blur_s,
-        vignetting=options.vignetting,
-        blackout=range(first, first + count),
-        depth=options.depth,
-        known=options.known,
-        jpeg=options.jpeg,
-    )
+    same = "noise_std", "exposure_drift", "blur_s", "vignetting", "depth", "known", "jpeg"
+    imaging = Imaging(blackout=range(first, first + count), **{name: getattr(options, name) for name in same})
     with progress() as bar:
         simulate_images(world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m)
     size = sum(path.stat().st_size for path in options.out.rglob("*") if path.is_file()) / 1e6
