@@ -93,7 +93,8 @@ class Scene:
         """The same with more axes in front of one part."""
         name = {Part.STATE: "state", Part.LANDMARK: "landmark"}.get(part, "substate")
         array = getattr(self, name)
-        return self if array is None else replace(self, **{name: np.broadcast_to(array, (*shape, *array.shape))})
+        more: dict[str, Any] = {} if array is None else {name: np.broadcast_to(array, (*shape, *array.shape))}
+        return replace(self, **more)
 
     def lanes(self) -> "Scene":
         """All pairs of a particle and a landmark side by side, (N·K, …)."""

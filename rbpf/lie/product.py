@@ -51,8 +51,11 @@ class Euclidean(LieGroup):
     def adjoint(self, a: States) -> TangentMatrix:
         return np.broadcast_to(np.eye(self.dim), (*np.shape(a)[:-1], self.dim, self.dim)).copy()
 
-    # Storage and tangent are the same, and the group is commutative.
-    left_jacobian = left_jacobian_inverse = rotation = adjoint
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
+        return self.adjoint(xi)
+
+    left_jacobian_inverse = left_jacobian
+    rotation = adjoint
 
     def inverse_transform(self, a: States, p: States) -> StateArray:
         """Points p seen from a: the group is that of translations."""
