@@ -18,7 +18,7 @@ from examples.studies.consistency_runs import Mean
 from examples.studies.joint_map import JOINT, PARTICLES, RECORDINGS, loops
 from rbpf.lie import SE2
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.runs.run import Run
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers import Frame, RobotLog, Truth, open_log
@@ -120,7 +120,7 @@ def in_world(world: RobotWorld, runs: int) -> list[list[str | int | float]]:
         found = []
         for seed in range(runs):
             log = simulated_log(world, seed)
-            run = filter_robot_log(log, replace(config, seed=seed))
+            run = filter_opened(open_robot_log(log, replace(config, seed=seed)))
             assert log.truth is not None
             truth = truth_at(log.space, log.truth, run.log.stamps_ns, "first frame")
             assert truth is not None
@@ -143,7 +143,7 @@ def recorded(folder: Path, recordings: Sequence[str], seeds: int) -> list[list[s
         for name, config in FILTERS.items():
             found = []
             for seed in range(seeds):
-                run = filter_robot_log(log, replace(config, seed=seed))
+                run = filter_opened(open_robot_log(log, replace(config, seed=seed)))
                 scores = score_estimate(PathAndMap.of_run(run), run.truth, config.association == "ml")
                 path = scores["ate_rmse_m" if "mrclam" in recording else "path_rmse_m"]
                 landmarks = run.system.map().ids.size

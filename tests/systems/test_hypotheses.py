@@ -8,7 +8,7 @@ import pytest
 from examples.studies.hypotheses import come_back, corridor
 from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.systems.range_bearing.config import AssociationConfig, RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
@@ -27,8 +27,8 @@ def test_of_two_equal_doors_the_right_one_is_found_and_none_is_given_up_before()
 
 def test_where_nothing_is_ambiguous_it_is_the_run_that_knows_the_names():
     log = simulated_log(RobotWorld(steps=20, landmarks=12, std_translation_m=0.01), 1)
-    unnamed = filter_robot_log(log, CONFIG)
-    named = filter_robot_log(log, replace(CONFIG, association="known"))
+    unnamed = filter_opened(open_robot_log(log, CONFIG))
+    named = filter_opened(open_robot_log(log, replace(CONFIG, association="known")))
     assert isinstance(unnamed.system, RangeBearingSlam)
     pairs = {(a, b) for f, ids in zip(log.frames, unnamed.system.associations(), strict=True)
              for a, b in zip(f.landmarks.tolist(), ids.tolist(), strict=True)}  # fmt: skip
