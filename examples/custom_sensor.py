@@ -70,8 +70,7 @@ def main() -> dict[str, float]:
     for frame in frames[1:]:
         by_odometry.append(SE2.compose(by_odometry[-1], frame.control.delta))
     estimates = np.array([report.estimate.mean for report in reports])
-    belief = filter_.belief()
-    points = np.einsum("n,nkd->kd", belief.weights, belief.read(lamp_map.ids).mean)
+    points, _ = filter_.belief().moments(lamp_map.ids)
     used = [report for report in reports if report.rows]
     figures = {
         "findings": len(findings),

@@ -6,9 +6,19 @@ one Gaussian with the frame of the last few steps. For 25 s there is no fix.
 """
 
 import numpy as np
-from gps_fix import Position
 
-from rbpf import SE2, Consolidation, Filter, JointMap, MotionModel, Observations, Sensor, Transition
+from rbpf import (
+    SE2,
+    Consolidation,
+    Filter,
+    JointMap,
+    MotionModel,
+    ObservationModel,
+    Observations,
+    Part,
+    Sensor,
+    Transition,
+)
 
 RATE, SECONDS, OUTAGE = 50, 120, range(60, 85)
 STD_TICK = np.array([0.002, 0.01, 0.002])  # of an increment: turn [rad], forward [m], to the left [m]
@@ -39,11 +49,23 @@ class Driven(MotionModel):
         return Transition(SE2.compose(state, whole), noise[None], by_bias[None], np.eye(1)[None], np.zeros((1, 1)))
 
 
+class Position(ObservationModel):
+    """z = (x, y) of the robot [m]; reads the sampled state and nothing else."""
+
+    dim = 2
+    reads = frozenset({Part.STATE})
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return SE2.translation(state)
+
+
 class Receiver(Sensor):
-    """A frame is a fix (2,), or None."""
+    """A frame is a fix (2,), or None where there is none."""
 
     def observe(self, frame, belief):
-        return [] if frame is None else [Observations(frame[None], STD_FIX**2 * np.eye(2)[None], Position())]
+        if frame is None:
+            return []
+        return [Observations(frame[None], STD_FIX**2 * np.eye(2)[None], Position())]
 
 
 def simulate(rng: np.random.Generator) -> list[tuple[np.ndarray, float, np.ndarray | None, np.ndarray | None]]:
@@ -69,9 +91,9 @@ def track(world: list, seed: int) -> tuple[np.ndarray, np.ndarray, Filter]:
     filter_ = Filter(Driven(), Receiver(), held, rng=rng, lag=1, consolidation=window)
     for pose, _, ticks, fix in world:
         filter_.step(fix, None if ticks is None else summed(ticks))
-        estimate = held.estimate(filter_.particles)
-        errors.append(SE2.local(estimate.mean, pose))
-        nees.append(errors[-1] @ np.linalg.pinv(estimate.cov, hermitian=True) @ errors[-1])
+        mean, cov = filter_.belief().moments(Part.STATE)
+        errors.append(SE2.local(mean, pose))
+        nees.append(errors[-1] @ np.linalg.pinv(cov, hermitian=True) @ errors[-1])
     return np.array(errors), np.array(nees), filter_
 
 

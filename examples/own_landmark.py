@@ -98,8 +98,7 @@ def main() -> dict[str, float]:
         ready = point_map.ready(filter_.particles.weights)
         point_map.promote(ready)
         located += ready.tolist()
-    belief = filter_.belief()
-    means = np.einsum("n,nkd->kd", belief.weights, belief.read(located).mean)
+    means, _ = filter_.belief().moments(located)
     distances = np.linalg.norm(means - points[located], axis=1)
     figures = {
         "findings": len(findings),

@@ -30,12 +30,8 @@ def projected(model: ObservationModel, records: Records, belief: Belief) -> tupl
     predicted, within = expected(model, records, belief)
     # Relative to the particle of highest weight, so that angles need not be wrapped.
     mode = predicted[belief.mode]
-    offset = model.residual(predicted, mode)
-    by_particle = belief.weights[:, None, None]
-    mean = (by_particle * offset).sum(axis=0)
-    spread = offset - mean
-    between = spread[..., :, None] * spread[..., None, :]
-    return mode + mean, (by_particle[..., None] * (within + between)).sum(axis=0)
+    mean, cov = gaussian.mixture_moments(belief.weights, model.residual(predicted, mode), within)
+    return mode + mean, cov
 
 
 def checked_new_ids(

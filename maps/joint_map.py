@@ -269,6 +269,23 @@ class JointMap(Map):
         origin, _, mean, cov = self._consolidated(particles)
         return self.old.with_one_more(self._finished(origin, mean, cov)).landmarks()
 
+    def moments(self, particles: Particles, of: Part | np.ndarray = Part.LANDMARK) -> tuple[np.ndarray, np.ndarray]:
+        """As `Belief.moments`; the substate stays in the robot's frame."""
+        if not isinstance(of, Part):
+            names, means, covs = self.landmarks(particles)
+            rows = {name: row for row, name in enumerate(names.tolist())}
+            if missing := [name for name in of.tolist() if name not in rows]:
+                raise InputError(f"the map holds no landmark {missing[0]}")
+            chosen = [rows[name] for name in of.tolist()]
+            return means[chosen], covs[chosen]
+        if of == Part.STATE:
+            pose = self.estimate(particles)
+            return pose.mean, pose.cov
+        if of == Part.SUBSTATE:
+            own = slice(self.space.dim, self._first)
+            return gaussian.mixture_moments(particles.weights, self.mean[:, own], self.cov[own, own][None])
+        return self.landmarks(particles)[1:]
+
     def _finished(self, origin: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> SubMap:
         columns = self._held.of_one_kind(self._held.table.ids).columns
         used = np.append(np.arange(self.space.dim), columns)

@@ -6,6 +6,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
@@ -22,7 +23,7 @@ from rbpf.core.models import (
     Part,
     Records,
 )
-from rbpf.core.particles import Information, Prior
+from rbpf.core.particles import Information, Particles, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import gather, project
 from rbpf.lie import LieGroup
@@ -144,6 +145,20 @@ class LandmarkMap(Map):
         const = np.empty((n, k, landmark.constants))
         gather(access.pool, access.slabs, access.which, maps, mean, cov, const)
         return Records(mean, cov, const if landmark.constants else None)
+
+    def moments(self, particles: Particles, of: Part | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `Belief.moments`, of the particles in which a landmark exists; one that exists in none, of all that hold it."""
+        moments = []
+        for landmark_id in (self.ids if isinstance(of, Part) else of).tolist():
+            landmark, records = self.landmark_of(landmark_id), self.read(np.array([landmark_id]))
+            if not isinstance(landmark, Point):
+                records = landmark.promote(records)
+            weights = self.existing(landmark_id, particles.weights)
+            if not weights.any():
+                weights = particles.weights * np.isfinite(self.log_odds(np.array([landmark_id]))[:, 0])
+            moments.append(gaussian.mixture_moments(weights / weights.sum(), records.mean[:, 0], records.cov[:, 0]))
+        means, covs = zip(*moments, strict=True) if moments else ((), ())
+        return np.array(means), np.array(covs)
 
     def innovations(
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int

@@ -33,6 +33,20 @@ def symmetrise(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch 
     return 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 
+def mixture_moments(
+    weights: Float[np.ndarray, "N ..."], mean: Float[np.ndarray, "N ... D"], cov: Float[np.ndarray, "#N ... D D"]
+) -> tuple[Float[np.ndarray, "... D"], Float[np.ndarray, "... D D"]]:
+    """Mean (…, D) and covariance (…, D, D), within + between, of mixtures of Gaussians along the first axis.
+
+    Weights (N, …) that sum to one, or (N,) for all alike.
+    """
+    weights = weights.reshape(*weights.shape, *(1,) * (mean.ndim - weights.ndim))
+    centre = (weights * mean).sum(axis=0)
+    spread = mean - centre
+    between = spread[..., :, None] * spread[..., None, :]
+    return centre, symmetrise((weights[..., None] * (cov + between)).sum(axis=0))
+
+
 def pack(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch packed"]:
     """Lower triangle row by row, c00 c10 c11 c20 c21 c22 ..., (..., n, n) -> (..., n (n + 1) / 2)."""
     cov = np.asarray(cov, dtype=float)

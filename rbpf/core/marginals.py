@@ -13,7 +13,7 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import EVERYTHING, information, linearise, stacked
 from rbpf.core.models import NEW, NULL, Belief, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
-from rbpf.core.particles import Information, Particles, Prior, take
+from rbpf.core.particles import Information, Particles, Prior, mixture_estimate, take
 from rbpf.errors import InputError
 from rbpf.kernels.increment import conditioned
 from rbpf.lie import LieGroup
@@ -68,6 +68,10 @@ class StateOnly(Conditional):
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Nothing is stored."""
+
+    def moments(self, particles: Particles, of: Part | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        estimate = mixture_estimate(Prior.exactly(self.space, particles.state), None, particles.log_weights)
+        return estimate.mean, estimate.cov
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {}
@@ -205,6 +209,9 @@ class KalmanSubstate(Conditional):
         self._predicted = self._predicted[ancestors]
         self._gain = take(self._gain, ancestors)
         self._rest = take(self._rest, ancestors)
+
+    def moments(self, particles: Particles, of: Part | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return gaussian.mixture_moments(particles.weights, self.mean, self.cov)
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"substate/mean": self.mean, "substate/cov": self.cov}

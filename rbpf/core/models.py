@@ -335,11 +335,8 @@ class Landmark(ABC):
         mean, cov = gaussian.unscented_transform(at, records.mean, records.cov)
         if records.log_weights is None:
             return Records(mean, cov)
-        weights = np.exp(records.log_weights)[..., None]
-        centre = (weights * mean).sum(axis=2)
-        spread = mean - centre[:, :, None]
-        total = (weights[..., None] * (cov + spread[..., :, None] * spread[..., None, :])).sum(axis=2)
-        return Records(centre, total)
+        by_component = (np.moveaxis(array, 2, 0) for array in (np.exp(records.log_weights), mean, cov))
+        return Records(*gaussian.mixture_moments(*by_component))
 
     def _dehomogenised(self, mean: np.ndarray, const: np.ndarray | None) -> np.ndarray:
         world = self.homogeneous(mean, const)
@@ -493,6 +490,10 @@ class Conditional(ABC):
         """
         raise InputError(f"{type(self).__name__} cannot take in what the particles differ by: resample them")
 
+    def moments(self, particles: Particles, of: Part | Ids) -> tuple[np.ndarray, np.ndarray]:
+        """See `Belief.moments`; of a part that it supplies, or of landmarks. Raises InputError: it does not say."""
+        raise InputError(f"{type(self).__name__} does not say mean and covariance of {of}: override moments")
+
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that a checkpoint must hold."""
@@ -584,6 +585,10 @@ class Map(Conditional):
     def set_log_odds(self, ids: Ids, log_odds: Float[np.ndarray, "N K"]) -> None:
         """Overwrites log-odds (N, K), if the map keeps some; a landmark at −inf in every particle is removed."""
 
+    def existing(self, landmark_id: int, weights: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+        """The weights (N,), zero in the particles in which a landmark is not more probably there than not."""
+        return weights * (self.log_odds(np.array([landmark_id]))[:, 0] > 0.0) if self.evidence else weights
+
     @abstractmethod
     def innovations(
         self, model: ObservationModel, z: Z, ids: Ids, state: Float[np.ndarray, " E"], particle: int
@@ -638,6 +643,21 @@ class Belief:
     def read(self, ids: Sequence[int] | Ids, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)
+
+    def moments(self, of: Part | Sequence[int] | Ids) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and covariance over all particles, within + between, of what is named.
+
+        Landmarks (K,) of any kind, mixtures too, are points in the world, (K, D) and (K, D, D), in the order named; a map's
+        part is all of them. A substate is (m,) and (m, m); `Part.STATE` (E,) and (d, d), in the world. Raises InputError: a
+        landmark or part is not held, or a part of the user's own does not override `Conditional.moments`.
+        """
+        particles = Particles(self.state, self.log_weights)
+        if not isinstance(of, Part):
+            return self.map.moments(particles, np.asarray(of, dtype=np.int64))
+        holders = [part for part in self.parts.values() if of == part.supplies or of in part.also]
+        if not holders:
+            raise InputError(f"this filter does not hold a {of}")
+        return holders[-1].moments(particles, of)
 
     def read_mode(self, ids: Sequence[int] | Ids) -> Records:
         """Estimates (1, K, …) in the particle of highest weight alone."""

@@ -47,40 +47,23 @@ class MapEstimate:
 
 
 def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstimate:
-    """Mixture moments of every landmark that exists in most of the weight, relative to the start where it is `anchored`."""
-    belief = filter_.belief()
+    """Moments of every landmark that exists in most of the weight, relative to the start where it is `anchored`."""
+    belief, dim = filter_.belief(), 2 if isinstance(filter_.space, SE2Group) else 3
     landmark_map, weights = belief.map, belief.weights
     if isinstance(landmark_map, JointMap):
         return MapEstimate(*landmark_map.landmarks(filter_.particles))
-    names, means, covs = [], [], []
-    for landmark_id in landmark_map.ids:
-        held = np.ones(weights.size, dtype=bool)
-        if landmark_map.evidence:
-            held = landmark_map.log_odds(np.array([landmark_id]))[:, 0] > 0
-        fraction = (weights * held).sum()
-        if fraction <= 0.5:
-            continue
-        records = landmark_map.read(np.array([landmark_id]))
-        points, within = records.mean[:, 0], records.cov[:, 0]
-        if anchored is not None:
-            points, within = relative_points(filter_.space, anchored, records)
-        own = weights * held / fraction
-        mean, cov = mixture_moments(own, points, within)
-        names.append(int(landmark_id))
-        means.append(mean)
-        covs.append(cov)
-    dim = 2 if isinstance(filter_.space, SE2Group) else 3
-    return MapEstimate(
-        np.array(names, dtype=np.int64), np.array(means).reshape(-1, dim), np.array(covs).reshape(-1, dim, dim)
-    )
-
-
-def mixture_moments(weights: np.ndarray, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (D,) and covariance (D, D) of Gaussians (N, D), (N, D, D) of weights (N,): within + between."""
-    mean = (weights[:, None] * points).sum(axis=0)
-    spread = points - mean
-    between = spread[:, :, None] * spread[:, None, :]
-    return mean, gaussian.symmetrise((weights[:, None, None] * (within + between)).sum(axis=0))
+    ids = landmark_map.ids
+    ids = ids[[landmark_map.existing(landmark_id, weights).sum() > 0.5 for landmark_id in ids.tolist()]]
+    if anchored is None:
+        mean, cov = belief.moments(ids)
+    else:
+        moments = []
+        for row, landmark_id in enumerate(ids.tolist()):
+            held = landmark_map.existing(landmark_id, weights)
+            points = relative_points(filter_.space, anchored, landmark_map.read(ids[row : row + 1]))
+            moments.append(gaussian.mixture_moments(held / held.sum(), *points))
+        mean, cov = (np.array(part) for part in zip(*moments, strict=True)) if moments else np.zeros((2, 0))
+    return MapEstimate(ids, mean.reshape(-1, dim), cov.reshape(-1, dim, dim))
 
 
 def relative_points(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:

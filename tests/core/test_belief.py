@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from rbpf.core.genealogy import Lineage
-from rbpf.core.marginals import Marginals
-from rbpf.core.models import Belief, Records
+from rbpf.core.marginals import KalmanSubstate, Marginals
+from rbpf.core.models import Belief, Part, Records
 from rbpf.core.particles import Prior
+from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import Point
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 
 N, K, DRAWS = 12, 3, 100_000
@@ -101,3 +102,38 @@ def test_innovations_of_every_pair(rng):
         moved = by_state @ belief.prior.factor[i]
         within = by_landmark @ records.cov[i, (2, 0)[m]] @ by_landmark.T
         np.testing.assert_allclose(cov[i, k, m], within + moved @ moved.T + noise[k], atol=1e-12)
+
+
+def test_moments_are_those_of_draws_whatever_is_named(rng):
+    """A point, a ring of Gaussians, a point in an anchor's frame, and a substate."""
+    landmark_map, substate = LandmarkMap(SE2), KalmanSubstate(SE2, np.zeros(2), np.diag([1.0, 4.0]))
+    marginals = Marginals(SE2, [landmark_map, substate])
+    marginals.begin(N, Lineage(N))
+    places, within = rng.normal(size=(N, 1, 2)), np.tile(0.25 * np.eye(2), (N, 1, 1, 1))
+    anchors = np.concatenate([rng.normal(size=(N, 1, 1)), places], axis=-1)
+    circle = ring(places[:, 0], np.array([2.0]), 0.3, 9)
+    landmark_map.add_records(Records(places, within), Point(2))
+    landmark_map.add_records(circle, MixturePoint(9))
+    landmark_map.add_records(Records(np.ones((N, 1, 2)), within, anchors), AnchoredPoint(SE2))
+    substate.mean = rng.normal(size=(N, 2))
+    log_weights = np.log(rng.dirichlet(np.ones(N)))
+    belief = Belief(log_weights, Prior.exactly(SE2, SE2.identity((N,))), marginals.parts)
+
+    i, noise, of = rng.choice(N, DRAWS, p=np.exp(log_weights)), rng.normal(size=(DRAWS, 2)), rng.choice(9, DRAWS)
+    spread = np.linalg.cholesky(circle.cov[i, 0, of])
+    drawn = {
+        2: SE2.transform(anchors[i, 0], 1.0 + 0.5 * noise),
+        0: places[i, 0] + 0.5 * noise,
+        1: circle.mean[i, 0, of] + np.einsum("nab,nb->na", spread, noise),
+        Part.SUBSTATE: substate.mean[i] + noise * [1.0, 2.0],
+    }
+    found = zip(*belief.moments([2, 0, 1]), strict=True)
+    for (mean, cov), draws in zip([*found, belief.moments(Part.SUBSTATE)], drawn.values(), strict=True):
+        scale = np.trace(np.cov(draws.T))
+        np.testing.assert_allclose(mean, draws.mean(axis=0), atol=0.02 * np.sqrt(scale))
+        np.testing.assert_allclose(cov, np.cov(draws.T), atol=0.02 * scale)
+    np.testing.assert_array_equal(belief.moments(Part.LANDMARK)[0], belief.moments([0, 1, 2])[0])
+    np.testing.assert_allclose(belief.moments(Part.STATE)[1], np.zeros((3, 3)), atol=1e-15)
+    for wrong, sentence in (([7], "no landmark 7"), (Part("beacons"), "does not hold a beacons")):
+        with pytest.raises(InputError, match=sentence):
+            belief.moments(wrong)

@@ -79,16 +79,17 @@ BEFORE = {
 PREAMBLE = {
     "docs/how_to/sensor.md": """
 from examples.custom_sensor import LampSensor
-from examples.gps_fix import *
+from examples.gps_imu import *
 from rbpf.core.models import Records
+from rbpf.motion.odometry import OdometryMotion
 
-filter_ = Filter(OdometryMotion(SE2), PositionReceiver(0.5), n=20, rng=np.random.default_rng(0))
+filter_ = Filter(OdometryMotion(SE2), Receiver(), n=20, rng=np.random.default_rng(0))
 fix = np.array([0.1, 0.2])
 filter_.step(fix)
 state = np.zeros((20, 3))
 records = Records(np.tile([3.0, 1.0], (20, 2, 1)), np.tile(0.01 * np.eye(2), (20, 2, 1, 1)))
 """,
-    "docs/how_to/rates.md": "from examples.gps_fix import Position\n",
+    "docs/how_to/rates.md": "from examples.gps_imu import Position\n",
 }
 """Names that a page's programs take from the examples that the page shows."""
 

@@ -178,7 +178,7 @@ def test_what_is_told_of_rays_is_the_gaussian_carried_over():
             start += 6 + 3 * count
         return np.concatenate([SE3.transform(frame, mean[6:15].reshape(-1, 3)), *points]).ravel()
 
-    points, covs = joint.in_world(particles)
+    points, covs = joint.moments(particles)
     np.testing.assert_allclose(points.ravel(), carried(joint.mean[0]), atol=1e-11)
     jac = numeric(carried, joint.mean[0])
     cov = jac @ joint.cov @ jac.T
@@ -212,9 +212,9 @@ def test_consolidation_keeps_the_moments_of_draws():
 
 def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
     joint, particles = rays(1)
-    before, cov, mean = joint.in_world(particles), joint.cov.copy(), joint.mean[0].copy()
+    before, cov, mean = joint.moments(particles), joint.cov.copy(), joint.mean[0].copy()
     joint.promote(np.array([11]))
-    for first, second in zip(before, joint.in_world(particles), strict=True):
+    for first, second in zip(before, joint.moments(particles), strict=True):
         np.testing.assert_allclose(second, first, rtol=1e-9)
     assert joint.are(joint.ids, Point(3)).tolist() == [True] * 3 + [False] * 4 + [False, True]
     # Rows of the point: those of the clone and the ray, by numeric slopes.
@@ -229,7 +229,7 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
     joint.remove(np.array([10, 20]))  # the last ray of the second clone: the clone goes, too
     np.testing.assert_array_equal(joint.ids, [5, 2, 9, 21, 22, 23, 11])
     assert len(joint.clones) == 1 and joint.mean.shape[1] == 6 + 3 * 7 + 6
-    for whole, rest in zip(before, joint.in_world(particles), strict=True):
+    for whole, rest in zip(before, joint.moments(particles), strict=True):
         np.testing.assert_allclose(whole[[0, 1, 2, 4, 5, 6, 8]], rest, rtol=1e-9)
 
 

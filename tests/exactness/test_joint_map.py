@@ -35,7 +35,7 @@ def told(filter_: Filter) -> tuple[np.ndarray, list[np.ndarray]]:
     joint = filter_.belief().map
     assert isinstance(joint, JointMap)
     pose = joint.estimate(filter_.particles)
-    points, covs = joint.in_world(filter_.particles)
+    points, covs = joint.moments(filter_.particles)
     turn = joint.space.rotation(pose.mean)
     dim = joint.point.dim
     return np.concatenate([pose.mean[-dim:], points.ravel()]), [turn @ pose.cov[-dim:, -dim:] @ turn.T, *covs]
@@ -182,7 +182,7 @@ def test_what_is_told_of_the_world_is_the_gaussian_carried_over(space):
         return np.append(space.local(pose.mean, space.compose(frame, state)), points)
 
     pose = joint.estimate(particles)
-    points, covs = joint.in_world(particles)
+    points, covs = joint.moments(particles)
     np.testing.assert_allclose(carried(joint.mean[0]), np.append(np.zeros(d), points), atol=1e-12)
     steps = step * np.eye(joint.mean.shape[1])
     jac = np.array([carried(joint.mean[0] + e) - carried(joint.mean[0] - e) for e in steps]).T / (2 * step)
@@ -197,10 +197,10 @@ def test_what_is_told_of_the_world_is_the_gaussian_carried_over(space):
 @pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
 def test_consolidation_changes_nothing_that_is_told(space, landmarks):
     joint, particles = held(space, 20, landmarks)
-    before = joint.estimate(particles), joint.in_world(particles)
+    before = joint.estimate(particles), joint.moments(particles)
     particles = joint.consolidate(particles)
     assert (particles.state == space.identity()).all() and (joint.mean == joint.mean[0]).all()
-    after = joint.estimate(particles), joint.in_world(particles)
+    after = joint.estimate(particles), joint.moments(particles)
     for first, second in zip(
         (before[0].mean, before[0].cov, *before[1]), (after[0].mean, after[0].cov, *after[1]), strict=True
     ):

@@ -187,6 +187,6 @@ def test_a_bank_of_kalman_filters(wrong, n, tolerance):
         return  # two filters of the bank are as probable
     best = exact[0][1]
     spread = np.sqrt(np.diag(best.cov))
-    mean = np.append(joint.estimate(filter_.particles).mean, joint.in_world(filter_.particles)[0])
+    mean = np.append(joint.estimate(filter_.particles).mean, joint.moments(filter_.particles)[0])
     np.testing.assert_allclose(mean / spread, best.mean / spread, atol=tolerance)
     np.testing.assert_allclose(joint.estimate(filter_.particles).cov, best.cov[:2, :2], rtol=tolerance)

@@ -13,7 +13,8 @@ from tests.examples import claims
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if "def main(" in path.read_text()]
-LONGEST_SENSOR = 40
+LONGEST_SENSOR, LONGEST_MODEL = 40, 60
+PLUGGED_IN = ("grid_slam", "jump_markov", "gps_imu", "range_only_beacons", "stochastic_volatility")
 
 
 @pytest.mark.slow
@@ -41,8 +42,13 @@ def test_example_uses_the_public_interface(path):
     assert ast.get_docstring(tree)
 
 
-def test_a_new_sensor_takes_few_lines():
-    tree = ast.parse((ROOT / "examples" / "custom_sensor.py").read_text(encoding="utf-8"))
-    (sensor,) = [node for node in tree.body if isinstance(node, ast.ClassDef)]
-    assert sensor.end_lineno is not None
-    assert sensor.end_lineno - sensor.lineno + 1 < LONGEST_SENSOR
+def lines_of_classes(name: str) -> int:
+    tree = ast.parse((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"))
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    return sum((node.end_lineno or 0) - node.lineno + 1 for node in classes)
+
+
+@pytest.mark.parametrize("name", PLUGGED_IN)
+def test_what_is_plugged_in_takes_few_lines(name):
+    assert lines_of_classes("custom_sensor") < LONGEST_SENSOR
+    assert 0 < lines_of_classes(name) < LONGEST_MODEL

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.core.checkpoint import fitting, grey, integers, load_arrays, numbers, poses, read, text
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
@@ -21,7 +22,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
 from rbpf.sensors.feature_log import KnownPoints
 from rbpf.systems.anchoring import Anchored
-from rbpf.systems.map_estimate import MapEstimate, mixture_moments, relative_points
+from rbpf.systems.map_estimate import MapEstimate, relative_points
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.system import Gauge
@@ -166,7 +167,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
             assert features.group is not None
             points, within = landmark.in_group(records)
             for member in range(points.shape[1]):
-                moments = mixture_moments(weights, points[:, member], within[:, member])
+                moments = gaussian.mixture_moments(weights, points[:, member], within[:, member])
                 rows.append((int(features.group.names[member]), *moments, nowhere))
             continue
         ends = nowhere
@@ -174,7 +175,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
             extent = unknown_depth.extent(belief.read_mode([landmark_id]), RAY_SIGMAS, MIN_RHO)[0, 0]
             ends = SE3.inverse_transform(world.mean[mode], extent[:, :3] / extent[:, 3:])
             records = unknown_depth.as_points(records)
-        moments = mixture_moments(weights, *relative_points(SE3, world, records))
+        moments = gaussian.mixture_moments(weights, *relative_points(SE3, world, records))
         rows.append((landmark_id, *moments, ends))
     names = np.array([row[0] for row in rows], dtype=np.int64)
     order = np.argsort(names, kind="stable")
