@@ -23,6 +23,8 @@ WINDOW = 20
 """Steps with observations that a sign must last for, in most of them."""
 LARGE = 4.0
 """Normalised innovation squared per degree of freedom; the median of a consistent filter is 0.45 to 1."""
+SMALL, ENOUGH = 0.25, 200.0
+"""The same over all that was measured, where the noise is stated twice as large as it is; and of how many numbers at least."""
 FEW = 0.02
 """Fraction of the particles that is next to none of them, but two at least."""
 EVIDENCE_SIGMA = 6.0
@@ -108,6 +110,8 @@ class HealthWarning(UserWarning):
 class Health:
     """What the last steps show. `findings` holds the sentences; each kind is told once, as a `HealthWarning` unless `silent`.
 
+    Too much caution is a finding without a warning: nothing that the filter says is wrong.
+
     Args:
         n: number of particles.
         space: the group of the states.
@@ -117,6 +121,7 @@ class Health:
         self.n = n
         self.findings = dict[str, str]()
         self.silent = False
+        self._squared, self._rows = 0.0, 0.0
         self._few = max(2.0, FEW * n)
         self._ratios, self._ess, self._parents = (deque[float](maxlen=WINDOW) for _ in range(3))
         self._recent = deque[float](maxlen=WINDOW)
@@ -136,6 +141,15 @@ class Health:
                     f"step {step}: what is measured is {ratio:.0f} times as far off (squared) as the noise explains, and has "
                     f"been for {WINDOW} steps. The filter has probably diverged: check the noise of motion and measurements, "
                     "use more particles, or marginalise what is sampled",
+                )
+            # A mean, for a filter that is too cautious is no failure, and there is time; large ones only hide it.
+            self._squared, self._rows = self._squared + nis, self._rows + rows
+            if self._rows >= ENOUGH and self._squared < SMALL * self._rows:
+                self._tell(
+                    "caution",
+                    f"step {step}: what is measured is {self._squared / self._rows:.2f} times as far off (squared) as the "
+                    "noise explains, 1 is right: the noise of motion or measurements is stated too large",
+                    warns=False,
                 )
         self._ess.append(-ess)
         few = -_lasting(self._ess, step)
@@ -197,10 +211,10 @@ class Health:
                 "(KalmanSubstate), or give it some noise",
             )
 
-    def _tell(self, kind: str, sentence: str) -> None:
+    def _tell(self, kind: str, sentence: str, warns: bool = True) -> None:
         if kind not in self.findings:
             self.findings[kind] = sentence
-            if not self.silent:
+            if warns and not self.silent:
                 warnings.warn(sentence, HealthWarning, stacklevel=4)
 
 

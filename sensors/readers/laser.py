@@ -23,7 +23,7 @@ A range of zero or less, or one that is not a number, is not valid; one of the g
 greatest range is what the log says (`robot_front_laser_max` up to 80 m); where it says nothing 80 m, or 8.18 m where no range
 is beyond the 8.19 m that SICK's scanners reach in millimetres. Without odometry the log has None for it. Scans whose time is
 not after that of all before them, by up to a second, come of programs that write at once; they are left out, which is said.
-A clock that is set back by more is refused. Odometry that jumps is kept, and said.
+A clock that is set back by more is refused. Scans that turn against the odometry are said; odometry that jumps is kept.
 """
 
 import logging
@@ -51,10 +51,10 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 LATE_NS = 1_000_000_000
 """A scan may be written so much after one of a later time."""
-FASTEST = 10.0
-"""Of a robot, m/s and rad/s: odometry that is faster jumps."""
 
 _FAR_M, _MILLIMETRES_M = 80.0, (8.18, 8.2)
+_TURNS, _TURNED, _NEAR_M, _WALL_M = 50, 0.2, 2.0, 0.2
+"""For a mirrored scanner so many turns [rad] are looked at, so far apart; two scans see one wall so near to each other."""
 _HEAD = ("type", "start angle", "field of view", "angular resolution", "maximum range", "accuracy", "remission mode")
 _POSES = ("x", "y", "theta", "odometry's x", "odometry's y", "odometry's theta")
 _log = logging.getLogger(__name__)
@@ -152,12 +152,12 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
     odometry = None
     poses = [scan.odometry for scan in scans if scan.odometry is not None]
     if poses:
-        odometry = SE2.normalise(np.stack(poses))
-        _tell_jumps(path, scans, odometry)
-        odometry = odometry[rows]
+        odometry = SE2.normalise(np.stack(poses))[rows]
     whole = path.resolve()
     name = whole.name if whole.is_dir() else whole.name.removesuffix(".gz").rpartition(".")[0] or whole.name
-    return LaserLog(name, scanner, stamps_ns[rows], ranges, odometry)
+    log = LaserLog(name, scanner, stamps_ns[rows], ranges, odometry)
+    _tell_mirrored(path, log)
+    return log
 
 
 def _kinds() -> str:
@@ -179,15 +179,35 @@ def _in_order(path: Path, scans: list[ScanOfFile]) -> list[ScanOfFile]:
     return kept
 
 
-def _tell_jumps(path: Path, scans: list[ScanOfFile], odometry: Array) -> None:
-    moved = SE2.between(odometry[:-1], odometry[1:])
-    seconds = np.diff([scan.stamp_ns for scan in scans]) * 1e-9
-    size = np.maximum(np.abs(moved[:, 0]), np.hypot(moved[:, 1], moved[:, 2]))
-    if (jumps := np.flatnonzero(size > FASTEST * seconds + 1.0)).size:
-        turn, x, y = moved[jumps[0]].tolist()
+def _tell_mirrored(path: Path, log: LaserLog) -> None:
+    """Says so where the scans before and after turns lie on each other with their angles mirrored, and not as they are."""
+    if log.odometry is None:
+        return  # what has no turns of its own is as consistent in a mirror
+    every, gains, first = -(-log.scanner.angles.size // 200), list[float](), 0
+    towards = np.stack([np.cos(log.scanner.angles), np.sin(log.scanner.angles)], axis=1)[::every]
+    for last in range(1, len(log.odometry)):
+        moved = SE2.between(log.odometry[first], log.odometry[last])
+        if np.hypot(moved[1], moved[2]) > _NEAR_M or abs(moved[0]) > 1.0:
+            first = last
+        elif abs(moved[0]) >= _TURNED:
+            pair, fits = [(r, np.isfinite(r)) for r in log.ranges[[first, last], ::every]], list[float]()
+            for side in (1.0, -1.0):
+                before, after = (
+                    SE2.transform(log.scanner.robot_from_sensor, r[there, None] * towards[there] * [1.0, side])
+                    for r, there in pair
+                )
+                away = np.linalg.norm(before - SE2.transform(moved, after)[:, None], axis=-1).min(
+                    axis=1, initial=np.inf
+                )
+                fits.append(float(np.exp(-0.5 * (away / _WALL_M) ** 2).sum() / len(towards)))
+            gains.append(fits[1] - fits[0])
+            first = last
+        if len(gains) == _TURNS:
+            break
+    if len(gains) >= _TURNS // 5 and np.mean(gains) > 5.0 * np.std(gains) / np.sqrt(len(gains)):
         _log.warning(
-            "%s: the odometry jumps %d times, first by %.3g m and %.3g degrees in %.3g s before %s.",
-            path, jumps.size, np.hypot(x, y), np.degrees(turn), seconds[jumps[0]], scans[jumps[0] + 1].place,
+            "%s: the scans turn against the odometry, %d of %d turns fit better in a mirror: is the scanner upside down "
+            "(--upside-down mirrors it), or the odometry's heading reversed?", path, (np.array(gains) > 0.0).sum(), len(gains),
         )  # fmt: skip
 
 

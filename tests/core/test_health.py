@@ -1,5 +1,6 @@
 """Failures that were silent are told of, and filters that are sound are not suspected."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -124,13 +125,32 @@ def test_evidence_that_collapses(proposal):
 
 
 def test_sound_filters_are_not_suspected():
-    """Every warning is an error here: known and unknown association, a first fix that decides between guesses, an outlier."""
+    """Known and unknown association, a first fix that decides between guesses, an outlier."""
     for known in (True, False):
-        drive(Recipe(known=known, n=40).build(), planar_world(80, seed=3, clutter=0.0 if known else 0.5))
+        filter_ = Recipe(known=known, n=40).build()
+        drive(filter_, planar_world(80, seed=3, clutter=0.0 if known else 0.5))
+        assert not filter_.health.findings
     rng = np.random.default_rng(1)
     filter_ = Filter(Still(), Level(), n=100, rng=rng)
     for t in range(300):
         filter_.step(rng.standard_normal() * (30.0 if t % 50 == 7 else 1.0))
+    assert not filter_.health.findings
+
+
+def test_noise_that_is_stated_too_large_is_a_finding_and_no_warning():
+    """A third of it is the band's other side, a failure."""
+    world, found = planar_world(80, seed=3), []
+    for factor in (0.3, 1.0, 3.0):
+        frames = [replace(frame, cov_z=factor**2 * frame.cov_z) for frame in world.frames]
+        controls = [control and replace(control, cov=factor**2 * control.cov) for control in world.controls]
+        filter_ = Recipe(n=40).build()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", HealthWarning)
+            drive(filter_, replace(world, frames=frames, controls=controls))
+        found.append((findings(filter_), len(caught)))
+    assert found[1:] == [(set(), 0), ({"caution"}, 0)]
+    assert "innovations" in found[0][0] and found[0][1] == len(found[0][0])
+    assert "stated too large" in filter_.health.findings["caution"]
 
 
 def test_a_resampled_filter_with_few_particles_is_judged_by_particles_not_by_fractions():

@@ -10,6 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.sensors.readers import Part
 from rbpf.sensors.readers.laser import LaserOptions, read_laser_log
+from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 from tests.readers.images.bags import KINDS, STAMPS_NS, recorded, write_scans
 from tests.readers.small import CARMEN, QUARTER, write
 
@@ -101,11 +102,33 @@ def test_scans_that_come_late_are_left_out(tmp_path, caplog):
     assert "left out 2 scans whose time is not after that of the scan before" in caplog.text
 
 
-def test_odometry_that_jumps_is_kept_and_said(tmp_path, caplog):
+def test_odometry_that_jumps_is_kept(tmp_path):
     lines = "".join(f"FLASER 1 2 0 0 0 {x} 0 0 {t}.0\n" for t, x in enumerate([0, 0.5, 100.5, 101]))
-    log = log_of(tmp_path, lines)
-    assert log.odometry[:, 1].tolist() == [0, 0.5, 100.5, 101]
-    assert "the odometry jumps 1 times, first by 100 m and 0 degrees in 1 s before line 3" in caplog.text
+    assert log_of(tmp_path, lines).odometry[:, 1].tolist() == [0, 0.5, 100.5, 101]
+
+
+def told_of_a_mirror(text, folder, caplog, **options) -> tuple[bool, ...]:
+    """Whether a log is told of as it is, and with its readings the other way round."""
+    told = []
+    for name, order in (("plain.clf", 1), ("reversed.clf", -1)):
+        lines = [line.split() for line in text.splitlines()]
+        turned = [
+            [*w[:2], *w[2 : 2 + int(w[1])][::order], *w[2 + int(w[1]) :]] if w[0] == "FLASER" else w for w in lines
+        ]
+        caplog.clear()
+        log_of(folder, "\n".join(map(" ".join, turned)), LaserOptions(**options), name)
+        told.append("the scans turn against the odometry" in caplog.text)
+    return tuple(told)
+
+
+def test_a_scanner_whose_readings_run_the_other_way_is_told(tmp_path, caplog):
+    simulate_laser(LaserWorld(scans=150, laps=1), tmp_path, seed=1)
+    text = (tmp_path / "robot.clf").read_text()
+    assert told_of_a_mirror(text, tmp_path, caplog) == (False, True)
+    assert told_of_a_mirror(text, tmp_path, caplog, upside_down=True) == (True, False)
+    # Nothing turns: nothing can be told.
+    straight = "".join(f"FLASER 3 2 {2 + x} 3 {x} 0 0 {x} 0 0 {t}.0\n" for t, x in enumerate(np.arange(20) * 0.2))
+    assert told_of_a_mirror(straight, tmp_path, caplog) == (False, False)
 
 
 @pytest.mark.parametrize(("largest", "reach"), [("8.191", 8.18), ("81.91", 80.0), ("7.5", 80.0)])
@@ -172,3 +195,9 @@ def test_a_recording_of_a_robot(data_dir):
     assert log.ranges.shape == (910, 180) and np.isinf(log.ranges).sum() == 4172
     assert not np.isnan(log.ranges).any()
     assert np.nanmax(log.ranges[np.isfinite(log.ranges)]) < 30.0
+
+
+@pytest.mark.real_data
+def test_a_recording_of_a_robot_in_a_mirror(data_dir, tmp_path, caplog):
+    text = (data_dir / "laser_intel" / "intel.clf").read_text()
+    assert told_of_a_mirror("\n".join(text.splitlines()[:200]), tmp_path, caplog) == (False, True)

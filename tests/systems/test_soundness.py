@@ -1,0 +1,58 @@
+"""A good run of each system gives no sign of failure, where every sign has had the steps that it needs."""
+
+import numpy as np
+import pytest
+
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.system import System
+from rbpf.validation.simulation.robot import RobotWorld
+from tests.systems.laser_worlds import laser, scans
+from tests.systems.mono_logs import desk
+from tests.systems.test_blind_turn import filter_robot_log, simulated_log
+from tests.systems.test_mono_features import SMALL
+from tests.systems.test_mono_features import run as filter_desk
+from tests.systems.test_stereo_features import filtered, simulated
+
+pytestmark = pytest.mark.slow
+
+
+def robot(kind: str) -> tuple[System, dict[str, np.ndarray]]:
+    done = filter_robot_log(simulated_log(RobotWorld(steps=100), 0), RangeBearingConfig(map=kind))
+    return done.system, done.log
+
+
+def mono() -> tuple[System, dict[str, np.ndarray]]:
+    done = filter_desk(desk(1, frames=60), SMALL)
+    return done.system, done.log
+
+
+def stereo() -> tuple[System, dict[str, np.ndarray]]:
+    done = filtered(simulated(60))
+    return done.system, done.log
+
+
+def scanner() -> tuple[System, dict[str, np.ndarray]]:
+    slam = laser(distance_m=0.2)
+    values = [slam.take(scan).values for scan in scans(60)]
+    return slam, {name: np.array([one[name] for one in values]) for name in values[0]}
+
+
+MAKE = {
+    "robot": lambda: robot("particles"),
+    "joint": lambda: robot("joint"),
+    "mono": mono,
+    "stereo": stereo,
+    "laser": scanner,
+}
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_a_good_run_is_not_suspected(name):
+    system, log = MAKE[name]()
+    assert system.filter.health.findings == {}
+    # Weights, copies; innovations and evidence where there are some; ancestors where particles are resampled.
+    assert system.filter.steps >= 50
+    if name != "laser":
+        assert np.isfinite(log["nis"]).sum() >= 40 and np.isfinite(log["log_evidence"]).sum() >= 44
+    if name != "joint":
+        assert log["resampled"].sum() >= 20
