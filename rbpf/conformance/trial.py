@@ -8,7 +8,7 @@ import numpy as np
 
 from rbpf.core.models import Belief, Landmark, ObservationModel, Observations, Part, Records, Transition
 from rbpf.errors import InputError
-from rbpf.lie import LieGroup, SE2Group, SE3Group
+from rbpf.lie import LieGroup, Product, SE2Group, SE3Group
 
 PARTICLES, LANDMARKS = 5, 4
 CANDIDATES = 400
@@ -112,7 +112,8 @@ class Scene:
 
     def _landmark_dim(self, model: ObservationModel, rng: np.random.Generator) -> int:
         """The dimension of a point that the model can predict: that of the space first, else the lowest."""
-        known = {SE2Group: 2, SE3Group: 3}.get(type(self.space), self.space.dim)
+        first = self.space.groups[0] if isinstance(self.space, Product) else self.space
+        known = {SE2Group: 2, SE3Group: 3}.get(type(first), self.space.dim)
         for dim in (known, 1, 2, 3, 4, 5, 6):
             trial = replace(self, landmark=SPREAD * rng.normal(size=(self.state.shape[0], LANDMARKS, dim)))
             try:

@@ -26,7 +26,7 @@ from rbpf.core.models import (
 )
 from rbpf.errors import InputError
 from rbpf.kernels.signature import BLOCK, observation_kernel
-from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.lie import SE2, SE3, Euclidean, Product
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
@@ -71,6 +71,18 @@ class Anchored(Polar):
         n, k = state.shape[0], z.shape[0]
         mean = np.broadcast_to(point, (n, k, 2)).copy()
         return Records(mean, np.broadcast_to(np.eye(2), (n, k, 2, 2)), np.repeat(state[:, None], k, axis=1))
+
+
+class FromPose(Polar):
+    """The state holds more than the pose that points are seen from."""
+
+    space = Product(SE2, Euclidean(1))  # type: ignore[assignment]
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return super().predict(state[..., :3], landmark)
+
+    def invert(self, state, z):
+        return super().invert(state[..., :3], z)
 
 
 class RangeOnly(Polar):
@@ -128,6 +140,7 @@ SOUND: list[tuple[Any, Any, Example | None]] = [
     (OdometryMotion(SE2), None, Example(control=Odometry(np.array([0.1, 1, 0]), np.diag([0.1, 0, 0])))),
     (Driven(), None, None),
     (Polar(), None, None),
+    (FromPose(), None, None),
     (RangeBearing(SE2), None, None),
     (RangeBearing(SE2, np.array([0.3, 1.0, -0.5]), max_range=6.0, half_field_of_view=0.7), None, None),
     (RangeBearing(SE2, max_range=0.05), None, NEAR),
