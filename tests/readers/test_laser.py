@@ -116,7 +116,7 @@ def told_of_a_mirror(text, folder, caplog, **options) -> tuple[bool, ...]:
             [*w[:2], *w[2 : 2 + int(w[1])][::order], *w[2 + int(w[1]) :]] if w[0] == "FLASER" else w for w in lines
         ]
         caplog.clear()
-        log_of(folder, "\n".join(map(" ".join, turned)), LaserOptions(**options), name)
+        log_of(folder, "".join(" ".join(words) + "\n" for words in turned), LaserOptions(**options), name)
         told.append("the scans turn against the odometry" in caplog.text)
     return tuple(told)
 
