@@ -34,11 +34,11 @@ def told(filter_: Filter) -> tuple[np.ndarray, list[np.ndarray]]:
     """Mean of pose and landmarks in the world, and their covariances one by one."""
     joint = filter_.belief().map
     assert isinstance(joint, JointMap)
-    pose = joint.estimate(filter_.particles)
-    points, covs = joint.moments(filter_.particles)
-    turn = joint.space.rotation(pose.mean)
+    pose, cov = filter_.belief().moments(Part.STATE)
+    points, covs = filter_.belief().moments(joint.ids)
+    turn = joint.space.rotation(pose)
     dim = joint.point.dim
-    return np.concatenate([pose.mean[-dim:], points.ravel()]), [turn @ pose.cov[-dim:, -dim:] @ turn.T, *covs]
+    return np.concatenate([pose[-dim:], points.ravel()]), [turn @ cov[-dim:, -dim:] @ turn.T, *covs]
 
 
 def assert_same(filter_: Filter, kalman: Kalman, moving: int = 2, rtol: float = 1e-7) -> None:
