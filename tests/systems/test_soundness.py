@@ -3,26 +3,24 @@
 import numpy as np
 import pytest
 
+from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.system import System
-from rbpf.validation.simulation.robot import RobotWorld
+from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.systems.laser_worlds import laser, scans
-from tests.systems.mono_logs import desk
-from tests.systems.test_blind_turn import filter_robot_log, simulated_log
-from tests.systems.test_mono_features import SMALL
-from tests.systems.test_mono_features import run as filter_desk
+from tests.systems.mono_logs import SMALL, desk
 from tests.systems.test_stereo_features import filtered, simulated
 
 pytestmark = pytest.mark.slow
 
 
 def robot(kind: str) -> tuple[System, dict[str, np.ndarray]]:
-    done = filter_robot_log(simulated_log(RobotWorld(steps=100), 0), RangeBearingConfig(map=kind))
+    done = filter_opened(open_robot_log(simulated_log(RobotWorld(steps=100), 0), RangeBearingConfig(map=kind)))
     return done.system, done.log
 
 
 def mono() -> tuple[System, dict[str, np.ndarray]]:
-    done = filter_desk(desk(1, frames=60), SMALL)
+    done = filter_features(desk(1, frames=60), SMALL)
     return done.system, done.log
 
 
