@@ -10,10 +10,9 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import MonoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.colmap.against_colmap import compare_with_colmap
+from rbpf.validation.colmap.compare import compare_with_colmap
 from rbpf.validation.colmap.reconstruct import ReconstructionOptions
 from rbpf.validation.exports import export_colmap, export_ply
-from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.report.comparison_pictures import plot_against_colmap
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -31,13 +30,13 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
         run = filter_recording(MonoRecording(desk, desk / "known_points.csv"), MonoConfig())
         estimate = PathAndMap.of_run(run)
         options = ReconstructionOptions(every=every, features=800 if quick else 4096)
-        found = compare_with_colmap(estimate, run.source, options)
-    figures = {f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)}
-    if found.truth is not None:
-        figures["COLMAP's own error [m]"] = found.truth.path.rmse
+        found, truth = compare_with_colmap(estimate, run.source, options)
+    figures = {f"run: {name}": value for name, value in found.as_dict().items() if isinstance(value, float)}
+    if truth is not None:
+        figures["COLMAP's own error [m]"] = truth.path.rmse
     write_table(out / "against_colmap.csv", ("figure", "value"), list(figures.items()))
-    plot_against_colmap(found.run, estimate, out)
-    export_colmap(estimate, problem_of(run), out / "colmap")
+    plot_against_colmap(found, estimate, out)
+    export_colmap(estimate, run.system.measurements(run.name, run.log), out / "colmap")
     export_ply(estimate, out)
     return figures
 

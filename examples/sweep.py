@@ -12,8 +12,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.sweep.plan import SweepFile, plan
-from rbpf.validation.sweep.sweep import sweep
+from rbpf.validation.sweep import SweepFile, plan, sweep
 from rbpf.validation.tables import write_table
 
 OPTIONS = {

@@ -29,16 +29,10 @@ _INTRINSICS = "fx", "fy", "cx", "cy"
 def calibrate_images(
     images: Path, board: Board, on_image: Callable[[int, int], None] | None = None, model: str = "pinhole"
 ) -> tuple[BoardCalibration, int]:
-    """The camera that took pictures of a board, and how many images were looked at.
+    """The camera, pinhole or fisheye, that took pictures of a board, a folder or a video, and how many were looked at.
 
-    Args:
-        images: folder of images, or a video.
-        board: what is printed.
-        on_image: called with the images looked at and their number.
-        model: of the camera, as in camera.yaml: pinhole or fisheye.
-
-    Raises:
-        InputError: no or too few images show the board, they differ in size, or they do not determine the camera.
+    `on_image` is called with the images looked at and their number. An InputError says that no or too few images show the
+    board, that they differ in size, or that they do not determine the camera.
     """
     total, shots = read_uncalibrated(images, MOST_SHOTS)
     views, size, looked_at, empty = list[BoardView](), (0, 0), 0, None
@@ -59,9 +53,22 @@ def calibrate_images(
         if on_image is not None:
             on_image(looked_at, total)
     if not views:
-        raise InputError(_nothing(images, board, looked_at, empty))
-    rows = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int))
-    return calibrate([views[row] for row in rows], board, *size, MODELS[model]), looked_at
+        if empty is None:
+            raise InputError(f"{images}: none of its images can be read")
+        # Squares are often counted in place of corners.
+        places = "--board counts the places where four squares meet"
+        for columns, rows in ((board.columns + less, board.rows + less) for less in (-1, 1)):
+            if min(columns, rows) >= 3 and board_corners(empty, Board(columns, rows, board.square_m)) is not None:
+                raise InputError(
+                    f"{images}: a chessboard of {columns}x{rows} inner corners is seen, not of "
+                    f"{board.columns}x{board.rows}: {places}, give --board {columns}x{rows}"
+                )
+        raise InputError(
+            f"{images}: no chessboard of {board.columns}x{board.rows} inner corners is found in {looked_at} images: it has to "
+            f"be seen whole, with its white border, sharp and evenly lit; {places}"
+        )
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int))
+    return calibrate([views[row] for row in chosen], board, *size, MODELS[model]), looked_at
 
 
 def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out: Path) -> dict[str, Any]:
@@ -101,26 +108,6 @@ def camera_text(camera: Pinhole, about: str) -> str:
         f"distortion: [{', '.join(f'{value:.8f}' for value in camera.distortion)}]",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _nothing(images: Path, board: Board, looked_at: int, empty: np.ndarray | None) -> str:
-    """Why no board was found; squares are often counted in place of corners."""
-    size = f"{board.columns}x{board.rows}"
-    if empty is None:
-        return f"{images}: none of its images can be read"
-    for less in (-1, 1):
-        columns, rows = board.columns + less, board.rows + less
-        if min(columns, rows) < 3:
-            continue
-        if board_corners(empty, Board(columns, rows, board.square_m)) is not None:
-            return (
-                f"{images}: a chessboard of {columns}x{rows} inner corners is seen, not of {size}: --board counts the "
-                f"places where four squares meet, give --board {columns}x{rows}"
-            )
-    return (
-        f"{images}: no chessboard of {size} inner corners is found in {looked_at} images: it has to be seen whole, "
-        "with its white border, sharp and evenly lit; --board counts the places where four squares meet"
-    )
 
 
 def _draw(found: BoardCalibration) -> Any:

@@ -32,11 +32,10 @@ from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.colmap.images import OVER_IMAGES, Names, lay_out, recorded_images
-from rbpf.validation.colmap.model import build_model
-from rbpf.validation.gtsam.batch_problem import Problem, read_problem
+from rbpf.validation.colmap.model import OVER_IMAGES, Names, build_model, lay_out, recorded_images
+from rbpf.validation.gtsam.batch_problem import Problem
 from rbpf.validation.gtsam.observations import ObservationTable, observation_table
-from rbpf.validation.report.rerun import AXIS_M, ellipsoids, log_pose, log_time, recording
+from rbpf.validation.report.video import AXIS_M, ellipsoids, log_pose, log_time, recording
 
 _log = logging.getLogger(__name__)
 
@@ -45,12 +44,10 @@ MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 """Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing."""
 _STOPS = np.array([[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float)
-_QUANTILES = 0.05, 0.95
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
 _BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
 
-_VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-_SIGMA = [("sigma_m", "<f4")]
+_VERTEX = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue")), ("sigma_m", "<f4")]
 _EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
 _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
@@ -80,7 +77,7 @@ def _kitti(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 
 
 def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
-    problem = read_problem(run) if (run / OBSERVATIONS).exists() else None
+    problem = RunFolder.open(run).measurements if (run / OBSERVATIONS).exists() else None
     names: Names | None = None
     if (config := read_config(run))["system"] in OVER_IMAGES:
         try:
@@ -92,8 +89,8 @@ def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 
 
 def _npz(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
-    names, landmarks = ("stamps_ns", "world_from_body", "cov_poses"), estimate.landmarks
-    arrays = {name: getattr(estimate, name) for name in names}
+    landmarks = estimate.landmarks
+    arrays = {name: getattr(estimate, name) for name in ("stamps_ns", "world_from_body", "cov_poses")}
     arrays |= {"landmark_ids": landmarks.ids, "landmarks": landmarks.mean, "cov_landmarks": landmarks.cov}
     save_arrays(out / "run.npz", arrays)
     return [out / "run.npz"]
@@ -138,32 +135,25 @@ def export_colmap(
     Raises:
         InputError: path and measurements are not of one run.
     """
-    model = _colmap_model(estimate, problem, names)
-    prepare_folder(folder)
-    if kind == "text":
-        model.write_text(folder)
-    else:
-        model.write_binary(folder)
-    return model
-
-
-def _colmap_model(estimate: PathAndMap, problem: Problem | None, names: Names | None) -> Any:
     landmarks = raised(estimate.landmarks)
-    colours = colours_by_sigma(standard_deviations(estimate.landmarks.cov))
-    if not isinstance(problem, FeatureLog):
-        none = np.zeros(0, dtype=np.intp)
-        nothing = ObservationTable(NOMINAL, none, none, landmarks.ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    colours, ids = colours_by_sigma(standard_deviations(estimate.landmarks.cov)), landmarks.ids
+    if isinstance(problem, FeatureLog):
+        if len(problem.frames) != len(estimate.stamps_ns):
+            counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
+            raise InputError(f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run.")
+        # The observations of the map's landmarks, with the places of these in the map.
+        table, poses = observation_table(problem), estimate.world_from_body
+        order, kept = np.argsort(ids, kind="stable"), np.isin(table.names, ids)[table.index]
+        place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
+        shown = ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
+    else:
+        none, names = np.zeros(0, dtype=np.intp), None
+        shown = ObservationTable(NOMINAL, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
         poses = SE3.compose(estimate.trajectory.world_from_body, _BODY_FROM_CAMERA)
-        return build_model(nothing, poses, landmarks.mean, colours)
-    if len(problem.frames) != len(estimate.stamps_ns):
-        counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
-        raise InputError(f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run.")
-    # The observations of the map's landmarks, with the places of these in the map.
-    table, ids = observation_table(problem), landmarks.ids
-    order, kept = np.argsort(ids, kind="stable"), np.isin(table.names, ids)[table.index]
-    place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
-    shown = ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
-    return build_model(shown, estimate.world_from_body, landmarks.mean, colours, names)
+    model = build_model(shown, poses, landmarks.mean, colours, names)
+    prepare_folder(folder)
+    (model.write_text if kind == "text" else model.write_binary)(folder)
+    return model
 
 
 def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
@@ -198,7 +188,7 @@ def colours_by_sigma(std: Array) -> NDArray[np.uint8]:
     if not len(std):
         return np.zeros((0, 3), dtype=np.uint8)
     logs = np.log(np.maximum(std, np.finfo(float).tiny))
-    low, high = np.quantile(logs, _QUANTILES)
+    low, high = np.quantile(logs, (0.05, 0.95))
     fraction = np.clip((logs - low) / max(float(high - low), np.finfo(float).tiny), 0.0, 1.0)
     at = fraction * (len(_STOPS) - 1)
     stops = np.arange(len(_STOPS))
@@ -212,26 +202,16 @@ def write_ply(
     sigmas: Array | None = None,
     edges: NDArray[np.int64] | None = None,
 ) -> None:
-    """Writes points (M, 3) [m] with colours (M, 3), and lines between them; the file appears when complete.
+    """Writes finite points (M, 3) [m] with colours (M, 3), and lines between them; the file appears when complete.
 
     `sigmas` (M,) are a further property sigma_m of each point, `edges` (L, 2) rows of the points that a line connects.
-
-    Raises:
-        InputError: a coordinate is not finite.
     """
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(axis=1)))
         raise InputError(f"{path}: expected finite coordinates, found others in row {row}.")
-    vertices = np.empty(len(points), dtype=_VERTEX + (_SIGMA if sigmas is not None else []))
-    for axis, name in enumerate("xyz"):
-        vertices[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, channel]
-    if sigmas is not None:
-        vertices["sigma_m"] = sigmas
-    lines = np.empty(0 if edges is None else len(edges), dtype=_EDGE)
-    if edges is not None:
-        lines["vertex1"], lines["vertex2"] = edges.T
+    columns = [*points.T, *colours.T, *([] if sigmas is None else [sigmas])]
+    vertices = np.rec.fromarrays(columns, dtype=_VERTEX[: len(columns)])
+    lines = np.rec.fromarrays((np.zeros((0, 2), dtype=int) if edges is None else edges).T, dtype=_EDGE)
     header = ["ply", "format binary_little_endian 1.0"]
     for name, elements in (("vertex", vertices), *([("edge", lines)] if len(lines) else [])):
         header.append(f"element {name} {len(elements)}")

@@ -5,7 +5,6 @@ only the annotated video needs the images once more.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,27 +20,12 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.consistency.comparison import clear_comparisons
 from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
-from rbpf.validation.report.page import VIDEO
-from rbpf.validation.report.rerun import write_rerun
-from rbpf.validation.report.validate import COMPARISONS, compare_gtsam, report_run
-from rbpf.validation.report.video import PICTURES, write_annotated
+from rbpf.validation.report.validate import COMPARISONS, VIDEO, compare_gtsam, validate, write_report
+from rbpf.validation.report.video import PICTURES, write_annotated, write_rerun
 
 MOST = 300_000
 """Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
 who asks for it."""
-
-
-@dataclass(frozen=True)
-class Callbacks:
-    """Who is told how far the work after the filter is.
-
-    `on_frame` gets the frames drawn and their number, `on_iteration` the number of an iteration of the batch adjustment and
-    the error before it; after `most_iterations` it is given up, see `solve_problem`.
-    """
-
-    on_frame: Callable[[int, int], None] | None = None
-    on_iteration: Callable[[int, float], None] | None = None
-    most_iterations: int | None = None
 
 
 def finish_run(
@@ -51,7 +35,9 @@ def finish_run(
     video: bool = True,
     rerun: Path | None = None,
     batch: bool = True,
-    callbacks: Callbacks | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
+    on_iteration: Callable[[int, float], None] | None = None,
+    most_iterations: int | None = None,
 ) -> dict[str, Any]:
     """Writes everything that a run leaves; returns the entries of summary.json and the verdict.
 
@@ -64,12 +50,13 @@ def finish_run(
         video: also write the annotated video, of a run over images.
         rerun: file of a recording for the Rerun viewer; None writes none.
         batch: also solve for the batch optimum of the same measurements, and score it.
-        callbacks: who is told.
+        on_frame: called with the frames drawn and their number.
+        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
+        most_iterations: of the batch adjustment, after which it is given up, see `solve_problem`.
 
     Raises:
         InputError: a file cannot be written.
     """
-    callbacks = callbacks or Callbacks()
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
     if run.system.name not in COMPARISONS["gtsam"]:  # it measures nothing that a batch optimiser takes
         wanted, batch = {}, False
@@ -78,7 +65,7 @@ def finish_run(
     clear_comparisons(out)
     if batch:
         try:
-            entries |= add_batch(RunFolder.open(out), callbacks)
+            entries |= add_batch(RunFolder.open(out), most_iterations, on_iteration)
         except InputError as error:
             entries["batch_problem"] = str(error)
     entries |= score_run(RunFolder.open(out))
@@ -86,25 +73,20 @@ def finish_run(
     found = RunFolder.open(out)
     draw_run(found)
     if video and run.system.name in PICTURES:
-        write_annotated(run, out / VIDEO, callbacks.on_frame)
+        write_annotated(run, out / VIDEO, on_frame)
     else:
         (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:
         write_rerun(run, rerun)
-    verdict = report_run(out)
+    verdict = validate(out, "groundtruth") if (out / TRUTH).is_file() else write_report(out)
     said = [*entries.get("remarks", ()), *verdict.said]
     return entries | {"path_grade": verdict.path.grade, "verdict": verdict.trust, "sentences": said}
 
 
-def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
-    """Solves for the batch optimum of a run's measurements, writes batch.tum and the comparison with it.
+def add_batch(found: RunFolder, most: int | None, on_iteration: Callable[[int, float], None] | None) -> dict[str, Any]:
+    """Solves for a run's batch optimum, writes batch.tum and the comparison with it; returns entries of summary.json.
 
-    Returns:
-        Entries of summary.json.
-
-    Raises:
-        InputError: there are too many observations, too few frames are connected, it takes too many iterations, or it
-            does not converge.
+    An InputError says that there are too many observations, or what `solve_problem` says.
     """
     from rbpf.validation.consistency.against_batch import solve_run
 
@@ -116,7 +98,7 @@ def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
                 f"the run has {count} observations, more than the {MOST} that are adjusted in batch with it: "
                 "compare it afterwards by rbpf validate RUN --against gtsam"
             )
-    optimum = solve_run(found, callbacks.most_iterations, callbacks.on_iteration)
+    optimum = solve_run(found, most, on_iteration)
     write_tum(found.folder / BATCH, optimum.estimate.trajectory)
     entries: dict[str, Any] = {"batch_error": float(optimum.error)}
     if isinstance(optimum.problem, FeatureLog):

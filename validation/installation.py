@@ -14,8 +14,6 @@ from typing import Any, NamedTuple
 
 from rbpf import __version__
 
-TIMEOUT_S = 30
-
 
 class Part(NamedTuple):
     """Something that the program does with a library: whether it works, and whether every installation needs it.
@@ -53,20 +51,20 @@ def versions() -> dict[str, str | None]:
 
 def parts() -> list[Part]:
     """Tries every part."""
-    return [_tried(*probe) for probe in _PROBES]
+    found = []
+    for name, extra, module, distribution, probe in _PROBES:
+        try:
+            says = probe(import_module(module))
+            found.append(Part(name, True, not extra, says or f"{distribution} {version(distribution)}"))
+        except Exception as error:  # whatever a broken library raises as it is loaded
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            again = "install the package again: pip install --force-reinstall"
+            remedy = f"pip install 'rbpf[{extra}]'" if extra else again
+            found.append(Part(name, False, not extra, f"{reason}; {remedy}"))
+    return found
 
 
-def _tried(name: str, extra: str, probe: Callable[[], str]) -> Part:
-    try:
-        return Part(name, True, not extra, probe())
-    except Exception as error:  # whatever a broken library raises as it is loaded
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        remedy = f"pip install 'rbpf[{extra}]'" if extra else "install the package again: pip install --force-reinstall"
-        return Part(name, False, not extra, f"{reason}; {remedy}")
-
-
-def _compiler() -> str:
-    numba = import_module("numba")
+def _compiler(numba: Any) -> str:
     folder = Path(numba.config.CACHE_DIR or Path(__file__).resolve().parents[1] / "sensors" / "__pycache__")
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
@@ -74,8 +72,7 @@ def _compiler() -> str:
     return f"Numba {numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads, cache writable"
 
 
-def _images() -> str:
-    cv2 = import_module("cv2")
+def _images(cv2: Any) -> str:
     cv2.SIFT_create()
     names = [cv2.videoio_registry.getBackendName(key) for key in cv2.videoio_registry.getBackends()]
     if "FFMPEG" not in names:
@@ -83,48 +80,32 @@ def _images() -> str:
     return f"OpenCV {cv2.__version__}, with SIFT and video"
 
 
-def _gtsam() -> None:
-    gtsam = import_module("gtsam")
+def _gtsam(gtsam: Any) -> None:
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
     start.insert(0, gtsam.Pose3())
     gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
 
 
-def _ffmpeg() -> str:
-    path = import_module("imageio_ffmpeg").get_ffmpeg_exe()
-    subprocess.run([path, "-version"], check=True, capture_output=True, timeout=TIMEOUT_S)
+def _reconstruction(pycolmap: Any) -> None:
+    pycolmap.Reconstruction()
+
+
+def _ffmpeg(imageio_ffmpeg: Any) -> str:
+    path: str = imageio_ffmpeg.get_ffmpeg_exe()
+    subprocess.run([path, "-version"], check=True, capture_output=True, timeout=30)
     return path
 
 
-def _loaded(name: str, distribution: str, probe: Callable[[], object]) -> Callable[[], str]:
-    """A probe that says the version of a distribution."""
-
-    def say() -> str:
-        probe()
-        return f"{name} {version(distribution)}"
-
-    return say
-
-
-def _bags() -> None:
-    for part in ("rosbag1", "rosbag2"):
-        import_module(f"rosbags.{part}")
-
-
-_PROBES: tuple[tuple[str, str, Callable[[], str]], ...] = (
-    ("compiled kernels", "", _compiler),
-    ("images and video", "", _images),
-    ("batch optimum", "", _loaded("GTSAM", "gtsam", _gtsam)),
-    ("reconstruction", "", _loaded("pycolmap", "pycolmap", lambda: import_module("pycolmap").Reconstruction())),
-    ("annotated video", "", _ffmpeg),
-    (
-        "pictures",
-        "",
-        _loaded("Matplotlib", "matplotlib", lambda: import_module("matplotlib.figure").Figure().canvas.draw()),
-    ),
-    ("Rerun recordings", "viewing", _loaded("rerun-sdk", "rerun-sdk", lambda: import_module("rerun"))),
-    ("ROS bags", "bags", _loaded("rosbags", "rosbags", _bags)),
-    ("sweeps on a cluster", "cluster", _loaded("Dask", "dask", lambda: import_module("distributed"))),
+_PROBES: tuple[tuple[str, str, str, str, Callable[[Any], str | None]], ...] = (
+    ("compiled kernels", "", "numba", "numba", _compiler),
+    ("images and video", "", "cv2", "opencv-python-headless", _images),
+    ("batch optimum", "", "gtsam", "GTSAM", _gtsam),
+    ("reconstruction", "", "pycolmap", "pycolmap", _reconstruction),
+    ("annotated video", "", "imageio_ffmpeg", "imageio-ffmpeg", _ffmpeg),
+    ("pictures", "", "matplotlib.figure", "Matplotlib", lambda figure: figure.Figure().canvas.draw()),
+    ("Rerun recordings", "viewing", "rerun", "rerun-sdk", lambda _: None),
+    ("ROS bags", "bags", "rosbags.rosbag2", "rosbags", lambda _: None),
+    ("sweeps on a cluster", "cluster", "distributed", "Dask", lambda _: None),
 )
-"""What it does, the extra that it comes with, how it is tried."""
+"""What it does, the extra that it comes with, module and distribution, and how it is tried once it is loaded."""

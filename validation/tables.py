@@ -1,19 +1,17 @@
 """A table of figures, printed and kept as CSV."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
+
+from rbpf.runs import files
 
 Cell = str | int | float
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
     """Writes rows as CSV, numbers with six digits; makes the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows([[_text(cell, 6) for cell in row] for row in rows])
+    files.prepare_folder(path.parent)
+    files.write_csv(path, header, [[_text(cell, 6) for cell in row] for row in rows])
 
 
 def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:

@@ -110,11 +110,11 @@ def robot_causes(
     batch = robot.solve(measured, marginals=False, incremental=len(stamps) > AFAR)
     start = InitialEstimate(runs[0].log.poses, dict(batch.landmarks))
     again = robot.solve(measured, marginals=False, initial=start)
-    found = error(batch.world_from_robot)
+    found = error(batch.world_from_body)
     out = [
         Cause(AS_IT_IS, tuple(error(run.log.poses) for run in runs), found),
         Cause(BATCH, (found,), found),
-        Cause(FROM_FILTER, (error(again.world_from_robot),), found),
+        Cause(FROM_FILTER, (error(again.world_from_body),), found),
         Cause(ONLINE, (error(robot.solve_online(measured)),), found),
     ]
     many = replace(config, particles=MANY * config.particles)

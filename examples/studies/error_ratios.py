@@ -35,7 +35,7 @@ from rbpf.sensors.readers import open_log
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
+from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, solve_problem
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -143,7 +143,7 @@ def tracks_ratio(
         found = filter_features(log, _seeded(config, seed))
         if optimum is None:
             begin = found.log.poses if start is None else start[: len(found.log)]
-            optimum = solve_problem(problem_of(found), begin)
+            optimum = solve_problem(found.system.measurements(found.name, found.log), begin)
         path = optimum.estimate
         off = ate(PathAndMap.of_run(found).at(optimum.steps).trajectory, path.trajectory).rmse
         spread = float(np.sqrt(np.trace(path.cov_poses[:, 3:, 3:], axis1=1, axis2=2).mean()))
@@ -168,7 +168,8 @@ def _over_seeds(filtered: Callable[[int], Run], seeds: Sequence[int]) -> tuple[t
     ours, batch, optimum = [], [], None
     for seed in seeds:
         found = filtered(seed)
-        estimate, problem, truth = PathAndMap.of_run(found), problem_of(found), _truth(found)
+        estimate, truth = PathAndMap.of_run(found), _truth(found)
+        problem = found.system.measurements(found.name, found.log)
         alignment: Alignment = "similarity" if floats_in_scale(problem) else "rigid"
         if optimum is None or isinstance(problem, FeatureLog):
             robust = ROBUST if isinstance(problem, FeatureLog) else None

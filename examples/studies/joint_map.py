@@ -24,11 +24,12 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.metrics.scores import score_estimate
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
@@ -179,8 +180,8 @@ class RoomTrial:
         done = filter_features(log, replace(self.config, seed=seed))
         seconds, truth = time.process_time() - begun, done.truth
         assert truth is not None
-        batch = solve_features(log, CameraEstimate(done.log.poses, {}), marginals=False)
-        path = SE3.between(batch.world_from_camera[0], batch.world_from_camera)
+        batch = solve_features(log, InitialEstimate(done.log.poses, {}), marginals=False)
+        path = SE3.between(batch.world_from_body[0], batch.world_from_body)
         off = np.linalg.norm(SE3.translation(path) - SE3.translation(truth.poses), axis=1)
         maps = [
             [np.linalg.norm(point - truth.landmarks[name]) for name, point in landmarks.items()]

@@ -41,7 +41,7 @@ def solve_and_filter(job: Job) -> tuple[float, list[tuple[float, np.ndarray]]]:
     """Error of the batch [m], and errors of the filter by number of particles."""
     log = simulate_features(DeskWorld(frames=job.frames), Measuring(), MONO, job.seed)
     truth = log.truth.world_from_camera
-    batch = solve_features(log, marginals=False).world_from_camera
+    batch = solve_features(log, marginals=False).world_from_body
 
     def rmse(path: np.ndarray) -> float:
         return float(np.sqrt(np.square(path[:, 4:] - truth[:, 4:]).sum(axis=1).mean()))

@@ -20,7 +20,7 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
-from rbpf.validation.simulation.paths import HandHeld, frame_seconds, frame_stamps, looking
+from rbpf.validation.simulation.paths import HandHeld, frame_stamps, looking
 
 SURFACE = 1e-6
 """Fraction of the line of sight that may lie in a block: a point on a block's face is seen from the front."""
@@ -144,7 +144,7 @@ class DeskWorld(Ranged):
         blocks = np.stack([middle - extent, middle + extent], axis=1)
         draw = outside(lambda count: half * [0, 0, 1] + rng.uniform(-half, half, (count, 3)), blocks)
         points, present = populated(draw, self.points, self.frames, self.renewal / self.rate_hz, rng)
-        path = self.hand.poses(frame_seconds(self.frames, self.rate_hz), self.size_m, rng)
+        path = self.hand.poses(np.arange(self.frames) / self.rate_hz, self.size_m, rng)
         return Scene("desk", frame_stamps(self.frames, self.rate_hz), path, points, present, blocks)
 
 

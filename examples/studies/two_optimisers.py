@@ -26,10 +26,12 @@ from rbpf.runs.plots import new_axes, save_figures
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.colmap.model import build_model, from_colmap_pose, image_id
 from rbpf.validation.gtsam.batch_problem import connected_frames
-from rbpf.validation.gtsam.camera import CameraSolution, solve_features
-from rbpf.validation.gtsam.observations import CameraEstimate, ObservationTable, observation_table, reprojection
+from rbpf.validation.gtsam.camera import solve_features
+from rbpf.validation.gtsam.observations import ObservationTable, observation_table, reprojection
+from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.tables import write_table
 
 LEAST_HELD = 3
@@ -79,7 +81,7 @@ def with_held(log: FeatureLog, held: dict[int, Array]) -> FeatureLog:
     return FeatureLog(log.name, log.camera, log.frames, known, log.truth)
 
 
-def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustment:
+def adjust_by_colmap(log: FeatureLog, initial: InitialEstimate) -> ColmapAdjustment:
     """Adjusts all poses and landmarks; the log's known points, which must be exact (`with_held`), stay where they are.
 
     Args:
@@ -94,7 +96,7 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
     held = dict(zip(log.known.names.tolist(), log.known.positions, strict=True)) if log.known else {}
     places = initial.landmarks | held
     points = np.array([places[name] for name in table.names.tolist()])
-    model = build_model(table, initial.world_from_camera, points)
+    model = build_model(table, initial.world_from_body, points)
     fixed = np.isin(table.names, list(held))
     adjuster = _adjuster(model, np.flatnonzero(fixed) + 1)
     _solve(adjuster, log.name)
@@ -113,7 +115,7 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
     )
 
 
-def _checked(log: FeatureLog, initial: CameraEstimate) -> tuple[ObservationTable, float]:
+def _checked(log: FeatureLog, initial: InitialEstimate) -> tuple[ObservationTable, float]:
     if not isinstance(log.camera, Pinhole):
         raise InputError(
             f"{log.name} is a stereo log: COLMAP would count the row of each pair twice; adjust its left camera alone."
@@ -225,7 +227,7 @@ class TwoOptima:
     """
 
     log: FeatureLog
-    gtsam: CameraSolution
+    gtsam: BatchSolution
     colmap: ColmapAdjustment
     pose_differences: Array
     landmark_differences_m: Array
@@ -264,18 +266,18 @@ def adjust_by_both(log: FeatureLog, world_from_camera: Array) -> TwoOptima:
         raise InputError(f"{log.name}: no two frames share enough landmarks for a batch adjustment.")
     log = replace(log, frames=[log.frames[t] for t in frames.tolist()])
     start = world_from_camera[frames]
-    free = solve_features(log, CameraEstimate(start, {}), marginals=False)
+    free = solve_features(log, InitialEstimate(start, {}), marginals=False)
     settled = {name: free.landmarks[name] for name in sorted(free.landmarks.keys() - set(free.undetermined))}
     held = _held(log, settled)
     problem = with_held(_only(log, settled), held)
-    gtsam = solve_features(problem, CameraEstimate(free.world_from_camera, settled | held))
-    colmap = adjust_by_colmap(problem, CameraEstimate(start, settled | held))
+    gtsam = solve_features(problem, InitialEstimate(free.world_from_body, settled | held))
+    colmap = adjust_by_colmap(problem, InitialEstimate(start, settled | held))
     names = sorted(colmap.landmarks.keys() - held.keys())
     return TwoOptima(
         log=problem,
         gtsam=gtsam,
         colmap=colmap,
-        pose_differences=SE3.local(gtsam.world_from_camera, colmap.world_from_camera),
+        pose_differences=SE3.local(gtsam.world_from_body, colmap.world_from_camera),
         landmark_differences_m=np.array(
             [np.linalg.norm(gtsam.landmarks[name] - colmap.landmarks[name]) for name in names]
         ),

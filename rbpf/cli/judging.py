@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.ranges import Count, Range
 
 if TYPE_CHECKING:
-    from rbpf.validation.consistency.verdict import Verdict
+    from rbpf.validation.consistency.comparison import Verdict
 
 Format = Literal["tum", "kitti", "ply", "colmap", "rerun", "npz"]
 
@@ -51,7 +51,7 @@ class Report(Printed):
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
 
     def __call__(self) -> None:
-        from rbpf.validation.report.page import write_report
+        from rbpf.validation.report.validate import write_report
 
         _answer(write_report(self.run), self.run, self.json)
 
@@ -91,9 +91,8 @@ class Sweep(Printed):
     scheduler: Text = None  #: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
 
     def __call__(self) -> None:
-        from rbpf.validation.sweep.plan import read_plan
-        from rbpf.validation.sweep.sweep import TABLE
-        from rbpf.validation.sweep.sweep import sweep as run_all
+        from rbpf.validation.sweep import TABLE, read_plan
+        from rbpf.validation.sweep import sweep as run_all
 
         if self.workers == 0 or self.workers < -1:
             raise InputError(f"--workers must be at least 1, or -1 for one per core, got {self.workers}")

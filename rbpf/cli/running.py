@@ -260,21 +260,26 @@ def _filtered(options: RunOptions, recording: "Recording", config: Any, out: Pat
 
 def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, video: bool) -> None:
     """Filters, then writes everything, with a bar for each stage of the work."""
-    from rbpf.validation.finish import Callbacks, finish_run
-    from rbpf.validation.report.rerun import require_rerun
+    from rbpf.validation.finish import finish_run
+    from rbpf.validation.report.video import require_rerun
 
     if options.rerun is not None:
         require_rerun()
     with _prepared(options) as out, progress() as bar:
         run = _filtered(options, recording, config, out, bar("filtering"))
         solving = bar("batch")
-        callbacks = Callbacks(
-            on_frame=bar("drawing"),
-            on_iteration=lambda count, _error: solving(count, None),
-            most_iterations=options.batch_limit,
-        )
         with finishing():
-            entries = finish_run(run, out, recording.sources(), video, options.rerun, options.batch, callbacks)
+            entries = finish_run(
+                run,
+                out,
+                recording.sources(),
+                video,
+                options.rerun,
+                options.batch,
+                on_frame=bar("drawing"),
+                on_iteration=lambda count, _error: solving(count, None),
+                most_iterations=options.batch_limit,
+            )
     _finish(entries, options, out, run.failure)
 
 

@@ -92,9 +92,9 @@ class Measurements:
 
 
 class InitialEstimate(NamedTuple):
-    """Where an optimiser starts: world_from_robot (T, E), and name of each landmark to its (D,) position."""
+    """Where an optimiser starts: world_from_body (T, E), and name of each landmark to its (D,) position."""
 
-    world_from_robot: Array
+    world_from_body: Array
     landmarks: Mapping[int, Array]
 
 

@@ -160,7 +160,7 @@ def test_a_missing_rerun_is_said_before_the_run(desk, tmp_path, monkeypatch, cap
 def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    for name in ("finish", "report.rerun", "report.video"):
+    for name in ("finish", "report.video"):
         assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
 
 

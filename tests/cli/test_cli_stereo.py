@@ -147,7 +147,7 @@ def test_the_batch_stands_beside(finished):
 
 def test_a_run_is_compared_with_a_reconstruction(finished, tmp_path, monkeypatch, capsys):
     """The baseline tells the scale; so few pairs must all be key frames, and begin with a smaller angle."""
-    importlib.import_module("rbpf.validation.colmap.against_colmap")  # names the class as the type of an argument
+    importlib.import_module("rbpf.validation.colmap.compare")  # names the class as the type of an argument
     near = ReconstructionOptions(every=1, features=800, least_angle_deg=4.0)
     monkeypatch.setattr("rbpf.validation.colmap.reconstruct.ReconstructionOptions", lambda: near)
     folder = shutil.copytree(finished, tmp_path / "run")

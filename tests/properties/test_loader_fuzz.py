@@ -20,8 +20,7 @@ from rbpf.systems.mono.known_map import KnownMap, known_map_arrays, read_known_m
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.comparison import read_comparisons
-from rbpf.validation.sweep.plan import read_plan
-from rbpf.validation.sweep.sweep import read_rows
+from rbpf.validation.sweep import read_plan, read_rows
 from tests.properties.mutations import damaged, read_or_refused, restored
 
 pytestmark = pytest.mark.slow

@@ -11,10 +11,11 @@ from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_opened, open_features
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.simulation.lab import LabDrive
 
 pytestmark = pytest.mark.slow
@@ -55,8 +56,8 @@ def rmse(log: FeatureLog, poses: np.ndarray) -> float:
 
 def test_beside_the_batch(log, run):
     """The filter sees the past only, the batch all of it; the odometry forgets."""
-    start = CameraEstimate(run.log.poses, {})
-    batch = solve_features(log, start, marginals=False).world_from_camera
+    start = InitialEstimate(run.log.poses, {})
+    batch = solve_features(log, start, marginals=False).world_from_body
     batch = SE3.between(batch[0], batch)
     ours, best, alone = (rmse(log, poses) for poses in (run.log.poses, batch, run.log["odometry"]))
     assert ours < 2.5 * best

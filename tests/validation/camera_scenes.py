@@ -66,7 +66,7 @@ def _known(names: Array, places: Array, rng: np.random.Generator) -> KnownPoints
 
 
 class Reference(NamedTuple):
-    """Optimum and covariances as in a `CameraSolution`, landmarks in the order of their names."""
+    """Optimum and covariances as in a `BatchSolution`, landmarks in the order of their names."""
 
     world_from_camera: Array
     landmarks: Array

@@ -100,7 +100,7 @@ def test_landmarks_that_both_maps_have_are_compared():
     [
         ({"delta": 0}, "whole number of frames"),
         ({"delta": 40}, "longer than 40 frames"),
-        ({"unit": "m"}, "frames or metres, found 'm'"),
+        ({"unit": "m"}, "frames or metres, found 1 m"),
     ],
 )
 def test_a_delta_that_makes_no_pair_is_refused(wander, arguments, words):

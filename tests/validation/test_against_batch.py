@@ -27,7 +27,7 @@ from rbpf.validation.consistency.against_batch import (
     compare_run,
     compare_with_batch,
 )
-from rbpf.validation.gtsam.batch_problem import problem_of, solve_problem
+from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
@@ -164,7 +164,8 @@ def test_a_folder_that_is_no_finished_run_is_refused(folder, spoil, says):
 
 
 def test_path_and_measurements_of_different_runs_are_refused(linear_run):
-    filtered, problem = PathAndMap.of_run(linear_run), problem_of(linear_run)
+    filtered = PathAndMap.of_run(linear_run)
+    problem = linear_run.system.measurements(linear_run.name, linear_run.log)
     later = replace(filtered, stamps_ns=filtered.stamps_ns + 1)
     with pytest.raises(InputError, match="do not share their time stamps"):
         compare(later, problem)

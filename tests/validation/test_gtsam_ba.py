@@ -28,7 +28,7 @@ def test_the_optimum_and_its_covariance_are_scipys(dim, kind, singular, noise):
     m = world(dim, kind, singular, noise=noise)
     found, expected = solve(m), solve_by_scipy(m)
     assert found.error == pytest.approx(expected.error, rel=1e-9)
-    assert np.abs(m.space.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6 * noise
+    assert np.abs(m.space.local(expected.world_from_robot, found.world_from_body)).max() < 1e-6 * noise
     names = sorted(found.landmarks)
     assert names == np.unique(m.landmarks).tolist()
     np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=1e-6 * noise)
@@ -40,10 +40,10 @@ def test_the_start_is_known_and_a_robot_that_cannot_slip_does_not():
     m = world(2, "range_bearing", singular=True)
     found = solve(m)
     np.testing.assert_array_equal(found.cov_poses[0], np.zeros((3, 3)))
-    np.testing.assert_allclose(found.world_from_robot[0], m.start, atol=1e-12)
-    predicted = m.space.compose(found.world_from_robot[:-1], m.deltas)
+    np.testing.assert_allclose(found.world_from_body[0], m.start, atol=1e-12)
+    predicted = m.space.compose(found.world_from_body[:-1], m.deltas)
     slip = np.linalg.eigh(m.covs[0])[1][:, 0]
-    slipped = m.space.local(predicted, found.world_from_robot[1:]) @ slip
+    slipped = m.space.local(predicted, found.world_from_body[1:]) @ slip
     assert np.abs(slipped).max() < 1e-9
 
 
@@ -57,7 +57,7 @@ def test_a_robust_loss_is_opt_in_and_is_hubers():
     expected = solve_by_scipy(bad, robust=1.345)
     assert robust.error == pytest.approx(expected.error, rel=1e-9)
     # SciPy's numeric derivatives stop a little short of the kinked loss' minimum.
-    assert np.abs(SE2.local(expected.world_from_robot, robust.world_from_robot)).max() < 1e-4
+    assert np.abs(SE2.local(expected.world_from_robot, robust.world_from_body)).max() < 1e-4
     off = [
         np.linalg.norm(s.landmarks[int(m.landmarks[5])] - clean.landmarks[int(m.landmarks[5])]) for s in (plain, robust)
     ]
@@ -69,11 +69,11 @@ def test_any_start_near_by_leads_to_the_same_optimum():
     m = world(2, "range_bearing", steps=CHUNK + 10)
     expected = solve(m)
     rng = np.random.default_rng(4)
-    moved = SE2.retract(expected.world_from_robot, 0.05 * rng.normal(size=expected.cov_poses.shape[:2]))
+    moved = SE2.retract(expected.world_from_body, 0.05 * rng.normal(size=expected.cov_poses.shape[:2]))
     points = {name: point + 0.05 * rng.normal(size=2) for name, point in expected.landmarks.items()}
     for found in (solve(m, initial=InitialEstimate(moved, points)), solve(m, incremental=True)):
         assert found.error == pytest.approx(expected.error, rel=1e-9)
-        assert np.abs(SE2.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6
+        assert np.abs(SE2.local(expected.world_from_body, found.world_from_body)).max() < 1e-6
 
 
 def first_steps(m, count):
@@ -89,10 +89,10 @@ def test_the_online_optimum_knows_nothing_of_the_future():
     found = solve_online(m)
     for step in (5, 9, 14):
         then = solve(first_steps(m, step + 1))
-        off = m.space.local(then.world_from_robot[-1], found[step])
+        off = m.space.local(then.world_from_body[-1], found[step])
         assert (np.abs(off) < 0.1 * np.sqrt(np.diag(then.cov_poses[-1]))).all()
     whole = solve(m)
-    early = m.space.local(whole.world_from_robot[5], found[5])
+    early = m.space.local(whole.world_from_body[5], found[5])
     assert (np.abs(early) > 0.3 * np.sqrt(np.diag(whole.cov_poses[5]))).any()
 
 
@@ -101,7 +101,7 @@ def test_without_sightings_dead_reckoning_comes_back(singular):
     m = world(2, "position", singular)
     blind = seen(m, m.steps[:0], m.landmarks[:0], m.z[:0], m.cov_z[:0])
     found = solve(blind)
-    np.testing.assert_allclose(found.world_from_robot, dead_reckoning(m), atol=1e-12)
+    np.testing.assert_allclose(found.world_from_body, dead_reckoning(m), atol=1e-12)
     assert found.landmarks == {}
     assert found.cov_landmarks == {}
     first = m.covs[0]
@@ -121,9 +121,9 @@ def test_bad_input_is_refused_in_words():
         solve(m, robust=0.0)
     start = initial_estimate(m)
     with pytest.raises(InputError, match=re.escape("every landmark seen, landmark 7 is missing")):
-        solve(m, initial=InitialEstimate(start.world_from_robot, {k: v for k, v in start.landmarks.items() if k != 7}))
+        solve(m, initial=InitialEstimate(start.world_from_body, {k: v for k, v in start.landmarks.items() if k != 7}))
     with pytest.raises(InputError, match=re.escape("found poses of shape (3, 3)")):
-        solve(m, initial=InitialEstimate(start.world_from_robot[:3], start.landmarks))
+        solve(m, initial=InitialEstimate(start.world_from_body[:3], start.landmarks))
 
 
 def test_a_variable_that_is_not_determined_is_named():

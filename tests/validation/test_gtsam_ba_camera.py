@@ -9,7 +9,8 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import KnownPoints
-from rbpf.validation.gtsam.camera import CameraEstimate, begin, solve_features
+from rbpf.sensors.readers.measurements import InitialEstimate
+from rbpf.validation.gtsam.camera import begin, solve_features
 from rbpf.validation.gtsam.camera_graph import CameraProblem, adjust
 from rbpf.validation.gtsam.observations import known_by_name, observation_table
 from rbpf.validation.gtsam.solvers import marginals_by_schur
@@ -24,7 +25,7 @@ def estimate(log, seed=5, scale=0.02):
     rng = np.random.default_rng(seed)
     path = log.truth.world_from_camera
     moved = SE3.retract(path, scale * rng.normal(size=(len(path), 6)))
-    return CameraEstimate(moved, {n: p + scale * rng.normal(size=3) for n, p in log.truth.landmarks.items()})
+    return InitialEstimate(moved, {n: p + scale * rng.normal(size=3) for n, p in log.truth.landmarks.items()})
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -35,7 +36,7 @@ def test_the_optimum_and_its_covariance_are_scipys(camera):
 
 def assert_same(found, expected):
     assert found.error == pytest.approx(expected.error, rel=1e-8)
-    assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-6
+    assert np.abs(SE3.local(expected.world_from_camera, found.world_from_body)).max() < 1e-6
     names = sorted(found.landmarks)
     np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=2e-6)
     assert_same_covariances(found.cov_poses, expected.cov_poses, 1e-4)
@@ -48,21 +49,21 @@ def test_without_known_points_the_first_pose_and_the_scale_are_held(camera):
     log = scene(camera, known=0)
     start = estimate(log)
     found = solve_features(log, start)
-    np.testing.assert_allclose(SE3.local(start.world_from_camera[0], found.world_from_camera[0]), 0, atol=1e-9)
+    np.testing.assert_allclose(SE3.local(start.world_from_body[0], found.world_from_body[0]), 0, atol=1e-9)
     np.testing.assert_array_equal(found.cov_poses[0], np.zeros((6, 6)))
-    far = int(np.argmax(_distances(start.world_from_camera)))
-    held, kept = _distances(found.world_from_camera)[far], _distances(start.world_from_camera)[far]
+    far = int(np.argmax(_distances(start.world_from_body)))
+    held, kept = _distances(found.world_from_body)[far], _distances(start.world_from_body)[far]
     other = solve_features(log, estimate(log, seed=9))
     assert other.error == pytest.approx(found.error, rel=1e-9)
-    scale = _distances(other.world_from_camera)[1:] / _distances(found.world_from_camera)[1:]
+    scale = _distances(other.world_from_body)[1:] / _distances(found.world_from_body)[1:]
     np.testing.assert_allclose(scale, scale[0], rtol=1e-5)
     if camera is STEREO:
         assert scale[0] == pytest.approx(1.0, abs=1e-5)
     else:
         assert held == pytest.approx(kept, rel=1e-7)
-        along = found.world_from_camera[far, 4:] - found.world_from_camera[0, 4:]
-        cov = SE3.rotation(found.world_from_camera[far]) @ found.cov_poses[far, 3:, 3:]
-        cov = cov @ SE3.rotation(found.world_from_camera[far]).T
+        along = found.world_from_body[far, 4:] - found.world_from_body[0, 4:]
+        cov = SE3.rotation(found.world_from_body[far]) @ found.cov_poses[far, 3:, 3:]
+        cov = cov @ SE3.rotation(found.world_from_body[far]).T
         assert along @ cov @ along < 1e-9 * np.trace(cov) * along @ along
 
 
@@ -73,13 +74,13 @@ def _distances(path):
 def test_points_known_exactly_stay_where_they_are():
     log = scene()
     exact = replace(log, known=KnownPoints(log.known.names, log.known.positions, np.zeros_like(log.known.cov)))
-    found = solve_features(exact, CameraEstimate(log.truth.world_from_camera, {}))
+    found = solve_features(exact, InitialEstimate(log.truth.world_from_camera, {}))
     tight = replace(log, known=KnownPoints(log.known.names, log.known.positions, 1e-6 * log.known.cov))
     near = solve_features(tight, estimate(log))
     for name, position in zip(log.known.names.tolist(), log.known.positions, strict=True):
         np.testing.assert_allclose(found.landmarks[name], position, atol=1e-12)
         assert np.abs(found.cov_landmarks[name]).max() < 1e-20
-    assert np.abs(SE3.local(near.world_from_camera, found.world_from_camera)).max() < 1e-4
+    assert np.abs(SE3.local(near.world_from_body, found.world_from_body)).max() < 1e-4
 
 
 def test_a_robust_loss_is_opt_in_and_is_hubers():
@@ -95,9 +96,9 @@ def test_a_robust_loss_is_opt_in_and_is_hubers():
     )
     expected = solve_by_scipy(bad, robust=1.345)
     assert robust.error == pytest.approx(expected.error, rel=1e-6)
-    off = [np.abs(SE3.local(clean.world_from_camera, s.world_from_camera)).max() for s in (plain, robust)]
+    off = [np.abs(SE3.local(clean.world_from_body, s.world_from_body)).max() for s in (plain, robust)]
     assert off[0] > 3 * off[1]
-    assert np.abs(SE3.local(expected.world_from_camera, robust.world_from_camera)).max() < 1e-3
+    assert np.abs(SE3.local(expected.world_from_camera, robust.world_from_body)).max() < 1e-3
 
 
 def adjusted(camera, known: str):
@@ -111,7 +112,7 @@ def adjusted(camera, known: str):
     if log.known is not None:
         names = known_by_name(log.known, table.names)
     problem = CameraProblem(log.name, len(log.frames), table, names)
-    start = begin(problem, CameraEstimate(log.truth.world_from_camera, {}))
+    start = begin(problem, InitialEstimate(log.truth.world_from_camera, {}))
     return adjust(problem, start)
 
 

@@ -11,8 +11,8 @@ from examples.studies.point_worlds import STEREO as PAIR
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
-from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
-from rbpf.validation.gtsam.camera_start import locate
+from rbpf.sensors.readers.measurements import InitialEstimate
+from rbpf.validation.gtsam.camera import locate, solve_features
 from rbpf.validation.gtsam.observations import ObservationTable
 from tests.validation.camera_scenes import BENT, PLAIN, STEREO, WHOLE, scene
 
@@ -22,7 +22,7 @@ SQUARE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.3, 0.0], [0.0, 0.3,
 
 
 def true_start(log):
-    return CameraEstimate(log.truth.world_from_camera, {})
+    return InitialEstimate(log.truth.world_from_camera, {})
 
 
 def shown(log, step, names, z):
@@ -43,7 +43,7 @@ def test_the_same_optimum_is_found_from_scratch(camera):
     log = scene(camera, frames=12, points=25, noise_px=0.5)
     found, expected = (solve_features(log, start, marginals=False) for start in (None, true_start(log)))
     assert found.error == pytest.approx(expected.error, rel=1e-6)
-    assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-4
+    assert np.abs(SE3.local(expected.world_from_camera, found.world_from_body)).max() < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_camera_that_rests_at_first_is_followed(camera, known, outliers):
     path = log.truth.world_from_camera
     if not known:
         path = SE3.compose(SE3.inverse(path[0]), path)
-    errors = np.sqrt(np.square(SE3.local(path, found.world_from_camera)).mean(0))
+    errors = np.sqrt(np.square(SE3.local(path, found.world_from_body)).mean(0))
     assert errors.max() < 0.015
 
 
@@ -83,7 +83,7 @@ def test_a_landmark_that_an_outlier_draws_into_its_camera_is_left_out():
     left_out = set(names[counts > 1].tolist()) - set(found.landmarks)
     assert left_out
     assert left_out <= set(found.undetermined)
-    assert np.abs(SE3.local(log.truth.world_from_camera, found.world_from_camera)).max() < 0.03
+    assert np.abs(SE3.local(log.truth.world_from_camera, found.world_from_body)).max() < 0.03
 
 
 def test_a_stereo_pair_places_a_landmark_seen_once():
@@ -92,7 +92,7 @@ def test_a_stereo_pair_places_a_landmark_seen_once():
     once = shown(log, 2, np.array([7]), STEREO.project(point)[None])
     found = solve_features(once, true_start(log))
     assert found.undetermined == []
-    np.testing.assert_allclose(SE3.inverse_transform(found.world_from_camera[2], found.landmarks[7]), point, atol=1e-6)
+    np.testing.assert_allclose(SE3.inverse_transform(found.world_from_body[2], found.landmarks[7]), point, atol=1e-6)
 
 
 def test_a_star_keeps_its_direction_and_helps_the_rotation():
@@ -106,7 +106,7 @@ def test_a_star_keeps_its_direction_and_helps_the_rotation():
     found, without = (solve_features(one, true_start(log)) for one in (starry, log))
     assert found.undetermined == [7, 8]
     for name, star in zip((7, 8), stars, strict=True):
-        seen = SE3.inverse_transform(found.world_from_camera[2], found.landmarks[name])
+        seen = SE3.inverse_transform(found.world_from_body[2], found.landmarks[name])
         assert seen[2] > 0
         np.testing.assert_allclose(PLAIN.project(seen), PLAIN.project(star), atol=1.5)
     for one, other in zip(found.cov_poses[1:], without.cov_poses[1:], strict=True):
@@ -171,10 +171,10 @@ def test_an_unusable_estimate_is_refused():
     log = scene(known=0)
     path, points = log.truth.world_from_camera, log.truth.landmarks
     with pytest.raises(InputError, match=re.escape("shape (6, 7), one for each frame of small scene, found (3, 7)")):
-        solve_features(log, CameraEstimate(path[:3], points))
+        solve_features(log, InitialEstimate(path[:3], points))
     with pytest.raises(InputError, match="All initial poses of small scene are at one place"):
-        solve_features(log, CameraEstimate(np.tile(path[:1], (6, 1)), points))
+        solve_features(log, InitialEstimate(np.tile(path[:1], (6, 1)), points))
     turned = path.copy()
     turned[3] = SE3.retract(path[3], np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
     with pytest.raises(InputError, match=r"Landmark \d+ lies behind the camera in frame \d of small scene"):
-        solve_features(log, CameraEstimate(turned, points))
+        solve_features(log, InitialEstimate(turned, points))

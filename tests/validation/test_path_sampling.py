@@ -20,7 +20,7 @@ from tests.validation.worlds import seen, world
 
 def drawn(m, draws=400, seed=0):
     found = solve(m, marginals=False)
-    start = InitialEstimate(found.world_from_robot, found.landmarks)
+    start = InitialEstimate(found.world_from_body, found.landmarks)
     return draw_posterior(m, start, np.random.default_rng(seed), draws)
 
 
@@ -49,7 +49,7 @@ def test_in_a_linear_world_all_draws_count_the_same_and_the_evidence_is_the_kalm
 def test_in_a_linear_world_the_draws_have_the_moments_of_the_posterior(linear):
     found, batch = drawn(linear, 20_000), solve(linear)
     assert (found.world_from_robot[..., 0] == 0.0).all()
-    moves = found.world_from_robot - batch.world_from_robot
+    moves = found.world_from_robot - batch.world_from_body
     for t in (1, 6, 11):
         np.testing.assert_allclose(moves[:, t].mean(0), 0.0, atol=0.03 * np.sqrt(batch.cov_poses[t, 1, 1]))
         np.testing.assert_allclose(np.cov(moves[:, t, 1:].T), batch.cov_poses[t, 1:, 1:], rtol=0.05, atol=2e-4)

@@ -9,8 +9,7 @@ from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.runs.run import Run
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
-from rbpf.validation.report.rerun import recording
-from rbpf.validation.report.video import FEATURES, annotated_frames, drawn_size, frame_rate, is_complete
+from rbpf.validation.report.video import FEATURES, annotated_frames, drawn_size, frame_rate, is_complete, recording
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
+from rbpf.sensors.calibration import Board
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_scene import Chessboard, ImageWorld, Rectangle, TexturedScene, cast
+from rbpf.validation.simulation.textured_scene import ImageWorld, Rectangle, TexturedScene, cast
 from rbpf.validation.simulation.textures import clouds, grey_levels
 
 CAMERA = Pinhole(160, 120, 110.0, 108.0, 78.0, 61.5)
@@ -33,10 +34,12 @@ def noise(side: int, seed: int = 0) -> np.ndarray:
     return grey_levels(128.0 + 30.0 * clouds((side, side), np.random.default_rng(seed)))
 
 
-def squares(board: Chessboard, camera: Pinhole, pose: np.ndarray, px: np.ndarray) -> np.ndarray:
+def squares(
+    board: Board, world_from_board: np.ndarray, camera: Pinhole, pose: np.ndarray, px: np.ndarray
+) -> np.ndarray:
     """Grey levels (…) of a chessboard at pixels (…, 2), from the board's definition alone."""
     ray = np.concatenate([camera.unproject(px), np.ones((*px.shape[:-1], 1))], axis=-1)
-    board_from_camera = SE3.compose(SE3.inverse(board.world_from_board), pose)
+    board_from_camera = SE3.compose(SE3.inverse(world_from_board), pose)
     eye = board_from_camera[4:]
     turned = SE3.transform(board_from_camera, ray) - eye
     place = eye - eye[2] / turned[..., 2:] * turned
@@ -49,20 +52,20 @@ def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
     """A window about each corner is registered (least squares) to the mean of 9 × 9 exact rays per pixel."""
     cv2 = pytest.importorskip("cv2")
     scene = drawn(DESK)
-    board = scene.boards[0]
+    board, lies = scene.boards[0]
     renderer = Renderer(scene.rectangles, camera)
     around = np.stack(np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0)), axis=-1)
     within = np.stack(np.meshgrid(*[(np.arange(9) - 4.0) / 9.0] * 2), axis=-1)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     for pose in scene.world_from_camera[-1:]:
         image = renderer.image(pose)
-        points = SE3.inverse_transform(pose, board.corners)
+        points = SE3.inverse_transform(pose, SE3.transform(lies, board.corners))
         project = cv2.fisheye.projectPoints if camera.distortion_model == "equidistant" else cv2.projectPoints
         none, distortion = np.zeros((3, 1)), np.array(camera.distortion)
         seen = project(points[:, None], none, none, matrix, distortion)[0].reshape(-1, 2)
         for corner in seen:
             px = np.round(corner) + around
-            exact = squares(board, camera, pose, px[:, :, None, None] + within).mean(axis=(2, 3))
+            exact = squares(board, lies, camera, pose, px[:, :, None, None] + within).mean(axis=(2, 3))
             down, across = np.gradient(exact)
             slope = np.stack([across, down], axis=-1)[1:-1, 1:-1].reshape(-1, 2)
             column, row = np.moveaxis(px.astype(int)[1:-1, 1:-1], -1, 0)

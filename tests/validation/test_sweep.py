@@ -6,10 +6,9 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.errors import InputError
+from rbpf.validation import sweep as sweeping
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.sweep import sweep as sweeping
-from rbpf.validation.sweep.plan import SweepFile, plan, read_plan
-from rbpf.validation.sweep.sweep import ROWS, TABLE, read_rows, sweep
+from rbpf.validation.sweep import ROWS, TABLE, SweepFile, plan, read_plan, read_rows, sweep
 from tests.cli.mono_sequences import FRAMES, render_desk
 from tests.cli.stereo_sequences import render_room
 

@@ -11,7 +11,7 @@ from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.runs.results import load
 from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers import Truth
-from rbpf.validation.report.page import _images, write_report
+from rbpf.validation.report.validate import _images, write_report
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")

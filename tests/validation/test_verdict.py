@@ -12,10 +12,17 @@ from rbpf.runs.folder import write_run
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.results import Results
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
-from rbpf.validation.consistency.comparison import INNOVATIONS, compare_with_itself, innovation_statistics, noise_advice
+from rbpf.validation.consistency.comparison import (
+    INNOVATIONS,
+    Verdict,
+    compare_with_itself,
+    grade_path,
+    innovation_statistics,
+    judge,
+    noise_advice,
+)
 from rbpf.validation.consistency.statistic import coverage, step_ratio, variance_ratio, whitened_errors
-from rbpf.validation.consistency.verdict import Verdict, grade_path, judge
-from rbpf.validation.report.page import verdict_of
+from rbpf.validation.report.validate import verdict_of
 from tests.validation.fixes import Receiver, Walk
 
 ALIKE = {
@@ -79,8 +86,8 @@ def test_one_that_claims_too_much_outweighs_all_that_are_cautious():
     """A wide innovation must not hide a pose that is further off than it says."""
     cautious = variance_ratio("innovations", 0.01, 5000.0, 1.1)
     daring = variance_ratio("poses", 20.0, 50.0, 2.0)
-    few_inside = coverage(np.full(200, 30.0), 6, 200.0, (0.5,))
-    many_inside = coverage(np.full(5000, 0.1), 6, 5000.0, (0.5,))
+    few_inside = coverage(np.full(200, 30.0), 6, 200.0)[:1]
+    many_inside = coverage(np.full(5000, 0.1), 6, 5000.0)[:1]
     assert judge(many_inside, [many_inside[0].name]).leaning == "cautious"
     assert judge([cautious, daring]).leaning == "over-confident"
     assert judge([cautious, daring]).reason.startswith("poses: ")

@@ -1,4 +1,4 @@
-"""How far a path and a map are from COLMAP's reconstruction: camera centres, and distances between the clouds.
+"""How far a run's path and map, or the truth, are from COLMAP's reconstruction: camera centres, and distances between clouds.
 
 COLMAP's world and scale are its own: its cameras are brought onto the reference's by the best similarity, or by the
 best rigid motion where a stereo pair gave the scale. Then one metre is the reference's.
@@ -7,7 +7,9 @@ Two detectors seldom choose the same spots, so the nearest point is about as far
 from the plane of the nearest points does not depend on that where the surface is smooth.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -15,10 +17,14 @@ from scipy.spatial import cKDTree
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.runs.provenance import read_config
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Similarity, Trajectory, associate
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction
+from rbpf.sensors.readers import ImageSequence
+from rbpf.validation.colmap.model import OVER_IMAGES, recorded_images
+from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction, ReconstructionOptions, reconstruct
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
 NEIGHBOURS = 6
@@ -77,16 +83,41 @@ class ColmapComparison:
         }
 
 
+def compare_folder_with_colmap(
+    folder: Path, options: ReconstructionOptions | None = None
+) -> tuple[ColmapComparison, ColmapComparison | None]:
+    """Reconstructs the images that a run folder's config.yaml names, which must still lie where they were, and compares."""
+    config = read_config(folder)
+    if config["system"] not in OVER_IMAGES:
+        raise InputError(
+            f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
+        )
+    sequence = recorded_images(config)
+    if config["system"] == "mono" and sequence.camera.lens.is_identity:
+        # Where the recording is a rectified pair, of which the run saw the left images, both take part.
+        with suppress(InputError):
+            pair = recorded_images({**config, "system": "stereo"})
+            if pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns):
+                sequence = pair
+    return compare_with_colmap(RunFolder.open(folder).estimate, sequence, options)
+
+
+def compare_with_colmap(
+    estimate: PathAndMap, sequence: ImageSequence, options: ReconstructionOptions | None = None
+) -> tuple[ColmapComparison, ColmapComparison | None]:
+    """A run beside the reconstruction of its images, and this beside the truth: how good COLMAP itself is, None without."""
+    found, points = reconstruct(sequence, options), estimate.landmarks
+    run = compare_with_path(found, estimate.trajectory, points.mean, points.cov)
+    return run, None if sequence.truth is None else compare_with_truth(found, sequence.truth)
+
+
 def compare_with_path(
     found: Reconstruction, reference: Trajectory, landmarks: Array | None = None, cov_landmarks: Array | None = None
 ) -> ColmapComparison:
     """COLMAP beside a filter's path and, if given, its map.
 
-    The poses of the camera at the key frames' times are compared, and landmarks (M, 3) of covariances (M, 3, 3) in the
-    reference's world.
-
-    Raises:
-        InputError: the two share too few instants.
+    The poses of the camera at the key frames' times are compared, of which there must be enough, and landmarks (M, 3) of
+    covariances (M, 3, 3) in the reference's world.
     """
     ours, theirs = associate(found.path, reference)
     if len(ours) < LEAST_FRAMES:
@@ -113,11 +144,7 @@ def compare_with_path(
 
 
 def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> ColmapComparison:
-    """COLMAP beside the truth, interpolated at the key frames.
-
-    Raises:
-        InputError: there is no truth, or too little of it.
-    """
+    """COLMAP beside the truth, interpolated at the key frames; an InputError where there is none, or too little."""
     if truth is None:
         raise InputError(f"{found.name} has no ground truth to compare with; compare with a run's path instead.")
     rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, found.stamps_ns)
@@ -130,11 +157,7 @@ def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> Colm
 
 
 def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None = None) -> CloudDistance:
-    """Distances of landmarks (M, 3), of covariances (M, 3, 3), to a cloud (P, 3).
-
-    Raises:
-        InputError: the cloud or the map is too small.
-    """
+    """Distances of M >= 1 landmarks (M, 3), of covariances (M, 3, 3), to a cloud (P, 3) of P >= 3 points."""
     if len(cloud) < LEAST_POINTS or not len(landmarks):
         found = f"{len(cloud)} and {len(landmarks)}"
         raise InputError(f"Expected {LEAST_POINTS} or more points of a cloud and a landmark, found {found}.")

@@ -1,4 +1,4 @@
-"""COLMAP's cameras, pixels and poses in ours, and a reconstruction made of a path, a map and its observations.
+"""COLMAP's cameras, pixels and poses in ours; a reconstruction made of a path, a map and its observations; its images.
 
 COLMAP writes poses as camera-from-world and puts the centre of the top-left pixel at (0.5, 0.5); here poses are
 world-from-camera and it is at (0, 0). The half pixel is added and taken away in this module and nowhere else.
@@ -9,57 +9,54 @@ of the map.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
 from rbpf.lie import SE3, Array
+from rbpf.runs.files import prepare_folder
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.readers import ImageSequence, Part, Topics, open_images, open_stereo
+from rbpf.sensors.readers.images.decoding import FileImages
+from rbpf.sensors.readers.images.sequence import Source
+from rbpf.sensors.readers.part import Chosen
 from rbpf.validation.gtsam.observations import ObservationTable
 
 HALF_PX = 0.5
 """Added to our pixels it gives COLMAP's."""
 LEFT, RIGHT = 1, 2
 """Numbers of the cameras."""
+OVER_IMAGES = "mono", "stereo"
+"""Systems whose runs have images."""
+Names = dict[tuple[int, int], str]
+"""Names of images by frame and side."""
+
+_UPRIGHT = 1
+"""What a photo's tag of its orientation says where it is not turned."""
 
 
-def camera_model(camera: Pinhole) -> tuple[str, list[float]]:
-    """Name and parameters of COLMAP's model that is exactly our camera.
+def to_colmap_camera(camera: Pinhole, camera_id: int = 1) -> Any:
+    """The `pycolmap.Camera` that is exactly our camera, with a known focal length.
 
     PINHOLE without distortion; OPENCV with k1, k2, p1, p2; FULL_OPENCV, whose denominator is left at 1, with k3;
     OPENCV_FISHEYE where it is equidistant.
     """
-    plain = [camera.fx, camera.fy, camera.cx + HALF_PX, camera.cy + HALF_PX]
+    import pycolmap
+
+    lens = list(camera.distortion)
     if camera.distortion_model == "equidistant":
-        return "OPENCV_FISHEYE", [*plain, *camera.distortion]
-    *four, k3 = camera.distortion
-    if k3:
-        return "FULL_OPENCV", [*plain, *four, k3, 0.0, 0.0, 0.0]
-    return ("OPENCV", [*plain, *four]) if any(four) else ("PINHOLE", plain)
-
-
-def to_colmap_camera(camera: Pinhole, camera_id: int = 1) -> Any:
-    """A `pycolmap.Camera` with a known focal length."""
-    import pycolmap
-
-    name, params = camera_model(camera)
-    return pycolmap.Camera(
-        model=name,
-        width=camera.width,
-        height=camera.height,
-        params=params,
-        camera_id=camera_id,
-        has_prior_focal_length=True,
-    )
-
-
-def to_colmap_pose(world_from_camera: ArrayLike) -> Any:
-    """The `pycolmap.Rigid3d` cam_from_world of a pose (7,)."""
-    import pycolmap
-
-    inverse = SE3.inverse(np.asarray(world_from_camera, dtype=float))
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:4]), inverse[4:])
+        name = "OPENCV_FISHEYE"
+    elif lens[4]:
+        name, lens = "FULL_OPENCV", [*lens, 0.0, 0.0, 0.0]
+    else:
+        name, lens = ("OPENCV", lens[:4]) if any(lens) else ("PINHOLE", [])
+    params = [camera.fx, camera.fy, camera.cx + HALF_PX, camera.cy + HALF_PX, *lens]
+    found = pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=params, camera_id=camera_id)
+    found.has_prior_focal_length = True
+    return found
 
 
 def from_colmap_pose(cam_from_world: Any) -> Array:
@@ -78,7 +75,7 @@ def build_model(
     world_from_camera: Array,
     points: Array,
     colours: NDArray[np.uint8] | None = None,
-    names: Mapping[tuple[int, int], str] | None = None,
+    names: Names | None = None,
 ) -> Any:
     """A `pycolmap.Reconstruction`.
 
@@ -95,19 +92,18 @@ def build_model(
     stereo = isinstance(camera, RectifiedStereo)
     sides = (LEFT, RIGHT) if stereo else (LEFT,)
     pixels = {LEFT: table.z[:, :2], RIGHT: table.z[:, [-1, 1]]}
+    rig, sensors = pycolmap.Rig(rig_id=1), {}
+    for side in sides:
+        model.add_camera(to_colmap_camera(camera.camera if isinstance(camera, RectifiedStereo) else camera, side))
+        sensors[side] = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, side)
+    rig.add_ref_sensor(sensors[LEFT])
     if isinstance(camera, RectifiedStereo):
-        sensors = {side: pycolmap.sensor_t(pycolmap.SensorType.CAMERA, side) for side in sides}
-        for side in sides:
-            model.add_camera(to_colmap_camera(camera.camera, side))
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(sensors[LEFT])
         # A point at depth z is baseline · f / z further left in the right image.
         shift = np.array([-camera.baseline_m, 0.0, 0.0])
         rig.add_sensor(sensors[RIGHT], pycolmap.Rigid3d(pycolmap.Rotation3d(), shift))
-        model.add_rig(rig)
-    else:
-        model.add_camera_with_trivial_rig(to_colmap_camera(camera, LEFT))
-    for step, pose in enumerate(world_from_camera):
+    model.add_rig(rig)
+    for step, inverse in enumerate(SE3.inverse(world_from_camera)):
+        cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:4]), inverse[4:])
         rows = np.flatnonzero(table.steps == step)
         images = [
             pycolmap.Image(
@@ -119,15 +115,13 @@ def build_model(
             for side in sides
             if names is None or (step, side) in names
         ]
-        if not stereo or not images:
-            for image in images:
-                model.add_image_with_trivial_frame(image, to_colmap_pose(pose))
+        if not images:
             continue
         frame = pycolmap.Frame(frame_id=step + 1, rig_id=1)
         for image in images:
             image.frame_id = step + 1
             frame.add_data_id(image.data_id)
-        frame.rig_from_world = to_colmap_pose(pose)
+        frame.rig_from_world = cam_from_world
         model.add_frame(frame)
         for image in images:
             model.add_image(image)
@@ -155,3 +149,61 @@ def build_model(
 def image_id(frame: int, side: int = LEFT, stereo: bool = False) -> int:
     """Number of an image in a model."""
     return 2 * frame + side if stereo else frame + 1
+
+
+def recorded_images(config: Mapping[str, Any]) -> ImageSequence:
+    """The images that a run's config.yaml names; an InputError where they are not where they were."""
+    opened = open_stereo if config["system"] == "stereo" else open_images
+    topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
+    return opened(Path(str(config["recording"])), config.get("calibration"), topics=topics, part=Part.of(config))
+
+
+def lay_out(sequence: ImageSequence, folder: Path, count: int) -> Names:
+    """Links to the files of the first images of a recording, or the images as they were filtered, as PNG files.
+
+    A file is linked to under its own name where the system saw it as it is: not one of a video or a bag, rectified, resized
+    or turned. A missing one is left out. Returned are the names as paths below `folder`.
+    """
+    stereo = sequence.baseline_m is not None
+    prefixes = {LEFT: "left/", RIGHT: "right/"} if stereo else {LEFT: ""}
+    for prefix in prefixes.values():
+        prepare_folder(folder / prefix)
+    names: Names = {}
+    files = _files(sequence.source, (sequence.camera.width, sequence.camera.height))
+    if files is not None:
+        for side, paths in zip(prefixes, files, strict=False):
+            own = len({path.name for path in paths if path is not None}) == len([*filter(None, paths)])
+            for t, path in enumerate(paths[:count]):
+                if path is None or not path.is_file():
+                    continue
+                names[t, side] = prefixes[side] + (path.name if own else f"{t:06d}{path.suffix}")
+                link = folder / names[t, side]
+                link.unlink(missing_ok=True)
+                link.symlink_to(path.resolve())
+        return names
+    for t, frame in zip(range(count), sequence.frames(), strict=False):
+        for side, image in zip(prefixes, (frame.image, frame.right), strict=False):
+            if image is not None:
+                names[t, side] = image_name(t, side) if stereo else f"{t:06d}.png"
+                Image.fromarray(image).save(folder / names[t, side])
+    return names
+
+
+def _files(source: Source, size: tuple[int, int]) -> list[list[Path | None]] | None:
+    """The files of one camera or two that hold the images as they are filtered; None where there are none."""
+    rows: list[int] | None = None
+    if isinstance(source, Chosen):
+        rows, source = source.rows.tolist(), source.source
+    if not isinstance(source, FileImages):
+        return None
+    cameras: list[list[Path | None]] = [list(source.left), *([] if source.right is None else [list(source.right)])]
+    for files in cameras:
+        try:
+            with Image.open(next(path for path in files if path is not None)) as first:
+                upright = first.getexif().get(ExifTags.Base.Orientation, _UPRIGHT) == _UPRIGHT
+                # An image made smaller is no file.
+                if first.size != size or not upright:
+                    return None
+        except (OSError, StopIteration):
+            return None
+    return [files if rows is None else [files[row] for row in rows] for files in cameras]

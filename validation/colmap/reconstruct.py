@@ -20,12 +20,13 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.ranges import Angle, Count, Ranged, Seed
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
-from rbpf.validation.colmap.model import camera_model, from_colmap_pose
+from rbpf.validation.colmap.model import from_colmap_pose, to_colmap_camera
 
 LEAST_FRAMES = 3
 """Key frames; two have no third view that tells a wrong match."""
+OVERLAP = 10
+"""Each key frame is matched with so many that follow, and with those 2^i further on."""
 
 
 @final
@@ -35,10 +36,7 @@ class ReconstructionOptions(Ranged):
 
     every: Count = 5  #: every so many frames is a key frame, from the first on.
     features: Count = 4096  #: most of them per image.
-    overlap: Count = 10  #: each key frame is matched with so many that follow, and with those 2^i further on.
-    stereo: bool = True  #: of a stereo sequence take both images, and the scale from the baseline.
     least_angle_deg: Angle = 16.0  #: between the rays of the two images that it begins with.
-    threads: Count = 1  #: of extraction and matching; mapping takes one, so that the same seed gives the same model.
     seed: Seed = 0  #: of RANSAC.
 
 
@@ -48,7 +46,6 @@ class Reconstruction:
     """What COLMAP found, in a world of its own; in metres if a baseline told the scale."""
 
     name: str  #: of the sequence.
-    camera: Pinhole
     chosen: NDArray[np.int64]  #: (C,) frames that were handed to it.
     frames: NDArray[np.int64]  #: (R,) those of which it found the pose, ascending.
     stamps_ns: NDArray[np.int64]  #: (R,) their times.
@@ -83,15 +80,11 @@ class Reconstruction:
 
 
 def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None = None) -> Reconstruction:
-    """Reconstructs a sequence of images from scratch.
-
-    Raises:
-        InputError: too few key frames can be read, or COLMAP finds no model.
-    """
+    """Reconstructs a sequence of images; an InputError where too few key frames can be read, or COLMAP finds no model."""
     import pycolmap
 
     options = options or ReconstructionOptions()
-    is_stereo, numbers = options.stereo and sequence.baseline_m is not None, []
+    is_stereo, numbers = sequence.baseline_m is not None, []
     with TemporaryDirectory(prefix="colmap-") as temporary, _quiet():
         images, models, database = (Path(temporary) / name for name in ("images", "models", "database.db"))
         images.mkdir()
@@ -110,11 +103,10 @@ def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None =
                 f"{LEAST_FRAMES} or more; choose a smaller step than every {options.every}."
             )
         # SIFT of all images, and verified matches with those that follow.
-        name, params = camera_model(sequence.camera)
-        reading = pycolmap.ImageReaderOptions()
-        reading.camera_model, reading.camera_params = name, ",".join(map(repr, params))
+        camera, reading = to_colmap_camera(sequence.camera), pycolmap.ImageReaderOptions()
+        reading.camera_model, reading.camera_params = camera.model_name, ",".join(map(repr, camera.params.tolist()))
         extraction = pycolmap.FeatureExtractionOptions()
-        extraction.sift.max_num_features, extraction.num_threads = options.features, options.threads
+        extraction.sift.max_num_features, extraction.num_threads = options.features, 1
         pycolmap.extract_features(
             database,
             images,
@@ -124,8 +116,8 @@ def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None =
             device=pycolmap.Device.cpu,
         )
         matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.SequentialPairingOptions()
-        matching.num_threads = pairing.num_threads = options.threads
-        pairing.overlap = options.overlap * (1 + is_stereo)
+        matching.num_threads = pairing.num_threads = 1
+        pairing.overlap = OVERLAP * (1 + is_stereo)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = options.seed
         pycolmap.match_sequential(
@@ -164,7 +156,6 @@ def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None =
     points = [by_id[index] for index in sorted(by_id)]
     return Reconstruction(
         name=sequence.name,
-        camera=sequence.camera,
         chosen=np.array(numbers, dtype=np.int64),
         frames=frames,
         stamps_ns=np.asarray(sequence.stamps_ns, dtype=np.int64)[frames],

@@ -38,9 +38,6 @@ from rbpf.validation.gtsam.batch_problem import (
     Problem,
     fit_of,
     floats_in_scale,
-    name_of,
-    problem_of,
-    read_problem,
     solve_problem,
 )
 from rbpf.validation.gtsam.observations import HUBER
@@ -52,8 +49,6 @@ from rbpf.validation.metrics.gaussian_differences import (
     away_from_first,
     compare_last_pose,
     compare_maps,
-    figures_of,
-    no_differences,
     projected,
     rescaled,
     scale_onto,
@@ -126,7 +121,7 @@ class AgainstBatch:
         carry = ours.space.right_jacobian_inverse(delta)
         covs = ours.cov_poses, np.asarray(carry @ theirs.cov_poses @ carry.mT)
         if self.floats:
-            basis = across_of(away_from_first(ours))
+            basis = across_of(away_from_first(ours.world_from_body))
             covs, delta = (projected(basis, covs[0]), projected(basis, covs[1])), projected(basis, delta)
         return *covs, delta
 
@@ -148,37 +143,30 @@ class AgainstBatch:
         }
 
 
-def compare_run(run: Run, robust: float | None = None) -> AgainstBatch:
+def compare_run(run: Run) -> AgainstBatch:
     """A run in memory beside its batch optimum; see `compare`."""
-    return compare(PathAndMap.of_run(run), problem_of(run), robust)
+    return compare(PathAndMap.of_run(run), run.system.measurements(run.name, run.log))
 
 
-def compare_folder(folder: Path, robust: float | None = None) -> AgainstBatch:
+def compare_folder(folder: Path) -> AgainstBatch:
     """A run folder beside its batch optimum; see `compare`. The folder must be that of a finished run of this version."""
-    return compare(RunFolder.open(folder).estimate, read_problem(folder), robust)
+    record = RunFolder.open(folder)
+    return compare(record.estimate, record.measurements)
 
 
-def compare(
-    filtered: PathAndMap, problem: Problem, robust: float | None = None, optimum: Optimum | None = None
-) -> AgainstBatch:
-    """A filter's path and map beside the batch optimum of the same measurements.
+def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = None) -> AgainstBatch:
+    """A filter's path and map, T poses, beside the batch optimum of the same T measurements.
 
-    Args:
-        filtered: T poses, one per step of the problem.
-        problem: the measurements.
-        robust: Huber's threshold of the batch in standard deviations; None takes all as Gaussian, as the filter does.
-        optimum: of the problem, where it is known already.
-
-    Raises:
-        InputError: path and measurements are not of one run, or the batch cannot be solved.
+    Where it is not known it is solved for with all errors Gaussian, as the filter takes them. An InputError says that path
+    and measurements are not of one run, or that the batch cannot be solved.
     """
-    name, stamps = name_of(problem), problem.stamps_ns
+    name, stamps = problem.name if isinstance(problem, FeatureLog) else problem.recording, problem.stamps_ns
     if len(stamps) != len(filtered.stamps_ns) or (stamps != filtered.stamps_ns).any():
         raise InputError(f"{name}: path and measurements do not share their time stamps; take both from one run.")
     if len(stamps) < LEAST_STEPS:
         raise InputError(f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch.")
     if optimum is None:
-        optimum = solve_problem(problem, filtered.world_from_body, robust)
+        optimum = solve_problem(problem, filtered.world_from_body)
     floats = floats_in_scale(problem)
     scale = scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
     scaled = rescaled(filtered, scale)
@@ -192,9 +180,7 @@ def compare(
         optimum=optimum,
         path=ate(ours.trajectory, optimum.estimate.trajectory),
         landmarks=compare_maps(ours, optimum.estimate, floats),
-        poses=compare_last_pose(ours, optimum.estimate, int(optimum.steps[-1]), floats)
-        if len(ours.cov_poses) and len(optimum.estimate.cov_poses)
-        else no_differences(filtered.space.dim),
+        poses=compare_last_pose(ours, optimum.estimate, int(optimum.steps[-1]), floats),
         fit_filter=fit_of(optimum.problem, ours, shared),
         fit_batch=fit_of(optimum.problem, optimum.estimate, shared),
     )
@@ -203,19 +189,15 @@ def compare(
 def solve_run(record: RunFolder, most: int | None = None, on_iteration: OnIteration | None = None) -> Optimum:
     """The batch optimum of a run's measurements: with Huber's loss for matches in images, which hold false ones.
 
-    `most` and `on_iteration` as of `solve_problem`.
-
-    Raises:
-        InputError: as of `solve_problem`, or the run's measurements are missing, damaged, or another run's.
+    `most`, `on_iteration` and errors as of `solve_problem`.
     """
-    problem = read_problem(record.folder)
-    robust = HUBER if isinstance(problem, FeatureLog) else None
-    return solve_problem(problem, record.path.mean, robust, most, on_iteration)
+    robust = HUBER if isinstance(record.measurements, FeatureLog) else None
+    return solve_problem(record.measurements, record.path.mean, robust, most, on_iteration)
 
 
 def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tuple[Comparison, AgainstBatch]:
     """A run beside the batch posterior of the same measurements, from `solve_run` where it is known; errors as that."""
-    problem = read_problem(record.folder)
+    problem = record.measurements
     found = compare(record.estimate, problem, optimum=optimum or solve_run(record))
     figures: dict[str, Any] = {
         "gauge": found.gauge,
@@ -246,7 +228,8 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
             )
     accuracy = f"The path is {1e3 * found.path.rmse:.3g} mm (rms) from the batch optimum of the same measurements"
     # Single numbers of the Gaussians for the page; the rows behind them are `AgainstBatch.as_dict`'s.
-    figures |= figures_of("landmarks", found.landmarks) | figures_of("poses", found.poses)
+    for name, rows in (("landmarks", found.landmarks), ("poses", found.poses)):
+        figures |= {f"{name}_{key}": value for key, value in rows.as_dict().items() if not isinstance(value, list)}
     for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
         figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
     return Comparison("gtsam", f"{accuracy}{said}.", figures, statistics), found

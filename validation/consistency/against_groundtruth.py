@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.runs.plots import moved_map
-from rbpf.runs.reading import FilteredPath, PathAndMap, RunFolder
+from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
-from rbpf.runs.truth import RunTruth
+from rbpf.runs.truth import LEAST, RunTruth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.comparison import Comparison
 from rbpf.validation.consistency.statistic import (
@@ -37,12 +37,7 @@ from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
 from rbpf.validation.metrics.gaussian_differences import across_of, away_from_first, projected
 from rbpf.validation.metrics.scores import is_anonymous
 
-NAME = "groundtruth"
 NEES, LANDMARKS = "poses against the truth", "landmarks against the truth"
-
-NO_LANDMARKS = MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-LEAST = 3
-"""Steps with a true pose that a comparison needs."""
 
 _HOW = {
     "none": "without any alignment",
@@ -93,19 +88,12 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     turns = 1 if path.space.dim == SE2.dim else 3
     own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
     mean, cov = path.mean[truth.rows], path.cov[truth.rows] + np.diag(own)
+    anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
     if truth.alignment == "none":
-        whitened, moved, fitted = whitened_errors(path.space, mean, cov, truth.poses), truth, 0
-    else:
-        whitened, moved, fitted = _in_gauge(path, mean, cov, truth)
-    landmarks = None if is_anonymous(record) else _landmark_errors(record, moved, positions.alignment)
-    return TruthErrors(path, truth, positions, whitened, fitted, landmarks)
-
-
-def _in_gauge(
-    path: FilteredPath, mean: np.ndarray, cov: np.ndarray, truth: RunTruth
-) -> tuple[WhitenedErrors, RunTruth, int]:
-    """Errors where the truth has been brought into the run's world, that truth, and how many parameters were fitted."""
-    space, across = path.space, truth.alignment == "similarity"
+        whitened = whitened_errors(space, mean, cov, truth.poses)
+        landmarks = None if anonymous else _landmark_errors(record, truth, positions.alignment)
+        return TruthErrors(path, truth, positions, whitened, 0, landmarks)
+    # The truth brought into the run's world.
     true, ours = (in_space(path.stamps_ns[truth.rows], poses) for poses in (truth.poses, mean))
     start = align(true.positions, ours.positions, with_scale=across)
     if space.dim == SE2.dim:
@@ -116,8 +104,7 @@ def _in_gauge(
         plane, moved = start, start.transform_poses(truth.poses)
     basis = np.broadcast_to(np.eye(space.dim), cov.shape)
     if across:
-        estimate = PathAndMap(path.stamps_ns, path.mean, path.cov, NO_LANDMARKS)
-        basis = across_of(away_from_first(estimate)[truth.rows])
+        basis = across_of(away_from_first(path.mean)[truth.rows])
     roots, ranks = inverse_roots(projected(basis, cov))
 
     def errors(motion: np.ndarray) -> np.ndarray:
@@ -126,9 +113,10 @@ def _in_gauge(
 
     motion = least_squares(lambda x: errors(x).ravel(), np.zeros(space.dim), method="lm").x
     turn = space.exp(motion)
-    landmarks = {name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()}
-    there = RunTruth(truth.rows, space.compose(turn, moved), landmarks, truth.alignment)
-    return WhitenedErrors(errors(motion), ranks), there, space.dim
+    points = {name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()}
+    there = RunTruth(truth.rows, space.compose(turn, moved), points, truth.alignment)
+    landmarks = None if anonymous else _landmark_errors(record, there, positions.alignment)
+    return TruthErrors(path, truth, positions, WhitenedErrors(errors(motion), ranks), space.dim, landmarks)
 
 
 def pose_statistics(errors: WhitenedErrors, fitted: int = 0) -> list[Statistic]:
@@ -189,7 +177,7 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
         rmse = ate(batch, beside, truth.alignment).rmse
         figures["batch_position_rmse_m"] = rmse
         accuracy += f"; the batch optimum of the same measurements is {_metres(rmse)} from it"
-    return Comparison(NAME, f"{accuracy}.", figures, statistics)
+    return Comparison("groundtruth", f"{accuracy}.", figures, statistics)
 
 
 def _landmark_errors(record: RunFolder, truth: RunTruth, world: Similarity) -> LandmarkErrors | None:

@@ -46,33 +46,15 @@ Data = Path | RobotRecording | RobotLog | FeatureLog
 class EvidenceDifference:
     """Log-evidences of two configurations on the same data, in nats."""
 
-    logs_a: np.ndarray  #: (S,) log Ẑ of the first by seed;  logs_b: (S',) of the second.
-    logs_b: np.ndarray
-
-    @property
-    def log_evidence_a(self) -> float:
-        """Of the first."""
-        return _log_evidence(self.logs_a)[0]
-
-    @property
-    def log_evidence_b(self) -> float:
-        """Of the second."""
-        return _log_evidence(self.logs_b)[0]
+    log_evidence_a: float  #: of the first;  log_evidence_b: of the second.
+    log_evidence_b: float
+    error: float  #: standard error of the difference by the filters' randomness.
+    spread: float  #: larger standard deviation of log Ẑ over the seeds; beyond `NOISY` more particles are needed.
 
     @property
     def difference(self) -> float:
         """First minus second: log of the Bayes factor."""
         return self.log_evidence_a - self.log_evidence_b
-
-    @property
-    def error(self) -> float:
-        """Standard error of the difference by the filters' randomness."""
-        return float(np.hypot(_log_evidence(self.logs_a)[1], _log_evidence(self.logs_b)[1]))
-
-    @property
-    def spread(self) -> float:
-        """Larger standard deviation of log Ẑ over the seeds; beyond `NOISY` more particles are needed."""
-        return float(max(self.logs_a.std(ddof=1), self.logs_b.std(ddof=1)))
 
     def sentence(self, name_a: str, name_b: str) -> str:
         """What was found, in words."""
@@ -88,11 +70,7 @@ class EvidenceDifference:
 
 
 def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> EvidenceDifference:
-    """From log-evidences of any filters, one per seed.
-
-    Raises:
-        InputError: there are fewer than two of either, or one is no number: it is not defined.
-    """
+    """From log-evidences of any filters, one per seed; an InputError for fewer than two, or for one that is no number."""
     pair = np.asarray(logs_a, dtype=float), np.asarray(logs_b, dtype=float)
     for name, logs in zip(("first", "second"), pair, strict=True):
         if logs.size < 2:
@@ -102,7 +80,9 @@ def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> Evi
                 f"the {name} filter has no evidence: one of its likelihoods is not a density, or some observations updated "
                 "only the particles or only the map"
             )
-    return EvidenceDifference(*pair)
+    (a, error_a), (b, error_b) = map(_log_evidence, pair)
+    spread = float(max(logs.std(ddof=1) for logs in pair))
+    return EvidenceDifference(a, b, float(np.hypot(error_a, error_b)), spread)
 
 
 def compare_evidence(
@@ -131,12 +111,17 @@ def compare_evidence(
 
     if type(config_a) is not type(config_b):
         raise InputError("two configurations of different systems do not explain the same data: compare two of one")
+    if isinstance(data, FeatureLog) == isinstance(config_a, RangeBearingConfig):
+        raise InputError(f"a {type(config_a).__name__} does not filter a {type(data).__name__}")
     if len(seeds) < 2:
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
-    for name, config in (("first", config_a), ("second", config_b)):
-        _require_density(config, name)
     # What is told of landmarks must be the same, and must be counted once.
-    for config in (config_a, config_b):
+    for name, config in (("first", config_a), ("second", config_b)):
+        if not isinstance(config, MonoConfig) and not config.likelihood.build().normalised:
+            raise InputError(
+                f"the {name} configuration has no evidence: its likelihood {config.likelihood.kind!r} is not a density "
+                "(it does not integrate to one); use gaussian, or outliers for observations that may be wrong"
+            )
         if isinstance(config, MonoConfig) and config.max_new_per_frame > 0:
             raise InputError(
                 "a monocular filter that starts features has no evidence: of one whose depth is unknown, the pose and the "
@@ -183,8 +168,6 @@ def compare_runs(
     """
     records = RunFolder.open(run_a), RunFolder.open(run_b)
     for record in records:
-        if record.system == "stereo":
-            _require_density(_config_of(record), str(record.folder))
         if record.system in ("mono", "stereo"):
             raise InputError(
                 f"{record.folder}: what is measured in images depends on where the filter looks for it, so that two "
@@ -197,7 +180,9 @@ def compare_runs(
         raise InputError(
             f"{run_a} and {run_b} are runs over different recordings, or parts of one: evidences say nothing about them"
         )
-    configs = [_config_of(record) for record in records]
+    configs = [
+        load_settings(RangeBearingConfig, "range-bearing", record.folder / "config.yaml", (), {}) for record in records
+    ]
     return compare_evidence(configs[0], configs[1], one, range(seeds), workers, on_run)
 
 
@@ -210,28 +195,12 @@ def _log_evidence(logs: np.ndarray) -> tuple[float, float]:
     return float(logs.mean()) + 0.5 * variance, float(error)
 
 
-def _require_density(config: Config, name: str) -> None:
-    if isinstance(config, MonoConfig) or config.likelihood.build().normalised:
-        return
-    raise InputError(
-        f"the {name} configuration has no evidence: its likelihood {config.likelihood.kind!r} is not a density "
-        "(it does not integrate to one); use gaussian, or outliers for observations that may be wrong"
-    )
-
-
-def _config_of(record: RunFolder) -> RangeBearingConfig | StereoConfig:
-    path = record.folder / "config.yaml"
-    if record.system == "stereo":
-        return load_settings(StereoConfig, "stereo", path, (), {})
-    return load_settings(RangeBearingConfig, "range-bearing", path, (), {})
-
-
 def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
     """Log-evidences by parts of the draws from a robot's batch posterior; none where the filter's model is not the batch's."""
     from rbpf.validation.gtsam.batch_problem import solve_problem
     from rbpf.validation.gtsam.path_sampling import draw_posterior
 
-    if not isinstance(config, RangeBearingConfig) or config.association != "known":
+    if isinstance(data, FeatureLog) or not isinstance(config, RangeBearingConfig) or config.association != "known":
         return []
     run = _filtered(replace(config, particles=1), data)
     if not isinstance(run.system.likelihood, Gaussian):
@@ -244,23 +213,17 @@ def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
     return [float(np.logaddexp.reduce(part) - np.log(part.size)) for part in logs]
 
 
-def _filtered(config: RangeBearingConfig, data: Data) -> Run[RangeBearingSlam]:
-    if isinstance(data, Path | RobotRecording):
+def _filtered(config: RangeBearingConfig, data: Path | RobotRecording | RobotLog) -> Run[RangeBearingSlam]:
+    if not isinstance(data, RobotLog):
         return filter_recording(RobotRecording(data) if isinstance(data, Path) else data, config)
     if config.noise.given():
         raise InputError("a log that was read already has its noise: give the recording's path to change it")
-    if isinstance(data, RobotLog):
-        return filter_opened(open_robot_log(data, config))
-    raise _no_filter(config, data)
+    return filter_opened(open_robot_log(data, config))
 
 
 def _evidence(config: Config, data: Data) -> float:
     if isinstance(config, RangeBearingConfig):
+        assert not isinstance(data, FeatureLog)
         return float(_filtered(config, data).system.filter.log_evidence)
-    if isinstance(data, FeatureLog):
-        return float(filter_features(data, config).system.filter.log_evidence)
-    raise _no_filter(config, data)
-
-
-def _no_filter(config: Config, data: Data) -> InputError:
-    return InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")
+    assert isinstance(data, FeatureLog)
+    return float(filter_features(data, config).system.filter.log_evidence)

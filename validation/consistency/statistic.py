@@ -20,7 +20,6 @@ covariances are estimated from the series itself, up to the first lag at which i
 (C. Geyer, "Practical Markov chain Monte Carlo", 1992).
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -45,7 +44,6 @@ PROBABILITIES = 0.5, 0.9, 0.95
 """Of credible regions."""
 _NOTHING = 1e-12
 """Variances below this fraction of the largest, or of one, are none."""
-Outcome = Literal["supports", "contradicts", "leaves open"]
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Statistic:
     kind: Literal["ratio", "bias", "share"] = "ratio"
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> Literal["supports", "contradicts", "leaves open"]:
         """What it says about the filter."""
         if self.low > self.zone[1] or self.high < self.zone[0]:
             return "contradicts"
@@ -70,8 +68,9 @@ class Statistic:
 
     def entries(self) -> dict[str, Any]:
         """For JSON; bounds that are infinite are null."""
-        values = asdict(self) | {"zone": list(self.zone), "outcome": self.outcome}
-        return {name: _finite(value) for name, value in values.items()}
+        values = asdict(self) | {"outcome": self.outcome}
+        told = {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in values.items()}
+        return told | {"zone": [bound if np.isfinite(bound) else None for bound in self.zone]}
 
     @classmethod
     def of_entries(cls, entries: dict[str, Any]) -> "Statistic":
@@ -169,14 +168,8 @@ def posterior_ratio(
     online estimate knows less than the posterior of all measurements, so that its δ is random, of covariance
     P_f − P_b; the interval is that of this part. Where both know the same, as of a map, no part is random, and the median
     over the estimates is told: a few landmarks of which the filter has a prior and the posterior has none, or that hang on
-    a false match, say nothing of the others. None without any estimate that is uncertain.
-
-    Args:
-        name: of the statistic.
-        cov: (T, d, d) P_f.
-        cov_posterior: (T, d, d) P_b in the same chart.
-        delta: (T, d).
-        same_data: both know the same measurements.
+    a false match, say nothing of the others. None without any estimate that is uncertain. P_f, P_b (T, d, d) and
+    δ (T, d) are in one chart; with `same_data` both know the same.
     """
     roots, ranks = inverse_roots(cov)
     total = int(ranks.sum())
@@ -195,16 +188,11 @@ def posterior_ratio(
 
 
 def map_ratio(name: str, positions: np.ndarray, white: np.ndarray) -> Statistic:
-    """Ratio of the squared errors of a map's landmarks to what was expected of them.
+    """Ratio of the squared errors of a map's landmarks (M, D), whitened (M, d), to what was expected of them.
 
     Neighbours err together: a map that is turned by a wrong heading is one error, however many landmarks it has. What an
     affine field of displacements explains of the errors, k = d (d + 1) parameters, is therefore taken as one block, and
     the rest as another (Satterthwaite over both).
-
-    Args:
-        name: of the statistic.
-        positions: (M, D).
-        white: (M, d) errors in units of the filter's.
     """
     value = float(np.square(white).mean())
     design = np.column_stack([np.ones(len(positions)), positions - positions.mean(axis=0)])
@@ -233,11 +221,9 @@ def step_ratio(name: str, squares: np.ndarray, dofs: np.ndarray, factor: float =
 
 
 def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic]:
-    """Size and bias of what the observations say about the motion; see `rbpf.core.diagnostics.Correction`.
+    """Size and bias of what the observations say about the motion: corrections (T, r), (T, r, r) of the log.
 
-    Args:
-        correction: (T, r) in the motion's whitened coordinates; rows of NaN are left out.
-        cov: (T, r, r) what an consistent filter expects of it.
+    See `rbpf.core.diagnostics.Correction`; rows of NaN are left out.
     """
     known = np.isfinite(correction).all(axis=1)
     correction, cov = correction[known], cov[known]
@@ -246,38 +232,28 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
     turned = np.einsum("tab,ta->tb", vectors, correction)
     squares = np.where(informed, np.square(turned) / np.where(informed, values, 1.0), 0.0).sum(axis=1)
     size = step_ratio("motion against measurements", squares, informed.sum(axis=1).astype(float))
-    if size is None:
-        return []
-    bias = _bias(correction, cov, max(size.value, 1.0))
-    return [size, *([] if bias is None else [bias])]
-
-
-def _bias(correction: np.ndarray, cov: np.ndarray, excess: float) -> Statistic | None:
-    """The constant b that explains the corrections best, û = cov b: its clearest component that is informed."""
-    total = cov.sum(axis=0)
-    values, vectors = np.linalg.eigh(total)
+    # The constant b that explains the corrections best, û = cov b: its clearest component that is informed.
+    values, vectors = np.linalg.eigh(cov.sum(axis=0))
     informed = values > 1.0
-    if not informed.any():
-        return None
+    if size is None or not informed.any():
+        return [] if size is None else [size]
     along = (vectors.T @ correction.sum(axis=0))[informed] / values[informed]
-    std = np.sqrt(excess / values[informed])
+    std = np.sqrt(max(size.value, 1.0) / values[informed])
     margin = float(ndtri(0.5 + 0.5 * LEVEL ** (1.0 / along.size)))  # all components together
     lows = np.maximum(np.abs(along) - margin * std, 0.0)
     worst = int(np.argmax(lows)) if lows.any() else int(np.argmax(np.abs(along) + margin * std))
-    size = float(np.abs(along[worst]))
-    top = float((np.abs(along) + margin * std).max())
-    return Statistic("bias of the motion", size, float(lows[worst]), top, (-np.inf, BIAS), len(correction), "bias")
+    bias, top = float(np.abs(along[worst])), float((np.abs(along) + margin * std).max())
+    zone, samples = (-np.inf, BIAS), len(correction)
+    return [size, Statistic("bias of the motion", bias, float(lows[worst]), top, zone, samples, "bias")]
 
 
-def coverage(
-    nees: np.ndarray, dim: int, samples: float, probabilities: Sequence[float] = PROBABILITIES
-) -> list[Statistic]:
-    """How often the truth lies in the credible region of a probability, for each of some.
+def coverage(nees: np.ndarray, dim: int, samples: float) -> list[Statistic]:
+    """How often the truth lies in the credible region of a probability, for each of `PROBABILITIES`.
 
     From normalised squared errors (T,) of `dim` degrees of freedom each, which are worth so many independent samples.
     """
     out, tail = [], 0.5 * (1.0 - LEVEL)
-    for probability in probabilities:
+    for probability in PROBABILITIES:
         bound = float(chi_square_quantile(probability, dim))
         fraction = float((nees <= bound).mean())
         # Clopper and Pearson's interval, for a number of samples that need not be whole
@@ -285,14 +261,7 @@ def coverage(
         low = float(betaincinv(hits, samples - hits + 1.0, tail)) if hits > 0.0 else 0.0
         high = float(betaincinv(hits + 1.0, samples - hits, 1.0 - tail)) if hits < samples else 1.0
         zone = (float(chdtr(dim, bound / STATE_FACTOR**2)), float(chdtr(dim, bound * STATE_FACTOR**2)))
+        zone = (zone[0], zone[1] if zone[1] < 0.999 else 1.0)
         name = f"poses inside the {100 * probability:g} % region"
-        out.append(
-            Statistic(name, fraction, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share")
-        )
+        out.append(Statistic(name, fraction, low, high, zone, samples, "share"))
     return out
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

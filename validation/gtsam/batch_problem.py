@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from pathlib import Path
 from typing import final
 
 import numpy as np
@@ -16,22 +15,20 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.run import Run
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog, KnownPoints
-from rbpf.sensors.readers.measurements import Measurements
+from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam import robot
-from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.observations import in_one_piece, observation_table, reprojection
+from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
 
 OnIteration = Callable[[int, float], None]
-"""Called with the number of an iteration and the error before it."""
 LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
 EXACT = 1e-4
@@ -70,27 +67,6 @@ class Fit:
     sightings: int  #: how many observations took part; the name is that of the key in the file.
 
 
-def problem_of(run: Run) -> Problem:
-    """The measurements that a run in memory used."""
-    return run.system.measurements(run.name, run.log)
-
-
-def read_problem(folder: Path) -> Problem:
-    """The measurements that a run left in its folder.
-
-    Raises:
-        InputError: there are none, or a file is malformed.
-    """
-    if not (folder / OBSERVATIONS).exists():
-        raise InputError(f"{folder} holds no {OBSERVATIONS}: expected the folder of a finished run of this version.")
-    return read_measurements(folder)
-
-
-def name_of(problem: Problem) -> str:
-    """Of the recording."""
-    return problem.name if isinstance(problem, FeatureLog) else problem.recording
-
-
 def floats_in_scale(problem: Problem) -> bool:
     """Whether nothing in the measurements tells the scale: one camera and no known points."""
     return isinstance(problem, FeatureLog) and problem.known is None and not isinstance(problem.camera, RectifiedStereo)
@@ -112,7 +88,7 @@ def solve_problem(
         start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
         robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
         most: iterations of a camera's adjustment, after which it is given up; by default as many as `WORK` allows.
-        on_iteration: called with how far a camera's adjustment is.
+        on_iteration: called with the number of an iteration of a camera's adjustment and the error before it.
         marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
         twice: start a camera's adjustment from its known points alone, too, and take the better optimum, so that it does
             not hang on where the filter went; not needed near the optimum.
@@ -121,44 +97,10 @@ def solve_problem(
         InputError: the measurements do not determine everything, too few frames are connected, it takes too many
             iterations, or it does not converge.
     """
-    if isinstance(problem, FeatureLog):
-        return _solve_camera(problem, start, robust, most, on_iteration, marginals, twice)
-    found = robot.solve(problem, robust, marginals, incremental=len(problem.stamps_ns) > AFAR)
-    points = _summary(list(found.landmarks), found.landmarks, found.cov_landmarks, problem.z.shape[1])
-    estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, points)
-    return Optimum(problem, estimate, np.arange(len(problem.stamps_ns)), found.error)
-
-
-def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> Fit:
-    """How likely the observations of the named landmarks are, of the estimate's own poses and landmarks."""
-    places = estimate.landmarks.named()
-    if isinstance(problem, FeatureLog):
-        table = observation_table(problem)
-        table = table.rows(np.isin(table.names, names)[table.index])
-        points = np.array([places[name] for name in table.names.tolist()]).reshape(-1, 3)
-        residuals, cov = reprojection(table, estimate.world_from_body, points)[0], table.cov_z
-    else:
-        rows, model = np.flatnonzero(np.isin(problem.landmarks, names)), problem.model()
-        size = problem.z.shape[1]
-        points = np.array([places[name] for name in problem.landmarks[rows].tolist()]).reshape(-1, size)
-        predicted = model.predict(estimate.world_from_body[problem.steps[rows]], points)
-        residuals, cov = model.residual(problem.z[rows], predicted), problem.cov_z[rows]
-    square = np.square(mahalanobis(residuals, cov))
-    log_norm = np.linalg.slogdet(2.0 * np.pi * cov)[1]
-    rms = float(np.sqrt(square.sum() / max(residuals.size, 1)))
-    return Fit(float(-0.5 * (square + log_norm).sum()), rms, len(residuals))
-
-
-def _solve_camera(
-    log: FeatureLog,
-    path: Array,
-    robust: float | None,
-    most: int | None,
-    on_iteration: OnIteration | None,
-    marginals: bool,
-    twice: bool,
-) -> Optimum:
-    frames = connected_frames(log)
+    if not isinstance(problem, FeatureLog):
+        steps = np.arange(len(problem.stamps_ns))
+        return _optimum(problem, robot.solve(problem, robust, marginals, incremental=steps.size > AFAR), steps)
+    log, frames = problem, connected_frames(problem)
     if frames.size < 2:
         raise InputError(f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each")
     part = replace(log, frames=[log.frames[t] for t in frames], known=softened(log.known))
@@ -179,10 +121,10 @@ def _solve_camera(
     solve = partial(solve_features, part, robust=robust, on_iteration=watch, tolerance=tolerance)
     # A start that leads nowhere is passed over, if another one does not.
     solutions, problems = [], []
-    first = CameraEstimate(path[frames], {})
-    for start in [first, None] if twice and log.known is not None else [first]:
+    first = InitialEstimate(start[frames], {})
+    for near in [first, None] if twice and log.known is not None else [first]:
         try:
-            solutions.append(solve(start, marginals=False))
+            solutions.append(solve(near, marginals=False))
         except InputError as error:
             problems.append(error)
     if not solutions:
@@ -190,13 +132,28 @@ def _solve_camera(
     found = min(solutions, key=lambda solution: solution.error)
     if marginals:
         with suppress(InputError):  # where not all is determined, there are none
-            found = solve(CameraEstimate(found.world_from_camera, found.landmarks))
-    names = sorted(found.landmarks.keys() - set(found.undetermined))
-    points = _summary(names, found.landmarks, found.cov_landmarks, 3)
-    part = replace(part, known=log.known)
-    return Optimum(
-        part, PathAndMap(part.stamps_ns, found.world_from_camera, found.cov_poses, points), frames, found.error
-    )
+            found = solve(InitialEstimate(found.world_from_body, found.landmarks))
+    return _optimum(replace(part, known=log.known), found, frames)
+
+
+def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> Fit:
+    """How likely the observations of the named landmarks are, of the estimate's own poses and landmarks."""
+    places = estimate.landmarks.named()
+    if isinstance(problem, FeatureLog):
+        table = observation_table(problem)
+        table = table.rows(np.isin(table.names, names)[table.index])
+        points = np.array([places[name] for name in table.names.tolist()]).reshape(-1, 3)
+        residuals, cov = reprojection(table, estimate.world_from_body, points)[0], table.cov_z
+    else:
+        rows, model = np.flatnonzero(np.isin(problem.landmarks, names)), problem.model()
+        size = problem.z.shape[1]
+        points = np.array([places[name] for name in problem.landmarks[rows].tolist()]).reshape(-1, size)
+        predicted = model.predict(estimate.world_from_body[problem.steps[rows]], points)
+        residuals, cov = model.residual(problem.z[rows], predicted), problem.cov_z[rows]
+    square = np.square(mahalanobis(residuals, cov))
+    log_norm = np.linalg.slogdet(2.0 * np.pi * cov)[1]
+    rms = float(np.sqrt(square.sum() / max(residuals.size, 1)))
+    return Fit(float(-0.5 * (square + log_norm).sum()), rms, len(residuals))
 
 
 def softened(known: KnownPoints | None) -> KnownPoints | None:
@@ -228,10 +185,15 @@ def connected_frames(log: FeatureLog) -> NDArray[np.intp]:
         kept = now
 
 
-def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapEstimate:
+def _optimum(problem: Problem, found: BatchSolution, steps: NDArray[np.intp]) -> Optimum:
+    names, dim = sorted(found.landmarks.keys() - set(found.undetermined)), 3
+    if not isinstance(problem, FeatureLog):
+        dim = problem.z.shape[1]
     unknown = np.full((dim, dim), np.nan)
-    return MapEstimate(
+    points = MapEstimate(
         np.array(names, dtype=np.int64),
-        np.array([means[name] for name in names]).reshape(-1, dim),
-        np.array([covs.get(name, unknown) for name in names]).reshape(-1, dim, dim),
+        np.array([found.landmarks[name] for name in names]).reshape(-1, dim),
+        np.array([found.cov_landmarks.get(name, unknown) for name in names]).reshape(-1, dim, dim),
     )
+    estimate = PathAndMap(problem.stamps_ns, found.world_from_body, found.cov_poses, points)
+    return Optimum(problem, estimate, steps, found.error)

@@ -3,64 +3,87 @@
 The same measurements and the same noise as a filter had, without its samples and without its order in time.
 B. Triggs et al., "Bundle adjustment: a modern synthesis" (2000);
 F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
+
+An initial estimate from scratch has the first camera from known points, then goes frame by frame: a frame's pose is found
+from the landmarks placed so far; then the landmarks that it sees are triangulated, and placed once their parallax tells
+their distance. From time to time all is adjusted, because errors would grow else.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import final
+from dataclasses import replace
+from typing import Any, final
 
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rbpf.errors import InputError
-from rbpf.lie import Array
+from rbpf.lie import SE3, Array
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam.camera_graph import FINE, CameraProblem, CameraState, adjust, covariances
-from rbpf.validation.gtsam.camera_start import from_scratch
 from rbpf.validation.gtsam.observations import (
-    CameraEstimate,
+    HUBER,
+    ObservationTable,
+    first_centres,
     in_camera,
     in_front,
     in_one_piece,
     known_by_name,
     observation_table,
+    parallax,
     place,
+    sigmas,
+    spread,
     triangulate,
 )
-
-__all__ = ["CameraEstimate", "CameraSolution", "solve_features"]
+from rbpf.validation.gtsam.solvers import (
+    ROUGH,
+    SPATIAL,
+    BatchSolution,
+    OnIteration,
+    levenberg_marquardt,
+    marginals,
+    noise,
+)
 
 LEAST = 3
 """Landmarks that fix a pose, and points that fix a frame."""
 LINE = 1e-3
 """Known points whose spread across a line is below this fraction of that along it lie on it."""
+KNOWN = 4
+"""Known points that the first frame has to see."""
+PLACED = 5.0
+"""A landmark is placed once its inverse distance differs from zero by so many standard deviations."""
+NEAREST = 0.2
+"""Nor is it placed nearer than this fraction of the usual distance: near cameras that rest a point fits anything."""
+CAP = 4.5
+"""What one observation of a single camera says for it at most, as a loss: one outlier must not do."""
+GROWTH = 1.2
+"""All is adjusted whenever the number of frames has grown by this factor."""
+SETTLED = 30
+"""A landmark seen more often moves only when all is adjusted."""
+LOST = 10
+"""As many frames in a row without three placed landmarks are the end."""
+OUTLIER = 5.0
+"""An observation farther off takes no part in a frame's pose, in standard deviations."""
+_EARLIEST = 8
+_MOTION = 0.1  # of a frame: rad, and metres per metre of distance to what is seen
+_FOUND = 1e-6  # fraction of the error that is no gain any more
 
-
-@final
-@dataclass(frozen=True, eq=False)
-class CameraSolution:
-    """Most probable path and map; covariances and error as those of `robot.BatchSolution`."""
-
-    world_from_camera: Array  #: (T, 7) poses.
-    landmarks: dict[int, Array]  #: name of each landmark that took part to its (3,) position [m].
-    cov_poses: Array  #: (T, 6, 6).
-    cov_landmarks: dict[int, Array]  #: name to (3, 3).
-    error: float  #: of the residuals.
-    iterations: int  #: of the optimiser.
-    #: names of the landmarks whose place the measurements do not tell, ascending: those seen in one frame by a single
-    #: camera, and those that an outlier has drawn into its camera, which are both left out, and those whose distance
-    #: is open for want of parallax, which have a weak prior.
-    undetermined: list[int]
+Known = dict[int, tuple[Array, Array]]
+"""Position (3,) and covariance (3, 3) by name."""
 
 
 def solve_features(
     log: FeatureLog,
-    initial: CameraEstimate | None = None,
+    initial: InitialEstimate | None = None,
     *,
     robust: float | None = None,
     marginals: bool = True,
-    on_iteration: Callable[[float], None] | None = None,
+    on_iteration: OnIteration | None = None,
     tolerance: float | None = None,
-) -> CameraSolution:
+) -> BatchSolution:
     """Solve for all poses and landmarks at once.
 
     The points known beforehand that are seen hold the world's frame. Without any, the first pose is held where it
@@ -71,8 +94,7 @@ def solve_features(
         log: the measurements.
         initial: where to start; landmarks that it lacks are triangulated. By default it is found frame by frame,
             from four known points in the first frame, or for a stereo pair without any, from the identity.
-        robust: threshold of Huber's loss on the norm of each whitened observation, in standard deviations (1.345 is
-            usual); None takes all as Gaussian. The covariances then are those of the reweighted problem.
+        robust: as of `rbpf.validation.gtsam.robot.solve`, like `marginals`.
         marginals: compute covariances.
         on_iteration: given the error before each iteration, also of adjustments on the way to an initial estimate;
             what it raises ends it all.
@@ -84,30 +106,10 @@ def solve_features(
             estimate, the estimate puts a landmark behind its camera, a frame sees too few landmarks or none that
             connect it, the known points are fewer than three or on a line, or the optimiser does not converge.
     """
-    if robust is not None and not robust > 0:
-        raise InputError(f"Expected a robust threshold above 0 standard deviations, found {robust}.")
     full = observation_table(log)
     known = known_by_name(log.known, full.names)
     problem = CameraProblem(log.name, len(log.frames), full.determined(known), known, robust)
-    _check(problem)
-    start = begin(problem, initial or from_scratch(problem, on_iteration))
-    found = adjust(problem, start, tolerance or FINE, on_iteration)
-    found.require_converged()
-    cov_poses, cov_landmarks = covariances(found) if marginals else (np.empty((0, 6, 6)), {})
-    state, names = found.state, found.problem.table.names
-    return CameraSolution(
-        world_from_camera=state.path,
-        landmarks=dict(zip(names.tolist(), state.points, strict=True)),
-        cov_poses=cov_poses,
-        cov_landmarks=cov_landmarks,
-        error=found.graph.error(found.values),
-        iterations=found.iterations,
-        undetermined=sorted({*full.names.tolist()} - {*names[~found.loose].tolist()}),
-    )
-
-
-def _check(problem: CameraProblem) -> None:
-    """Refuses too few observations of a frame, frames apart, or known points that do not fix the world's frame."""
+    # Enough observations of each frame, frames that hang together, known points that fix the world's frame.
     table, name = problem.table, problem.name
     counts = np.bincount(table.steps, minlength=problem.frames)
     if (few := np.flatnonzero(counts < LEAST)).size:
@@ -119,32 +121,47 @@ def _check(problem: CameraProblem) -> None:
     if (apart := np.flatnonzero(~piece)).size:
         raise InputError(
             f"Frame {apart[0]} of {name} shares no landmark, directly or through others, with "
-            f"{'the known points' if problem.known else 'frame 0'}; leave it out."
+            f"{'the known points' if known else 'frame 0'}; leave it out."
         )
-    if problem.known:
-        positions = np.array([position for position, _ in problem.known.values()])
+    if known:
+        positions = np.array([position for position, _ in known.values()])
         if len(positions) < LEAST:
             raise InputError(f"{name} sees {len(positions)} known points, expected {LEAST} or more, or none at all.")
-        spread = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
-        if spread[1] <= LINE * spread[0]:
+        across = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
+        if across[1] <= LINE * across[0]:
             raise InputError(f"The known points that {name} sees lie on a line; add one beside it.")
+    start = begin(problem, initial or from_scratch(problem, on_iteration))
+    found = adjust(problem, start, tolerance or FINE, on_iteration)
+    if not found.converged:
+        raise InputError(
+            f"The batch adjustment of {name} did not converge in {found.iterations} iterations; "
+            "start it from a better estimate, or ask for the robust loss."
+        )
+    cov_poses, cov_landmarks = covariances(found) if marginals else (np.empty((0, 6, 6)), {})
+    state, names = found.state, found.problem.table.names
+    return BatchSolution(
+        world_from_body=state.path,
+        landmarks=dict(zip(names.tolist(), state.points, strict=True)),
+        cov_poses=cov_poses,
+        cov_landmarks=cov_landmarks,
+        error=found.graph.error(found.values),
+        iterations=found.iterations,
+        undetermined=sorted({*full.names.tolist()} - {*names[~found.loose].tolist()}),
+    )
 
 
-def begin(problem: CameraProblem, start: CameraEstimate) -> CameraState:
+def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
     """A state near an estimate: its landmarks, known points, and the others triangulated from its poses.
 
-    Landmarks that come out behind a camera are placed on their first rays.
-
-    Raises:
-        InputError: the path is none of the log's frames, or a landmark has no place in front of its cameras.
+    Landmarks that come out behind a camera are placed on their first rays; an InputError names one that has no place there.
     """
-    table, path = problem.table, np.asarray(start.world_from_camera, dtype=float)
+    table, path = problem.table, np.asarray(start.world_from_body, dtype=float)
     if path.shape != (problem.frames, 7) or not np.isfinite(path).all():
         raise InputError(
             f"Expected finite initial poses of shape {(problem.frames, 7)}, one for each frame of "
             f"{problem.name}, found {path.shape}."
         )
-    given = {name: mean for name, (mean, _) in problem.known.items()} | start.landmarks
+    given = {name: mean for name, (mean, _) in problem.known.items()} | dict(start.landmarks)
     points = triangulate(table, path)
     rows = [index for index, name in enumerate(table.names.tolist()) if name in given]
     points[rows] = np.array([given[int(table.names[row])] for row in rows]).reshape(-1, 3)
@@ -157,3 +174,162 @@ def begin(problem: CameraProblem, start: CameraEstimate) -> CameraState:
             f"{problem.name}, which measured it; start from another estimate."
         )
     return CameraState(path, points)
+
+
+def locate(table: ObservationTable, known: Known) -> tuple[Array, Array]:
+    """Pose of a frame of which nothing is known, from four points or more: COLMAP's P3P and consensus, then `resect`."""
+    import pycolmap
+
+    # In an image without distortion: the pixels at which a plain camera would have seen the same rays.
+    camera = table.camera.camera if isinstance(table.camera, RectifiedStereo) else table.camera
+    rays, points = table.bearings(), np.array([known[name][0] for name in table.names.tolist()])
+    plain = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[camera.fx, 0.0, 0.0])
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed = 0
+    px = camera.fx * rays[:, :2] / rays[:, 2:]
+    found = pycolmap.estimate_absolute_pose(px, points[table.index], plain, options)
+    if found is None:
+        raise InputError("no pose of the first camera explains its known points; give an initial estimate.")
+    cam_from_world = found["cam_from_world"]
+    pose = np.concatenate([cam_from_world.rotation.quat, cam_from_world.translation])
+    return resect(table, known, SE3.inverse(SE3.normalise(pose)), 1e-9 * np.eye(6))
+
+
+def resect(table: ObservationTable, known: Known, near: Array, info: Array) -> tuple[Array, Array]:
+    """Pose (7,) with Huber's loss, once more without the outliers, whose pull Huber only limits; covariance (6, 6).
+
+    From observations of one frame and where its landmarks are. A weak prior stands in for what the image leaves open: it
+    has its mean at `near` (7,) world_from_camera, where it starts, and the information (6, 6).
+    """
+
+    def solve(part: ObservationTable, start: Array) -> tuple[Any, Any, CameraProblem]:
+        problem = CameraProblem("", 1, part, known, HUBER)
+        points = np.array([known[name][0] for name in part.names.tolist()])
+        state = CameraState(start[None], points)
+        graph = problem.graph(state, np.zeros(len(points), dtype=bool), state.path)
+        prior = gtsam.PriorFactorPose3(problem.pose_keys[0], SPATIAL.pose(near), noise(np.asarray(np.linalg.inv(info))))
+        graph.push_back(prior)
+        values, _, _ = levenberg_marquardt(graph, problem.values(state), _FOUND)
+        return graph, values, problem
+
+    graph, values, problem = solve(table, near)
+    pose = problem.state(values).path
+    points = np.array([known[name][0] for name in table.names.tolist()])
+    inlier = sigmas(table, pose, points) < OUTLIER
+    if not inlier.all() and inlier.sum() >= KNOWN:
+        graph, values, problem = solve(table.rows(inlier), pose[0])
+    return problem.state(values).path[0], marginals(graph, values, problem.pose_keys)[0]
+
+
+def from_scratch(problem: CameraProblem, on_iteration: OnIteration | None = None) -> InitialEstimate:
+    """Path and landmarks from the known points, or for a stereo pair without any, from the first frame.
+
+    `on_iteration` as of `solve_features`. An InputError says where the path cannot begin, or breaks.
+    """
+    growth = _Growth(problem, on_iteration)
+    for step in range(problem.frames):
+        growth.add(step)
+    # Landmarks never placed are missing.
+    names, placed = problem.table.names.tolist(), np.flatnonzero(growth.placed).tolist()
+    return InitialEstimate(growth.path, {names[index]: growth.points[index] for index in placed})
+
+
+@final
+class _Growth:
+    """A path that grows frame by frame, and the landmarks placed so far."""
+
+    def __init__(self, problem: CameraProblem, on_iteration: OnIteration | None) -> None:
+        self.problem, self.on_iteration = problem, on_iteration
+        self.table, frames = problem.table, problem.frames
+        self.path = np.tile(SE3.identity(), (frames, 1))
+        self.blur = np.zeros(frames)
+        self.points = np.zeros((len(self.table.names), 3))
+        self.cov = np.zeros((len(self.table.names), 3, 3))
+        self.placed, self.fixed = ~problem.free, ~problem.free
+        for index in np.flatnonzero(self.placed).tolist():
+            self.points[index], self.cov[index] = problem.known[int(self.table.names[index])]
+        self.observations = np.zeros(len(self.points), dtype=int)
+        self.usual = 0.0
+        self.adjusted = _EARLIEST
+        self.blind = 0
+
+    def add(self, step: int) -> None:
+        """Pose of the next frame, and the landmarks it adds."""
+        name, first, last = self.problem.name, *np.searchsorted(self.table.steps, [step, step + 1])
+        rows = np.arange(first, last)
+        now = self.table.index[rows]
+        seen = rows[self.placed[now]]
+        is_pair = isinstance(self.table.camera, RectifiedStereo)
+        if not step and len(seen) < KNOWN and (self.problem.known or not is_pair):
+            raise InputError(
+                f"Frame 0 of {name} sees {len(seen)} known points, expected {KNOWN} or more to start from; "
+                "add known points or give an initial estimate."
+            )
+        self.blind = 0 if len(seen) >= 3 or not step else self.blind + 1
+        if self.blind == LOST:
+            raise InputError(
+                f"Frames {step - LOST + 1} to {step} of {name} see fewer than 3 landmarks whose place is known "
+                "by then; give an initial estimate, or more known points."
+            )
+        # The pose, from the landmarks placed so far.
+        self.path[step] = self.path[max(step - 1, 0)]
+        if len(seen):
+            part = self.table.rows(seen)
+            part = replace(part, steps=np.zeros_like(part.steps))
+            at = np.searchsorted(self.table.names, part.names)
+            known = dict(zip(part.names.tolist(), zip(self.points[at], self.cov[at], strict=True), strict=True))
+            if step:
+                far = _MOTION * self._distance(at, step)
+                info = np.diag(np.repeat([_MOTION, far], 3) ** -2.0)
+                self.path[step], cov = resect(part, known, self.path[step], info)
+            else:
+                self.path[step], cov = locate(part, known)
+            # An error of the camera's place is one of the rays: as pixels at the distance of what it sees.
+            focal = float(np.linalg.norm(self.table.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0]))
+            self.usual = self._distance(at, step)
+            self.blur[step] = (focal * np.sqrt(np.trace(cov[3:, 3:]) / 3) / self.usual) ** 2
+        # The landmarks of this frame from all frames so far, unless they are long settled.
+        self.observations[now] += 1
+        settled = self.fixed | (self.placed & (self.observations > SETTLED))
+        moving = np.isin(self.table.index[:last], now[~settled[now]])
+        if moving.any():
+            part = self._blurred(self.table.rows(np.flatnonzero(moving)))
+            points = triangulate(part, self.path)
+            good = self._good(part, self.path, points)
+            index = np.searchsorted(self.table.names, part.names[good])
+            self.points[index], self.placed[index] = points[good], True
+            self.cov[index] = spread(part, self.path, points)[good]
+        if step + 1 >= GROWTH * self.adjusted:
+            self.adjusted = step + 1
+            self._adjust(step)
+
+    def _adjust(self, step: int) -> None:
+        last = np.searchsorted(self.table.steps, step + 1)
+        part = self.table.rows(np.flatnonzero(self.placed[self.table.index[:last]]))
+        before = np.searchsorted(self.table.names, part.names)
+        problem = CameraProblem(self.problem.name, step + 1, part, self.problem.known, HUBER)
+        start = CameraState(self.path[: step + 1], self.points[before])
+        found = adjust(problem, start, ROUGH, self.on_iteration)
+        state, part = found.state, found.problem.table
+        index = np.searchsorted(self.table.names, part.names)
+        self.placed[before] = False
+        self.path[: step + 1], self.points[index] = state.path, state.points
+        part = self._blurred(part)
+        good = self._good(part, state.path, state.points)
+        self.placed[index] = self.fixed[index] | good
+        free = ~self.fixed[index]
+        self.cov[index[free]] = spread(part, state.path, state.points)[free]
+
+    def _distance(self, index: NDArray[np.intp], step: int) -> float:
+        """Median distance of landmarks from a frame's camera."""
+        return float(np.median(np.linalg.norm(self.points[index] - SE3.translation(self.path[step]), axis=1)))
+
+    def _good(self, part: ObservationTable, path: Array, points: Array) -> NDArray[np.bool_]:
+        cap = np.inf if isinstance(part.camera, RectifiedStereo) else CAP
+        distance = np.linalg.norm(points - first_centres(part, path), axis=1)
+        far = distance > NEAREST * self.usual
+        return far & in_front(part, path, points) & (parallax(part, path, points, cap) > PLACED)
+
+    def _blurred(self, part: ObservationTable) -> ObservationTable:
+        blur = self.blur[part.steps][:, None, None] * np.eye(part.z.shape[1])
+        return replace(part, cov_z=part.cov_z + blur)

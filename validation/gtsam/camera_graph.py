@@ -13,6 +13,7 @@ Python are evaluated all at once and handed out one by one, which makes them nea
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, final
 
@@ -38,7 +39,7 @@ from rbpf.validation.gtsam.solvers import (
     ROUGH,
     SPATIAL,
     OnIteration,
-    explained,
+    explaining,
     huber,
     levenberg_marquardt,
     marginals,
@@ -84,13 +85,6 @@ class CameraProblem:
         self.free = np.array([name not in known for name in table.names.tolist()], dtype=bool)
         self.pose_keys = [int(gtsam.symbol("x", frame)) for frame in range(frames)]
         self.point_keys = [int(gtsam.symbol("l", index)) for index in range(len(table.names))]
-
-    def part(self, kept: NDArray[np.bool_]) -> "CameraProblem":
-        """The same without some of the landmarks (L,)."""
-        if kept.all():
-            return self
-        table = self.table.rows(kept[self.table.index])
-        return CameraProblem(self.name, self.frames, table, self.known, self.robust)
 
     @property
     def scaled(self) -> bool:
@@ -164,10 +158,9 @@ class CameraProblem:
         points = np.asarray(gtsam.utilities.extractVectors(values, "l"))
         return CameraState(SE3.normalise(SE3.from_matrix(matrices)), points.reshape(-1, 3))
 
-    def explained(self, error: RuntimeError) -> InputError:
-        """GTSAM's complaint in words, with the variable that it names."""
-        advice = "check the measurements there, or add known points"
-        return explained(error, self.name, "frame", self.table.names, advice)
+    def explaining(self) -> AbstractContextManager[None]:
+        """GTSAM's complaints in words."""
+        return explaining(self.name, "frame", self.table.names, "check the measurements there, or add known points")
 
     def observation_factors(self) -> list[Any]:
         """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
@@ -198,8 +191,8 @@ class CameraProblem:
                 state = self.state(values)
                 return reprojection(self.table, state.path, state.points)
 
-            together = Together(evaluate)
-            return self.factors_by_row(lambda row, model, pose, point: together.factor(row, [pose, point], model))
+            factor = together(evaluate)
+            return self.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point], model))
         return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
 
     def factors_by_row(self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None) -> list[Any]:
@@ -217,32 +210,29 @@ class CameraProblem:
         return out
 
 
-@final
-class Together:
-    """Residuals of many factors, evaluated when the first of them is asked for and kept for the others.
+def together(evaluate: Callable[[Any], Residuals]) -> Callable[[int, list[int], Any], Any]:
+    """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
 
     GTSAM hands every factor the same object as long as Python holds it, as the loops of `solvers` do; an
     optimiser that changes its values in place would be shown old residuals.
     """
+    held: Any = None
+    found: Residuals = np.empty(0), []
 
-    def __init__(self, evaluate: Callable[[Any], Residuals]) -> None:
-        self._evaluate = evaluate
-        self._held: Any = None
-        self._found: Residuals = np.empty(0), []
-
-    def factor(self, row: int, keys: list[int], model: Any) -> Any:
-        """The factor of one row."""
-
+    def factor(row: int, keys: list[int], model: Any) -> Any:
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            if values is not self._held:
-                self._held, self._found = values, self._evaluate(values)
-            residuals, slopes = self._found
+            nonlocal held, found
+            if values is not held:
+                held, found = values, evaluate(values)
+            residuals, slopes = found
             if jacobians is not None:
                 for place, slope in enumerate(slopes):
                     jacobians[place] = slope[row]
             return residuals[row]
 
         return gtsam.CustomFactor(model, keys, error)
+
+    return factor
 
 
 class Adjusted(NamedTuple):
@@ -260,14 +250,6 @@ class Adjusted(NamedTuple):
         """The optimum in our storage."""
         return self.problem.state(self.values)
 
-    def require_converged(self) -> None:
-        """Refuses an optimum that is none."""
-        if not self.converged:
-            raise InputError(
-                f"The batch adjustment of {self.problem.name} did not converge in {self.iterations} iterations; "
-                "start it from a better estimate, or ask for the robust loss."
-            )
-
 
 def adjust(
     problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: OnIteration | None = None
@@ -275,24 +257,21 @@ def adjust(
     """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
 
     Those whose distance is open get a weak prior. One that an outlier has drawn into its camera is left out: there
-    it would explain any pixel, and hold up all others.
-
-    Raises:
-        InputError: the measurements do not determine a variable.
+    it would explain any pixel, and hold up all others. An InputError names a variable that is not determined.
     """
 
     def run(graph: Any, state: CameraState, tolerance: float) -> tuple[Any, int, bool]:
         most = _FEW if tolerance == ROUGH else ITERATIONS
-        try:
+        with problem.explaining():
             return levenberg_marquardt(graph, problem.values(state), tolerance, most, on_iteration)
-        except RuntimeError as error:
-            raise problem.explained(error) from error
 
     state, weak, total, loose = start, start, 0, np.zeros(len(start.points), dtype=bool)
     for round_ in range(_ROUNDS):
         kept = ~(problem.free & collapsed(problem.table, state.path, state.points))
-        problem, loose = problem.part(kept), loose[kept]
-        state, weak = (replace(one, points=one.points[kept]) for one in (state, weak))
+        if not kept.all():
+            table, loose = problem.table.rows(kept[problem.table.index]), loose[kept]
+            problem = CameraProblem(problem.name, problem.frames, table, problem.known, problem.robust)
+            state, weak = (replace(one, points=one.points[kept]) for one in (state, weak))
         now = problem.free & is_open(problem.table, state.path, state.points)
         # The first judgement may be the start's fault; later ones only add, so that it comes to an end.
         now = now if round_ < 2 else now | loose
@@ -322,8 +301,6 @@ def covariances(found: Adjusted) -> tuple[Array, dict[int, Array]]:
             found.graph, found.values, poses, points, problem.held_keys, problem.name
         )
         return of_poses, dict(zip(names, of_points, strict=True))
-    try:
+    with problem.explaining():
         blocks = marginals(found.graph, found.values, [*poses, *points])
-    except RuntimeError as error:
-        raise problem.explained(error) from error
     return np.array(blocks[: len(poses)]), dict(zip(names, blocks[len(poses) :], strict=True))

@@ -38,15 +38,6 @@ _NONE = 1e-200  # information of a landmark behind its cameras
 
 @final
 @dataclass(frozen=True, eq=False)
-class CameraEstimate:
-    """Where to start from: poses (T, 7), positions (3,) [m] by name; those that lack are triangulated from the poses."""
-
-    world_from_camera: Array
-    landmarks: dict[int, Array]
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class ObservationTable:
     """All measurements of a log, one row each, in the order of the frames."""
 
@@ -80,11 +71,7 @@ class ObservationTable:
 
 
 def observation_table(log: FeatureLog) -> ObservationTable:
-    """All measurements of a log.
-
-    Raises:
-        InputError: a covariance is singular.
-    """
+    """All measurements of a log; an InputError names one whose covariance is singular."""
     counts = [len(frame.landmarks) for frame in log.frames]
     names, index = np.unique(np.concatenate([f.landmarks for f in log.frames]), return_inverse=True)
     steps = np.repeat(np.arange(len(counts)), counts)
@@ -114,11 +101,7 @@ def in_one_piece(steps: Index, index: Index, frames: int, known: NDArray[np.bool
 
 
 def known_by_name(known: KnownPoints | None, names: NDArray[np.int64]) -> dict[int, tuple[Array, Array]]:
-    """Position (3,) and covariance (3, 3) of the known points among the names.
-
-    Raises:
-        InputError: a covariance is neither positive definite nor zero.
-    """
+    """Position (3,) and covariance (3, 3), positive definite or zero, of the known points among the names."""
     if known is None:
         return {}
     seen, found = set(names.tolist()), {}
@@ -163,11 +146,7 @@ def sigmas(table: ObservationTable, path: Array, points: Array) -> Array:
 
 
 def triangulate(table: ObservationTable, path: Array) -> Array:
-    """Huber's estimate from the distances to the rays, each taken in pixels of its image.
-
-    Returns:
-        (L, 3) positions; anywhere near its rays where a landmark has no parallax.
-    """
+    """Huber's estimate (L, 3) from the distances to the rays, each in pixels of its image; near them without parallax."""
     # Centres and unit directions of the rays in the world, and noise as an angle; the right image of a stereo pair
     # gives a second ray.
     poses, camera, index = path[table.steps], table.camera, table.index

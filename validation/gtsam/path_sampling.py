@@ -4,16 +4,8 @@ At the optimum the posterior is nearly Gaussian: in the right charts of the pose
 N(0, H⁻¹), H = JᵀJ with J the whitened Jacobian of the least-squares problem. A draw is what the problem answers when
 all of its residuals are noise, ξ = H⁻¹ Jᵀ η with η ~ N(0, I): no root of H⁻¹ is needed (G. Papandreou, A. Yuille,
 "Gaussian sampling by local perturbations", 2010). A draw's weight is the true joint density of path, map and
-measurements over its own: the mean weight is the evidence, without bias, and the weighted draws are the posterior,
-whatever H leaves out.
-
-    p(x, l, z) = Π N(e_t; 0, Q_t) Π N(z − h(x, l); 0, R) / Π E|∂l/∂z|,    e_t = Log((x_{t−1} δ_t)⁻¹ x_t)
-
-The evidence is that of all measurements given each landmark's first one, with a flat prior of the landmarks: what a
-filter sums up that begins landmarks by their first sighting. E|∂l/∂z|, over the noise of that sighting, is the density of the
-first ones themselves.
-
-That is Mathematics (batch-weight). Draws that are nearer to the posterior than those of N(0, H⁻¹), at no cost in exactness:
+measurements over its own, Mathematics (batch-weight): the mean weight is the evidence, without bias, and the weighted draws
+are the posterior, whatever H leaves out. Nearer to the posterior than draws of N(0, H⁻¹), at no cost in exactness:
 
 - Densities of motions are those of e_t, so that each pose comes with |J_r(ξ_t)| / |J_r(e_t)|. A robot that hardly slips
   sideways follows a curve that no chart of single poses follows: where e_t bends by more than `BENT` of its noise, the linear
@@ -95,9 +87,21 @@ def draw_posterior(
     Raises:
         InputError: a measurement's covariance is singular, or the optimum lacks something.
     """
-    problem, path, size = Problem(m), optimum.world_from_robot, m.z.shape[1]
+    problem, path, size = Problem(m), optimum.world_from_body, m.z.shape[1]
     places = np.array([optimum.landmarks[name] for name in problem.names.tolist()]).reshape(-1, size)
-    motions, points, robot = _derivatives(problem, path, places)
+    # Derivatives of the whitened motions by all moves, of the whitened observations by the landmarks' and the poses'.
+    dim, (ahead, back, _) = m.space.dim, _linear_noise(problem, path)
+    along = problem.axes.mT / np.sqrt(np.where(problem.null, 1.0, problem.variances))[..., None]
+    count = len(ahead)
+    pairs = np.stack([-along @ back, along @ ahead], axis=1).reshape(-1, dim, dim)
+    columns = np.stack([np.arange(count), np.arange(1, count + 1)], axis=1).ravel()
+    # Columns of all poses, of which the first does not move.
+    by_pose = bsr_array((pairs, columns, 2 * np.arange(count + 1)), shape=(dim * count, dim * (count + 1)))
+    motions = hstack([csc_array((dim * count, places.size)), by_pose.tocsc()[:, dim:]], format="csc")
+    slopes = problem.sensor.slopes(path[m.steps], places[problem.index])
+    whiten, each = np.linalg.inv(np.linalg.cholesky(m.cov_z)), np.arange(len(m.z) + 1)
+    robot = bsr_array((whiten @ slopes[0], m.steps, each), shape=(m.z.size, dim * len(path))).tocsc()[:, dim:]
+    points = bsr_array((whiten @ slopes[1], problem.index, each), shape=(m.z.size, places.size)).tocsc()
     seen = hstack([points, robot], format="csc")
     # Moves ξ of the landmarks, then of the poses after the first.
     noisy = np.where(problem.null, 0.0, 1.0).ravel()
@@ -108,8 +112,8 @@ def draw_posterior(
     squares = np.square(noisy[:, None] * (motions @ moves)).sum(axis=0) + np.square(seen @ moves).sum(axis=0)
     free = len(moves) - (noisy == 0.0).sum()
     log_draw = 0.5 * (np.log(np.abs(factor.U.diagonal())).sum() - squares - free * np.log(2.0 * np.pi))
-    xi = np.zeros((draws, len(path), m.space.dim))
-    xi[:, 1:] = moves[places.size :].T.reshape(draws, -1, m.space.dim)
+    xi = np.zeros((draws, len(path), dim))
+    xi[:, 1:] = moves[places.size :].T.reshape(draws, -1, dim)
     poses, log_motion = _driven(problem, path, xi)
 
     # Landmarks: their scatter about where the poses' moves would have them, and where the true residuals do.
@@ -130,24 +134,6 @@ def draw_posterior(
     for some, residual in _residuals(problem, poses, landmarks):
         log_seen[some] -= 0.5 * np.square(residual).sum(axis=0)
     return PosteriorDraws(poses, problem.names, landmarks, log_motion + log_seen - _log_first(m) - log_draw)
-
-
-def _derivatives(problem: Problem, path: Array, places: Array) -> tuple[csc_array, csc_array, csc_array]:
-    """Of the whitened motions by all moves, and of the whitened observations by the landmarks' and by the poses'."""
-    m, dim = problem.m, problem.m.space.dim
-    ahead, back, _ = _linear_noise(problem, path)
-    along = problem.axes.mT / np.sqrt(np.where(problem.null, 1.0, problem.variances))[..., None]
-    count = len(ahead)
-    pairs = np.stack([-along @ back, along @ ahead], axis=1).reshape(-1, dim, dim)
-    columns = np.stack([np.arange(count), np.arange(1, count + 1)], axis=1).ravel()
-    # Columns of all poses, of which the first does not move.
-    by_pose = bsr_array((pairs, columns, 2 * np.arange(count + 1)), shape=(dim * count, dim * (count + 1)))
-    motions = hstack([csc_array((dim * count, places.size)), by_pose.tocsc()[:, dim:]], format="csc")
-    slopes = problem.sensor.slopes(path[m.steps], places[problem.index])
-    whiten, each = np.linalg.inv(np.linalg.cholesky(m.cov_z)), np.arange(len(m.z) + 1)
-    by_robot = bsr_array((whiten @ slopes[0], m.steps, each), shape=(m.z.size, dim * len(path))).tocsc()[:, dim:]
-    by_point = bsr_array((whiten @ slopes[1], problem.index, each), shape=(m.z.size, places.size)).tocsc()
-    return motions, by_point, by_robot
 
 
 def _linear_noise(problem: Problem, path: Array) -> tuple[Array, Array, Array]:

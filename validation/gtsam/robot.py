@@ -15,8 +15,6 @@ standard deviation of the same step.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, final
 
 import gtsam
@@ -32,7 +30,8 @@ from rbpf.validation.gtsam.solvers import (
     PLANAR,
     ROUGH,
     SPATIAL,
-    explained,
+    BatchSolution,
+    explaining,
     gauss_newton,
     huber,
     levenberg_marquardt,
@@ -46,22 +45,8 @@ CHUNK = 50
 """Steps that an incremental start adds at once."""
 MOVED = 1e-3
 """How far a variable may be from where `solve_online` linearised it [rad, m]."""
+ADVICE = "check the covariances there"
 _PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class BatchSolution:
-    """Most probable trajectory and map, with covariances from the Gauss-Newton Hessian there."""
-
-    world_from_robot: Array  #: (T, E) poses.
-    landmarks: dict[int, Array]  #: name of each landmark to its (D,) position.
-    cov_poses: Array  #: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
-    cov_landmarks: dict[int, Array]  #: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
-    #: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right about
-    #: half the number of measured scalars less half that of the landmarks' coordinates.
-    error: float
-    iterations: int  #: of the optimiser.
 
 
 def solve(
@@ -86,7 +71,7 @@ def solve(
             does not converge.
     """
     problem = Problem(m, robust)
-    with _explaining(problem):
+    with explaining(m.recording, "the pose of step", problem.names, ADVICE):
         graph = problem.graph()
         if incremental:  # ISAM2 closes every loop from near by.
             *_, (_, isam) = _grown(problem, CHUNK)
@@ -95,7 +80,7 @@ def solve(
             values = problem.values(initial or initial_estimate(m))
         # Until the error stands; hard constraints of the odometry are softened first, and then Gauss-Newton's.
         softened = 0
-        if problem.singular:
+        if problem.null.any():
             near, softened, _ = levenberg_marquardt(problem.graph(soft=True), values, ROUGH)
             values, count, converged = gauss_newton(graph, near)
         else:
@@ -108,11 +93,9 @@ def solve(
         path, landmarks = problem.estimate(values)
         cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
         if marginals:
-            poses = [problem.pose_key(step) for step in range(len(path))]
-            points = [problem.landmark_key(index) for index in range(len(problem.names))]
-            found = marginals_of(graph, values, poses + points)
-            cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(poses)]])
-            cov_landmarks = dict(zip(problem.names.tolist(), found[len(poses) :], strict=True))
+            found = marginals_of(graph, values, problem.pose_keys + problem.landmark_keys)
+            cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(path)]])
+            cov_landmarks = dict(zip(problem.names.tolist(), found[len(path) :], strict=True))
         return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count)
 
 
@@ -123,7 +106,7 @@ def solve_online(m: Measurements, robust: float | None = None) -> Array:
     of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
     """
     problem = Problem(m, robust)
-    with _explaining(problem):
+    with explaining(m.recording, "the pose of step", problem.names, ADVICE):
         return np.array([pose for pose, _ in _grown(problem, 1, MOVED)])
 
 
@@ -146,28 +129,18 @@ def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterat
         for step in range(first, min(first + chunk, len(m.stamps_ns))):
             pose = m.space.compose(pose, m.deltas[step - 1]) if step else pose
             problem.add_step(graph, step, soft=True)
-            values.insert(problem.pose_key(step), problem.chart.pose(pose))
+            values.insert(problem.pose_keys[step], problem.chart.pose(pose))
             for row in problem.observations(step).tolist():
                 landmark = int(problem.index[row])
                 if landmark not in seen:
                     seen.add(landmark)
-                    values.insert(problem.landmark_key(landmark), start.invert(pose, m.z[row]))
+                    values.insert(problem.landmark_keys[landmark], start.invert(pose, m.z[row]))
         isam.update(graph, values)
         if moved is not None:
             isam.update()
-        pose = problem.chart.storage(isam.calculateEstimate(), problem.pose_key(step))
+        pose = problem.chart.storage(isam.calculateEstimate(), problem.pose_keys[step])
         yield pose, isam
     del held
-
-
-@contextmanager
-def _explaining(problem: "Problem") -> Iterator[None]:
-    """GTSAM's complaints in words."""
-    try:
-        yield
-    except RuntimeError as error:
-        advice = "check the covariances there"
-        raise explained(error, problem.m.recording, "the pose of step", problem.names, advice) from error
 
 
 @final
@@ -212,15 +185,9 @@ class Sensor:
 
 @final
 class Problem:
-    """Variables and factors of a run; see `solve`.
-
-    Raises:
-        InputError: an observation's covariance is singular.
-    """
+    """Variables and factors of a run; see `solve`. An InputError names an observation whose covariance is singular."""
 
     def __init__(self, m: Measurements, robust: float | None = None) -> None:
-        if robust is not None and not robust > 0:
-            raise InputError(f"Expected a robust threshold above 0 standard deviations, found {robust}.")
         variances = np.linalg.eigvalsh(m.cov_z)
         singular = variances[:, 0] <= SINGULAR * variances[:, -1]
         if singular.any():
@@ -230,24 +197,13 @@ class Problem:
         self.m, self.robust, self.sensor = m, robust, Sensor(m)
         self.chart = PLANAR if isinstance(m.space, SE2Group) else SPATIAL
         self.names, self.index = np.unique(m.landmarks, return_inverse=True)
+        self.pose_keys = [int(gtsam.symbol("x", step)) for step in range(len(m.stamps_ns))]
+        self.landmark_keys = [int(gtsam.symbol("l", index)) for index in range(len(self.names))]
         self._by_step = np.argsort(m.steps, kind="stable")
         self._bounds = np.searchsorted(m.steps[self._by_step], np.arange(len(m.stamps_ns) + 1))
         #: (T - 1, d) of the motions along their (T - 1, d, d) axes, and which of them are none.
         self.variances, self.axes = np.linalg.eigh(m.covs)
         self.null = self.variances <= SINGULAR * self.variances.max(-1, keepdims=True, initial=0.0)
-
-    @property
-    def singular(self) -> bool:
-        """Whether any odometry has a direction without noise."""
-        return bool(self.null.any())
-
-    def pose_key(self, step: int) -> int:
-        """Key of a step's pose."""
-        return int(gtsam.symbol("x", step))
-
-    def landmark_key(self, index: int) -> int:
-        """Key of the landmark `names[index]`."""
-        return int(gtsam.symbol("l", index))
 
     def observations(self, step: int) -> NDArray[np.intp]:
         """Rows of the step's observations."""
@@ -266,43 +222,37 @@ class Problem:
             graph.push_back(self._odometry(step, soft))
         else:
             hard = gtsam.noiseModel.Constrained.All(self.m.space.dim)
-            graph.push_back(self.chart.prior(self.pose_key(0), self.chart.pose(self.m.start), hard))
+            graph.push_back(self.chart.prior(self.pose_keys[0], self.chart.pose(self.m.start), hard))
         for row in self.observations(step).tolist():
             graph.push_back(self._observation(row))
 
     def values(self, initial: InitialEstimate) -> Any:
-        """GTSAM's values of an estimate.
-
-        Raises:
-            InputError: it lacks a pose or a landmark.
-        """
-        shape, path = (len(self.m.stamps_ns), self.m.space.size), initial.world_from_robot
+        """GTSAM's values of an estimate; an InputError says which pose or landmark it lacks."""
+        shape, path = (len(self.m.stamps_ns), self.m.space.size), initial.world_from_body
         missing = [name for name in self.names.tolist() if name not in initial.landmarks]
         if path.shape != shape or missing:
             problem = f"landmark {missing[0]} is missing" if missing else f"found poses of shape {path.shape}"
             raise InputError(f"Expected initial poses of shape {shape} and every landmark seen, {problem}.")
         values = gtsam.Values()
-        for step, pose in enumerate(path):
-            values.insert(self.pose_key(step), self.chart.pose(pose))
-        for index, name in enumerate(self.names.tolist()):
-            values.insert(self.landmark_key(index), np.asarray(initial.landmarks[name], dtype=float))
+        for key, pose in zip(self.pose_keys, path, strict=True):
+            values.insert(key, self.chart.pose(pose))
+        for key, name in zip(self.landmark_keys, self.names.tolist(), strict=True):
+            values.insert(key, np.asarray(initial.landmarks[name], dtype=float))
         return values
 
     def estimate(self, values: Any) -> InitialEstimate:
         """The inverse of `values`."""
-        poses = [self.chart.storage(values, self.pose_key(step)) for step in range(len(self.m.stamps_ns))]
-        points = {
-            name: np.array(self.chart.point(values, self.landmark_key(index)))
-            for index, name in enumerate(self.names.tolist())
-        }
-        return InitialEstimate(self.m.space.normalise(np.array(poses)), points)
+        poses = [self.chart.storage(values, key) for key in self.pose_keys]
+        points = [np.array(self.chart.point(values, key)) for key in self.landmark_keys]
+        path = self.m.space.normalise(np.array(poses))
+        return InitialEstimate(path, dict(zip(self.names.tolist(), points, strict=True)))
 
     def _odometry(self, step: int, soft: bool) -> Any:
         variances, axes, null = (x[step - 1] for x in (self.variances, self.axes, self.null))
         space, chart, delta = self.m.space, self.chart, self.m.deltas[step - 1]
         if soft:
             variances = np.where(null, SOFT**2 * variances[-1], variances)
-        keys = self.pose_key(step - 1), self.pose_key(step)
+        keys = self.pose_keys[step - 1 : step + 1]
         if not null.any() or (soft and variances[-1] > 0):
             cov = ((axes * variances) @ axes.T)[np.ix_(chart.order, chart.order)]
             return chart.between(*keys, chart.pose(delta), noise(cov))
@@ -318,11 +268,11 @@ class Problem:
             return axes.T @ e
 
         mixed = gtsam.noiseModel.Constrained.MixedSigmas(_PENALTY, np.sqrt(np.where(null, 0.0, variances)))
-        return gtsam.CustomFactor(mixed, list(keys), error)
+        return gtsam.CustomFactor(mixed, keys, error)
 
     def _observation(self, row: int) -> Any:
         sensor, chart, z = self.sensor, self.chart, self.m.z[row]
-        pose_key, landmark_key = (self.pose_key(int(self.m.steps[row])), self.landmark_key(int(self.index[row])))
+        pose_key, landmark_key = self.pose_keys[self.m.steps[row]], self.landmark_keys[self.index[row]]
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
             state, landmark = chart.storage(values, pose_key), chart.point(values, landmark_key)

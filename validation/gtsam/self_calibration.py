@@ -16,18 +16,12 @@ from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.calibration import camera_text
-from rbpf.validation.gtsam.batch_problem import Optimum, read_problem, softened, solve_problem
+from rbpf.validation.gtsam.batch_problem import Optimum, softened, solve_problem
 from rbpf.validation.gtsam.camera import begin
-from rbpf.validation.gtsam.camera_graph import FINE, SCALE, CameraProblem, Together, adjust
-from rbpf.validation.gtsam.observations import (
-    HUBER,
-    CameraEstimate,
-    Residuals,
-    known_by_name,
-    observation_table,
-    reprojection,
-)
+from rbpf.validation.gtsam.camera_graph import FINE, SCALE, CameraProblem, adjust, together
+from rbpf.validation.gtsam.observations import HUBER, Residuals, known_by_name, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
 
 ITERATIONS = 200
@@ -35,7 +29,6 @@ ITERATIONS = 200
 _STEP = 1e-6
 """Of focal length and k1, for the residuals' derivatives by them."""
 OnRound = Callable[[int, int], None]
-"""Called with the iterations done, and the most that there can be."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +47,13 @@ class Calibrated:
 def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnRound | None = None) -> Calibrated:
     """Focal length and k1 adjusted together with all poses and landmarks, from the optimum with the given camera.
 
-    Raises:
-        InputError: a batch adjustment fails.
+    `on_round` is called with the iterations done, and the most that there can be. Errors as of `solve_problem`.
     """
     assert isinstance(batch.problem, FeatureLog) and isinstance(batch.problem.camera, Pinhole)
     camera, full, path = batch.problem.camera, observation_table(batch.problem), batch.estimate.world_from_body
     known = known_by_name(softened(batch.problem.known), full.names)
     given = CameraProblem(log.name, len(path), full.determined(known), known, HUBER)
-    found = adjust(given, begin(given, CameraEstimate(path, batch.estimate.landmarks.named())))
+    found = adjust(given, begin(given, InitialEstimate(path, batch.estimate.landmarks.named())))
     problem, key = found.problem, int(gtsam.symbol("c", 0))
 
     def changed(change: np.ndarray) -> Pinhole:
@@ -80,8 +72,8 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnRound | None
         moved = [at(change + step)[0] - at(change - step)[0] for step in _STEP * np.eye(2)]
         return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
 
-    together = Together(evaluate)
-    factors = problem.factors_by_row(lambda row, model, pose, point: together.factor(row, [pose, point, key], model))
+    factor = together(evaluate)
+    factors = problem.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point, key], model))
     graph = problem.graph(found.state, found.loose, path, SCALE, factors)
     values = problem.values(found.state)
     values.insert(key, np.zeros(2))
@@ -107,15 +99,12 @@ def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
 
 
 def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tuple[dict[str, Any], Calibrated]:
-    """Calibrates the camera of a finished monocular run; writes camera.yaml into `out`; returns what changed, and the camera.
-
-    Raises:
-        InputError: the folder holds no run of one camera, or what it measured cannot be adjusted.
-    """
-    problem = read_problem(folder)
+    """Calibrates the camera of a finished monocular run; writes camera.yaml; returns what changed, and the camera."""
+    record = RunFolder.open(folder)
+    problem = record.measurements
     if not isinstance(problem, FeatureLog) or not isinstance(problem.camera, Pinhole):
         raise InputError(f"{folder} is no run of one camera: only that can calibrate its camera")
-    start = solve_problem(problem, RunFolder.open(folder).estimate.world_from_body, HUBER, marginals=False)
+    start = solve_problem(problem, record.estimate.world_from_body, HUBER, marginals=False)
     found = refine_calibration(problem, start, on_round)
     prepare_folder(out)
     about = f"focal length and k1 from what the run over {problem.name} measured"

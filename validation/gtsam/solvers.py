@@ -9,7 +9,8 @@ Python, a hundred times the cost; linearisation, elimination and retraction are 
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -38,6 +39,25 @@ MOST_POSES = 1_500
 """Whose dense reduced system is taken for covariances: 9,000 unknowns, 650 MB."""
 _POSE, _POINT = 6, 3
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class BatchSolution:
+    """Most probable trajectory and map, with covariances from the Gauss-Newton Hessian there."""
+
+    world_from_body: Array  #: (T, E) poses, of a robot or of a (left) camera.
+    landmarks: dict[int, Array]  #: name of each landmark that took part to its (D,) position [m].
+    cov_poses: Array  #: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
+    cov_landmarks: dict[int, Array]  #: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
+    #: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right about
+    #: half the number of measured scalars less half that of the landmarks' coordinates.
+    error: float
+    iterations: int  #: of the optimiser.
+    #: of a camera's, ascending: names of the landmarks whose place the measurements do not tell: those seen in one frame by
+    #: a single camera, and those that an outlier has drawn into its camera, which are both left out, and those whose
+    #: distance is open for want of parallax, which have a weak prior.
+    undetermined: Sequence[int] = ()
 
 
 @final
@@ -87,18 +107,22 @@ SPATIAL = Chart(
 )
 
 
-def explained(error: RuntimeError, name: str, pose: str, landmarks: NDArray[np.int64], advice: str) -> InputError:
-    """GTSAM's complaint about a recording in words, with the variable that it names.
+@contextmanager
+def explaining(name: str, pose: str, landmarks: NDArray[np.int64], advice: str) -> Iterator[None]:
+    """GTSAM's complaint about a recording as an InputError in words, with the variable that it names.
 
     The step of a pose is called `pose` in the recording, `landmarks` are the names of those that the keys count; `advice`
     says what to do.
     """
-    symbol = _SYMBOL.search(str(error))
-    if symbol is None:
-        return InputError(f"GTSAM could not solve {name}: {' '.join(str(error).split())}")
-    where = f"landmark {landmarks[int(symbol[2])]}" if symbol[1] == "l" else f"{pose} {symbol[2]}"
-    problem = f"the measurements do not determine everything near {where}"
-    return InputError(f"GTSAM could not solve {name}: {problem}; {advice}.")
+    try:
+        yield
+    except RuntimeError as error:
+        symbol = _SYMBOL.search(str(error))
+        if symbol is None:
+            raise InputError(f"GTSAM could not solve {name}: {' '.join(str(error).split())}") from error
+        where = f"landmark {landmarks[int(symbol[2])]}" if symbol[1] == "l" else f"{pose} {symbol[2]}"
+        problem = f"the measurements do not determine everything near {where}"
+        raise InputError(f"GTSAM could not solve {name}: {problem}; {advice}.") from error
 
 
 def noise(cov: Array) -> Any:
@@ -111,20 +135,18 @@ def huber(base: Any, threshold: float | None) -> Any:
     """Huber's loss on the norm of the whitened residual, in standard deviations; None leaves it Gaussian."""
     if threshold is None:
         return base
+    if not threshold > 0:
+        raise InputError(f"Expected a robust threshold above 0 standard deviations, found {threshold}.")
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(threshold), base)
 
 
 def levenberg_marquardt(
     graph: Any, values: Any, tolerance: float, iterations: int = ITERATIONS, on_iteration: OnIteration | None = None
 ) -> tuple[Any, int, bool]:
-    """Damped Gauss-Newton; returns the values, the number of iterations, and whether it converged.
+    """Damped Gauss-Newton from some values; returns the values, the number of iterations, and whether it converged.
 
-    Args:
-        graph: nonlinear factors.
-        values: where to start.
-        tolerance: it ends when a step gains less than this fraction of the error.
-        iterations: most of them.
-        on_iteration: called with the error before each iteration; what it raises ends the optimisation.
+    It ends when a step gains less than `tolerance`, a fraction of the error. `on_iteration` is called with the error before
+    each iteration; what it raises ends the optimisation.
     """
     error, damping = graph.error(values), _DAMPING
     for count in range(1, iterations + 1):
@@ -194,9 +216,7 @@ def marginals_by_schur(
     whose scale is measured, well or badly, not for those where a stiff prior holds it.
 
     The graph of a recording has factors between P poses and L points alone; some of them hard constraints hold by themselves.
-
-    Raises:
-        InputError: the measurements do not determine something.
+    An InputError says that the measurements do not determine everything.
     """
     undetermined = InputError(
         f"The measurements of {name} do not determine all poses and landmarks, so that they have no covariance; "

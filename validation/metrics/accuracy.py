@@ -15,8 +15,6 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, fit
 
-Unit = Literal["frames", "metres"]
-
 
 @final
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Simi
     """
     _require_pairs(estimate, reference)
     applied = fit(alignment, estimate.positions, reference.positions)
-    distances = _norm(applied.transform(estimate.positions) - reference.positions)
+    distances = np.linalg.norm(applied.transform(estimate.positions) - reference.positions, axis=-1)
     return AbsoluteError(reference.stamps_ns, distances, applied)
 
 
@@ -89,7 +87,7 @@ def rpe(
     estimate: Trajectory,
     reference: Trajectory,
     delta: float = 1,
-    unit: Unit = "frames",
+    unit: Literal["frames", "metres"] = "frames",
     alignment: Alignment | Similarity = "none",
 ) -> RelativeError:
     """Relative pose error, the difference of the motions between consecutive poses `delta` apart.
@@ -108,13 +106,24 @@ def rpe(
     """
     _require_pairs(estimate, reference)
     moved = estimate.transformed(fit(alignment, estimate.positions, reference.positions))
-    ends = _pair_ends(moved.positions, delta, unit)
+    if unit == "frames":
+        if delta < 1 or delta != int(delta):
+            raise InputError(f"Expected delta to be a whole number of frames, at least 1, found {delta:g}.")
+        ends = list(range(0, len(moved), int(delta)))
+    else:
+        if unit != "metres" or not delta > 0.0:
+            raise InputError(f"Expected delta to be a positive number of frames or metres, found {delta:g} {unit}.")
+        path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(moved.positions, axis=0), axis=-1))])
+        ends = [0]
+        while (end := int(np.searchsorted(path, path[ends[-1]] + delta))) < len(path):
+            ends.append(end)
     if len(ends) < 2:
         raise InputError(f"Expected a trajectory longer than {delta:g} {unit}; choose a shorter delta.")
     pairs = np.stack([ends[:-1], ends[1:]], axis=1)
     motions = (SE3.between(*np.swapaxes(path.world_from_body[pairs], 0, 1)) for path in (reference, moved))
     error = SE3.between(*motions)
-    return RelativeError(pairs, _norm(SE3.translation(error)), np.degrees(_norm(SE3.log(error)[:, :3])))
+    turned = np.linalg.norm(SE3.log(error)[:, :3], axis=-1)
+    return RelativeError(pairs, np.linalg.norm(SE3.translation(error), axis=-1), np.degrees(turned))
 
 
 def landmark_errors(
@@ -132,33 +141,13 @@ def landmark_errors(
         raise InputError(f"None of the {len(estimate)} estimated landmarks is among the {len(truth)} true ones.")
     found, true = (np.array([points[name] for name in names], dtype=float) for points in (estimate, truth))
     applied = fit(alignment, found, true)
-    return AbsoluteError(np.array(names), _norm(applied.transform(found) - true), applied)
+    return AbsoluteError(np.array(names), np.linalg.norm(applied.transform(found) - true, axis=-1), applied)
 
 
 def _require_pairs(estimate: Trajectory, reference: Trajectory) -> None:
     if len(estimate) != len(reference) or not len(estimate):
         counts = f"{len(estimate)} and {len(reference)}"
         raise InputError(f"Expected as many estimated as true poses, found {counts}; pair them with associate.")
-
-
-def _pair_ends(positions: Array, delta: float, unit: Unit) -> NDArray[np.intp]:
-    if unit not in ("frames", "metres"):
-        raise InputError(f"Expected the unit frames or metres, found {unit!r}.")
-    if unit == "frames":
-        if delta < 1 or delta != int(delta):
-            raise InputError(f"Expected delta to be a whole number of frames, at least 1, found {delta:g}.")
-        return np.arange(0, len(positions), int(delta))
-    if not delta > 0.0:
-        raise InputError(f"Expected delta to be a positive number of metres, found {delta:g}.")
-    path = np.concatenate([[0.0], np.cumsum(_norm(np.diff(positions, axis=0)))])
-    ends = [0]
-    while (end := int(np.searchsorted(path, path[ends[-1]] + delta))) < len(path):
-        ends.append(end)
-    return np.array(ends)
-
-
-def _norm(vectors: Array) -> Array:
-    return np.sqrt(np.square(vectors).sum(-1))
 
 
 def _rms(values: Array) -> float:

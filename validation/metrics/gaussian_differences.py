@@ -23,21 +23,19 @@ _TINY = 1e-9
 
 def mahalanobis(delta: Array, cov: Array) -> Array:
     """sqrt(δᵀ P⁻¹ δ) of (…, n) and (…, n, n): (…)."""
-    return np.sqrt(np.einsum("...i,...i->...", delta, _solve(cov, delta)))
+    return np.sqrt(_square(delta, cov))
 
 
 def kullback_leibler(delta: Array, cov_p: Array, cov_q: Array) -> Array:
     """KL(p ‖ q) of Gaussians whose means differ by δ (…, n), with covariances (…, n, n) [nats]: (…)."""
     trace = np.trace(np.linalg.solve(cov_q, cov_p), axis1=-2, axis2=-1)
-    shift = np.einsum("...i,...i->...", delta, _solve(cov_q, delta))
-    return np.asarray(0.5 * (trace + shift - delta.shape[-1] + _log_det(cov_q) - _log_det(cov_p)))
+    return np.asarray(0.5 * (trace + _square(delta, cov_q) - delta.shape[-1] + _log_det(cov_q) - _log_det(cov_p)))
 
 
 def bhattacharyya(delta: Array, cov_p: Array, cov_q: Array) -> Array:
     """Bhattacharyya's distance, −log ∫ √(p q); symmetric and 0 for equal Gaussians: (…)."""
     middle = 0.5 * (cov_p + cov_q)
-    shift = np.einsum("...i,...i->...", delta, _solve(middle, delta))
-    return 0.125 * shift + 0.5 * (_log_det(middle) - 0.5 * (_log_det(cov_p) + _log_det(cov_q)))
+    return 0.125 * _square(delta, middle) + 0.5 * (_log_det(middle) - 0.5 * (_log_det(cov_p) + _log_det(cov_q)))
 
 
 def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
@@ -73,12 +71,6 @@ class Differences:
         return figures | {"keys": self.keys.tolist()} | {name: getattr(self, name).tolist() for name in COLUMNS}
 
 
-def figures_of(name: str, differences: Differences) -> dict[str, Any]:
-    """Single numbers for a report's page, under names that begin with a word."""
-    rows = differences.as_dict().items()
-    return {f"{name}_{key}": value for key, value in rows if not isinstance(value, list)}
-
-
 def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differences:
     """The landmarks that both estimates of one world have; those that one of them holds exactly are left out.
 
@@ -94,35 +86,27 @@ def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differenc
 
 
 def compare_last_pose(ours: PathAndMap, other: PathAndMap, step: int, across: bool) -> Differences:
-    """The last poses of two estimates, in the chart at the other's; see `compare_maps`."""
+    """The last poses of two estimates, in the chart at the other's, where both have covariances; see `compare_maps`."""
+    if not (len(ours.cov_poses) and len(other.cov_poses)):
+        none = np.zeros(0)
+        return Differences(np.zeros(0, dtype=np.int64), none, none, none, none, none, ours.space.dim)
     space, mine, theirs = ours.space, ours.world_from_body[-1], other.world_from_body[-1]
     delta = space.local(theirs, mine)
     carry = space.right_jacobian_inverse(delta)
     covs = (carry @ ours.cov_poses[-1] @ carry.T)[None], other.cov_poses[-1][None]
     distances = np.linalg.norm(ours.trajectory.positions[-1:] - other.trajectory.positions[-1:], axis=1)
-    moved = away_from_first(other)[-1:] if across else None
+    moved = away_from_first(other.world_from_body)[-1:] if across else None
     return _differences(np.array([step]), distances, delta[None], covs, moved)
 
 
-def away_from_first(estimate: PathAndMap) -> Array:
-    """(T, 6) how a change of scale about the first pose of SE(3) moves each, in the chart there."""
-    poses = estimate.world_from_body
+def away_from_first(poses: Array) -> Array:
+    """(T, 6) how a change of scale about the first of poses (T, 7) moves each, in the chart there."""
     along = SE3.rotation(poses).mT @ (poses[:, 4:] - poses[0, 4:])[..., None]
     return np.concatenate([np.zeros((len(poses), 3)), along[..., 0]], axis=1)
 
 
-def no_differences(dims: int) -> Differences:
-    """None at all."""
-    none = np.zeros(0)
-    return Differences(np.zeros(0, dtype=np.int64), none, none, none, none, none, dims)
-
-
 def scale_onto(ours: PathAndMap, other: PathAndMap, name: str) -> float:
-    """The factor that brings our positions, taken from the first one, closest to the other's.
-
-    Raises:
-        InputError: our path does not move, so that it has no scale.
-    """
+    """The factor that brings our positions, taken from the first one, closest to the other's; a path must move."""
     mine, theirs = (one.trajectory.positions - one.trajectory.positions[0] for one in (ours, other))
     square = float(np.square(mine).sum())
     if square <= _TINY**2:
@@ -183,8 +167,8 @@ def _regular(cov: Array) -> NDArray[np.bool_]:
     return np.asarray(values[:, 0] > _TINY**2 * np.maximum(values[:, -1], np.finfo(float).tiny))
 
 
-def _solve(cov: Array, delta: Array) -> Array:
-    return np.asarray(np.linalg.solve(cov, delta[..., None])[..., 0], dtype=np.float64)
+def _square(delta: Array, cov: Array) -> Array:
+    return np.asarray(np.einsum("...i,...i->...", delta, np.linalg.solve(cov, delta[..., None])[..., 0]))
 
 
 def _log_det(cov: Array) -> Array:

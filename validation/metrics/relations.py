@@ -20,21 +20,15 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.reading import RunFolder
-from rbpf.runs.trajectory import MAX_DIFFERENCE_NS, Trajectory, read_tum
+from rbpf.runs.trajectory import MAX_DIFFERENCE_NS, Trajectory
 from rbpf.sensors.readers.text import parse_time, read_columns
 from rbpf.validation.metrics.scores import ODOMETRY
 
+Relations = tuple[NDArray[np.int64], Array]
+"""Times (R, 2) of both ends, and poses (R, 7) at the second time, seen from that at the first."""
 _COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
-FILTERED, FINAL = "trajectory.tum", "posterior.tum"
-
-
-@dataclass(frozen=True)
-class Relations:
-    """R relations."""
-
-    stamps_ns: NDArray[np.int64]  #: (R, 2) times of both ends.
-    first_from_second: Array  #: (R, 7) pose at the second time, seen from that at the first.
+PATHS = {"": "trajectory.tum", "final_": "posterior.tum", "odometry_": ODOMETRY}
+"""Files of a run's paths, by prefix: "" of the filter, "final_" of its last particles, "odometry_" without it."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +65,20 @@ def read_relations(path: Path) -> Relations:
         for line, row in zip(table.lines, table.rows, strict=True)
     ]
     poses = SE3.from_ypr(table.block("x", "z"), table["yaw"], table["pitch"], table["roll"])
-    return Relations(np.array(ends, dtype=np.int64), poses)
+    return np.array(ends, dtype=np.int64), poses
 
 
 def relation_errors(estimate: Trajectory, relations: Relations) -> RelationErrors:
-    """Errors of a path by relations.
-
-    Raises:
-        InputError: no relation has both ends within the path.
-    """
+    """Errors of a path by relations, of which one must have both ends within the path."""
     if not len(estimate):
         raise InputError("Expected a path with poses to score by relations, found an empty one.")
     first, last = estimate.stamps_ns[[0, -1]] + [-MAX_DIFFERENCE_NS, MAX_DIFFERENCE_NS]
-    inside = ((relations.stamps_ns >= first) & (relations.stamps_ns <= last)).all(axis=1)
+    stamps_ns, first_from_second = relations
+    inside = ((stamps_ns >= first) & (stamps_ns <= last)).all(axis=1)
     if not inside.any():
         raise InputError("None of the relations has both ends within the path; expected times of the same clock.")
-    ends = [_at(estimate, column) for column in relations.stamps_ns[inside].T]
-    error = SE3.between(relations.first_from_second[inside], SE3.between(*ends))
+    ends = [_at(estimate, column) for column in stamps_ns[inside].T]
+    error = SE3.between(first_from_second[inside], SE3.between(*ends))
     turned = np.linalg.norm(SE3.log(error)[:, :3], axis=1)
     return RelationErrors(np.linalg.norm(SE3.translation(error), axis=1), np.degrees(turned))
 
@@ -103,10 +94,3 @@ def _at(path: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
     at = SE3.interpolate(a * turning, b * turning, fraction)
     at[:, 4:] = a[:, 4:] + fraction[:, None] * (b - a)[:, 4:]
     return at
-
-
-def score_relations(found: RunFolder, relations: Relations) -> dict[str, RelationErrors]:
-    """Errors of each of a run's paths, by prefix: "" of the filter, "final_" of its last particles, "odometry_" without it."""
-    paths = {"": FILTERED, "final_": FINAL, "odometry_": ODOMETRY}
-    there = {prefix: found.folder / name for prefix, name in paths.items() if (found.folder / name).is_file()}
-    return {prefix: relation_errors(read_tum(path), relations) for prefix, path in there.items()}

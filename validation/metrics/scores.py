@@ -13,13 +13,11 @@ from scipy.optimize import linear_sum_assignment
 
 from rbpf.errors import InputError
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.runs.trajectory import Similarity, Trajectory, align, associate, fit, in_space, read_tum
+from rbpf.runs.trajectory import Trajectory, align, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
 BATCH, ODOMETRY = "batch.tum", "odometry.tum"
-
-_ROUNDS = 5
 
 ODOMETRY_PREFIX = {"stereo": "vo_"}
 """How the figures of the odometry alone begin, by system; otherwise with `odometry_`."""
@@ -98,36 +96,28 @@ def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth, prefix:
     return {prefix + name: value for name, value in entries.items()}
 
 
-def match_points(points: np.ndarray, truth: dict[int, np.ndarray], start: Similarity) -> dict[int, np.ndarray]:
-    """Names estimated points (M, D) by the true points, one to one, nearest in sum after a rigid alignment.
-
-    The alignment, at first a path's in space, and the matching are repeated in turn, as in iterated closest points; the
-    points are returned as they were.
-    """
-    names = list(truth)
-    true = np.array([truth[name][: points.shape[1]] for name in names])
-    moved = start.in_dimension(points.shape[1]).transform(points)
-    for _ in range(_ROUNDS):
-        distance = np.linalg.norm(moved[:, None] - true[None], axis=-1)
-        rows, columns = linear_sum_assignment(distance)
-        moved = align(points[rows], true[columns]).transform(points)
-    return {names[column]: points[row] for row, column in zip(rows, columns, strict=True)}
-
-
 def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
     """Mean errors of landmarks whose true places are known, moved as the path is, and with an alignment of their own.
 
     The estimate has a pose for every frame of the run. Landmarks to which the filter gave no names (`anonymous`) are each
     scored as the true one nearest to it, one to one.
     """
-    points = estimate.landmarks
-    if not truth.landmarks or not points.ids.size:
+    names, points = estimate.landmarks.named(), estimate.landmarks.mean
+    if not truth.landmarks or not names:
         return {}
-    ours = estimate.at(truth.rows).trajectory
+    ours, dim = estimate.at(truth.rows).trajectory, points.shape[1]
     reference = in_space(ours.stamps_ns, truth.poses)
-    start = ate(ours, reference, "rigid").alignment if anonymous else None
-    names = points.named() if start is None else match_points(points.mean, truth.landmarks, start)
-    moved = fit(truth.alignment, ours.positions, reference.positions).in_dimension(points.mean.shape[1])
+    if anonymous:
+        # One to one, nearest in sum after a rigid alignment. The alignment, at first the path's, and the matching are repeated
+        # in turn, as in iterated closest points.
+        true_names = list(truth.landmarks)
+        true = np.array([truth.landmarks[name][:dim] for name in true_names])
+        placed = ate(ours, reference, "rigid").alignment.in_dimension(dim).transform(points)
+        for _ in range(5):
+            rows, columns = linear_sum_assignment(np.linalg.norm(placed[:, None] - true[None], axis=-1))
+            placed = align(points[rows], true[columns]).transform(points)
+        names = {true_names[column]: points[row] for row, column in zip(rows, columns, strict=True)}
+    moved = fit(truth.alignment, ours.positions, reference.positions).in_dimension(dim)
     try:
         own = landmark_errors(names, truth.landmarks, moved)
         aligned = landmark_errors(names, truth.landmarks, "rigid")

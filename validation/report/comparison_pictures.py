@@ -52,7 +52,13 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
     motions = {which: world.motion(path) for which, path in both.items()}
     paths = {which: motions[which].transform(path.positions) for which, path in both.items()}
     plane = wide_axes(paths["batch"])
-    figures = {"gtsam_path.png": path_figure(f"{name}: paths in {world.name}", paths, plane)}
+    figure, axes = _axes(7.0, 6.0)
+    for which, at in paths.items():
+        axes.plot(*at[:, plane].T, "-", color=COLOURS[which], lw=1.2, label=which)
+        axes.plot(*at[0, plane], "o", color=COLOURS[which], ms=4)
+    label(axes, f"{name}: paths in {world.name}", f"{'xyz'[plane[0]]} [m]", f"{'xyz'[plane[1]]} [m]", equal=True)
+    axes.legend(fontsize="small")
+    figures = {"gtsam_path.png": figure}
     cov, cov_batch, delta = found.pose_errors()
     if len(cov):
         roots, ranks = inverse_roots(cov)
@@ -73,18 +79,6 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
 
 def plot_against_colmap(found: ColmapComparison, reference: PathAndMap, out: Path) -> list[str]:
     """Both maps and paths in the reference's world, and the landmarks' nearest distances; returns the file names."""
-    figures = {"colmap_map.png": _colmap_map(found, reference)}
-    if found.cloud is not None:
-        title = f"{found.reconstruction.name}: landmarks to the surface of COLMAP's points"
-        figure, axes = new_axes(title, "landmarks", "distance [m]", equal=False)
-        axes.hist(found.cloud.surface_m, bins=20, color=COLOURS["filter"])
-        axes.axvline(float(np.median(found.cloud.surface_m)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
-        axes.legend(loc="best", fontsize="small")
-        figures["colmap_cloud.png"] = figure
-    return save_figures(figures, out)
-
-
-def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
     views = Views.of_camera(reference.trajectory.world_from_body)
     figure, shown = views.axes(f"{found.reconstruction.name}: COLMAP brought onto the run")
     move = found.reference_from_colmap
@@ -101,37 +95,33 @@ def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.2, label="filter")
         axes.plot(centres[:, right], centres[:, up], "+", color=COLOURS["batch"], ms=6, label="COLMAP's key frames")
     shown[0][0].legend(loc="best", fontsize="small")
-    return figure
+    figures = {"colmap_map.png": figure}
+    if found.cloud is not None:
+        title = f"{found.reconstruction.name}: landmarks to the surface of COLMAP's points"
+        figure, axes = new_axes(title, "landmarks", "distance [m]", equal=False)
+        axes.hist(found.cloud.surface_m, bins=20, color=COLOURS["filter"])
+        axes.axvline(float(np.median(found.cloud.surface_m)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
+        axes.legend(loc="best", fontsize="small")
+        figures["colmap_cloud.png"] = figure
+    return save_figures(figures, out)
 
 
-def wide_axes(positions: np.ndarray) -> tuple[int, int]:
+def wide_axes(positions: np.ndarray) -> list[int]:
     """The two axes, in their order, along which positions (T, 3) extend most."""
-    first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
-    return first, second
+    return sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
 
 
-def path_figure(title: str, curves: Mapping[str, np.ndarray], plane: tuple[int, int]) -> Any:
-    """Paths (T, 3) by name, in a plane of the world."""
+def _axes(width: float, height: float) -> tuple[Any, Any]:
+    """A figure of one pair of axes."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-    axes = figure.subplots()
-    right, up = plane
-    for name, at in curves.items():
-        style = "--" if name == "truth" else "-"
-        axes.plot(at[:, right], at[:, up], style, color=COLOURS[name], lw=1.2, label=name)
-        axes.plot(at[0, right], at[0, up], "o", color=COLOURS[name], ms=4)
-    label(axes, title, f"{'xyz'[right]} [m]", f"{'xyz'[up]} [m]", equal=True)
-    axes.legend(fontsize="small")
-    return figure
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots()
 
 
 def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any:
     """Normalised squared errors (R,) of one run over the steps, with the band of an honest filter."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-    axes, band = figure.subplots(), chi_square_band(dim)
+    (figure, axes), band = _axes(9.0, 4.0), chi_square_band(dim)
     axes.axhspan(band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
     axes.axhline(band.expected, color="tab:green", lw=0.8, label=f"its mean, {dim}")
     shown = np.maximum(nees, _LOWEST * band.low)
@@ -145,10 +135,7 @@ def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any
 
 def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
     """Distances of landmarks (M,) in σ, in order, beside those that an honest filter's would have."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 5.0), layout="constrained")
-    axes, count = figure.subplots(), squares.size
+    (figure, axes), count = _axes(7.0, 5.0), squares.size
     places = np.arange(1, count + 1)
     right = np.sqrt(chi_square_quantile((places - 0.5) / count, dim))
     axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
@@ -160,26 +147,18 @@ def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
 
 
 def map_figure(
-    title: str,
-    path: np.ndarray,
-    mean: np.ndarray,
-    cov: np.ndarray,
-    other: Mapping[str, np.ndarray],
-    plane: tuple[int, int],
+    title: str, path: np.ndarray, mean: np.ndarray, cov: np.ndarray, other: Mapping[str, np.ndarray], plane: list[int]
 ) -> Any:
     """A map's points (M, 3) with ellipses from (M, 3, 3), over others' by name, in a plane of the world."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-    axes, chosen = figure.subplots(), list(plane)
-    axes.plot(*path[:, chosen].T, color=COLOURS["filter"], lw=0.8, alpha=0.6, label="path of the filter")
+    figure, axes = _axes(7.0, 6.0)
+    axes.plot(*path[:, plane].T, color=COLOURS["filter"], lw=0.8, alpha=0.6, label="path of the filter")
     for name, points in other.items():
-        axes.plot(*points[:, chosen].T, "+", color=COLOURS[name], ms=7, label=f"landmarks: {name}")
-    axes.plot(*mean[:, chosen].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
-    ellipses = outline(mean[:, chosen], cov[:, chosen][:, :, chosen])
+        axes.plot(*points[:, plane].T, "+", color=COLOURS[name], ms=7, label=f"landmarks: {name}")
+    axes.plot(*mean[:, plane].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
+    ellipses = outline(mean[:, plane], cov[:, plane][:, :, plane])
     axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color=COLOURS["map"], lw=0.7)
-    label(axes, title, f"{'xyz'[chosen[0]]} [m]", f"{'xyz'[chosen[1]]} [m]", equal=True)
-    shown = np.concatenate([path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]])
+    label(axes, title, f"{'xyz'[plane[0]]} [m]", f"{'xyz'[plane[1]]} [m]", equal=True)
+    shown = np.concatenate([path, *other.values(), mean])[:, plane]
     low, high = np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0)
     middle, half = 0.5 * (low + high), 0.65 * max(float((high - low).max()), 1e-3)
     axes.set_xlim(middle[0] - half, middle[0] + half)

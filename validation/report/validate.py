@@ -2,26 +2,45 @@
 
 A new comparison is one function from a run to a `Comparison`, entered into `COMPARISONS`; one that needs a file besides
 takes its path, too, and is entered into `WITH_A_FILE`.
+
+The page is made from the files in the run's folder: verdict, comparisons with their pictures, the run's own figures; a video
+stays a file beside it.
 """
 
+import base64
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rbpf.errors import InputError
-from rbpf.runs.files import prepare_folder
+from rbpf.runs.files import prepare_folder, write_text
 from rbpf.runs.folder import write_summary
-from rbpf.runs.plots import World
+from rbpf.runs.plots import World, tracking_losses
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.truth import TRUTH
-from rbpf.validation.consistency.comparison import Comparison, write_comparison
-from rbpf.validation.consistency.verdict import Verdict
-from rbpf.validation.report.page import write_report
+from rbpf.runs.trajectory import associate, read_tum
+from rbpf.validation.consistency.comparison import (
+    Comparison,
+    PathGrade,
+    Verdict,
+    compare_with_itself,
+    grade_path,
+    independent_names,
+    judge,
+    noise_advice,
+    read_comparisons,
+    write_comparison,
+)
+from rbpf.validation.metrics.accuracy import ate, rpe
 
 if TYPE_CHECKING:
     from rbpf.validation.gtsam.batch_problem import Optimum
 
+PAGE = "report.html"
+VIDEO = "annotated.mp4"
+
+_SAME = {"groundtruth_path.png": "path.png", "groundtruth_error.png": "error.png"}
+"""Pictures of a comparison that show what one of the run's own does."""
 KEY_FRAMES = 60
 """Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do."""
 Compare = Callable[[RunFolder], Comparison]
@@ -37,11 +56,7 @@ def _groundtruth(record: RunFolder) -> Comparison:
 
 
 def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Comparison:
-    """A run beside the batch posterior, from its optimum where it is known: written into its folder, with pictures.
-
-    Raises:
-        InputError: see `compare_with_batch`.
-    """
+    """A run beside the batch posterior, see `compare_with_batch`: written into its folder, with pictures."""
     from rbpf.validation.consistency.against_batch import compare_with_batch
     from rbpf.validation.report.comparison_pictures import plot_against_batch
 
@@ -53,38 +68,35 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
 
 def _camera_colmap(record: RunFolder) -> Comparison:
     """A run over images beside COLMAP's reconstruction of every n-th."""
-    from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap
+    from rbpf.validation.colmap.compare import compare_folder_with_colmap
     from rbpf.validation.colmap.reconstruct import ReconstructionOptions
     from rbpf.validation.report.comparison_pictures import plot_against_colmap
 
-    usual = ReconstructionOptions()
-    every = max(usual.every, -(-len(record.path.mean) // KEY_FRAMES))
-    found = compare_folder_with_colmap(record.folder, replace(usual, every=every))
-    figures = {f"run_{name}": value for name, value in found.run.as_dict().items()}
-    if found.truth is not None:
-        figures |= {f"truth_{name}": value for name, value in found.truth.as_dict().items()}
-    accuracy = f"The path is {1e3 * found.run.path.rmse:.3g} mm (rms) from COLMAP's reconstruction of the same images."
-    pictures = plot_against_colmap(found.run, record.estimate, record.folder)
+    every = max(ReconstructionOptions().every, -(-len(record.path.mean) // KEY_FRAMES))
+    run, truth = compare_folder_with_colmap(record.folder, ReconstructionOptions(every=every))
+    figures = {f"run_{name}": value for name, value in run.as_dict().items()}
+    if truth is not None:
+        figures |= {f"truth_{name}": value for name, value in truth.as_dict().items()}
+    accuracy = f"The path is {1e3 * run.path.rmse:.3g} mm (rms) from COLMAP's reconstruction of the same images."
+    pictures = plot_against_colmap(run, record.estimate, record.folder)
     return Comparison("colmap", accuracy, figures, pictures=pictures)
 
 
 def _relations(record: RunFolder, file: Path) -> Comparison:
     """A run's paths by the relations of a file; the figures go into its summary.json, too."""
-    from rbpf.validation.metrics.relations import read_relations, score_relations
+    from rbpf.validation.metrics.relations import PATHS, read_relations, relation_errors
 
     relations = read_relations(file)
-    scores = score_relations(record, relations)
+    paths = {prefix: record.folder / name for prefix, name in PATHS.items() if (record.folder / name).is_file()}
+    scores = {prefix: relation_errors(read_tum(path), relations) for prefix, path in paths.items()}
     figures = {prefix + name: value for prefix, errors in scores.items() for name, value in errors.entries().items()}
     write_summary(record.folder, dict(record.summary) | figures)
-    said = scores.get("final_", scores[""]).sentence(len(relations.stamps_ns))
+    said = scores.get("final_", scores[""]).sentence(len(relations[0]))
     return Comparison("relations", said, figures)
 
 
 def _path(record: RunFolder, file: Path) -> Comparison:
     """A run beside another path of the same recording, rigidly aligned."""
-    from rbpf.runs.trajectory import associate, read_tum
-    from rbpf.validation.metrics.accuracy import ate, rpe
-
     estimate, reference = associate(record.trajectory, read_tum(file))
     apart, moved = ate(estimate, reference, "rigid"), rpe(estimate, reference)
     figures = {
@@ -112,14 +124,8 @@ WITH_A_FILE: dict[str, Callable[[RunFolder, Path], Comparison]] = {"relations": 
 def validate(folder: Path, against: str, out: Path | None = None, file: Path | None = None) -> Verdict:
     """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again; returns the verdict.
 
-    Args:
-        folder: of the run.
-        against: a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`.
-        out: a further folder for the JSON.
-        file: what the run is compared with.
-
-    Raises:
-        InputError: the comparison is not possible; the report is written all the same, and says why.
+    `against` is a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`; `out` is a further folder for the JSON. An
+    InputError says that it is not possible; the report is written all the same, and says why.
     """
     record = RunFolder.open(folder)
     try:
@@ -131,7 +137,7 @@ def validate(folder: Path, against: str, out: Path | None = None, file: Path | N
                 raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
             compare = known.get(record.system, known.get(ANY))
             if compare is None:
-                able = ", ".join(sorted(known)) or "no system yet"
+                able = ", ".join(sorted(known))
                 raise InputError(
                     f"a run of the system {record.system!r} cannot be compared with {against} (possible: {able})"
                 )
@@ -146,8 +152,78 @@ def validate(folder: Path, against: str, out: Path | None = None, file: Path | N
     return write_report(folder)
 
 
-def report_run(folder: Path) -> Verdict:
-    """The page of a run that has just finished: compared with the truth where its recording has one."""
-    if (folder / TRUTH).is_file():
-        return validate(folder, "groundtruth")
-    return write_report(folder)
+def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
+    """Builds `report.html` of a run from the files in its folder; returns the verdict that stands on top.
+
+    `problems` are what else has to be said, one sentence each.
+    """
+    from jinja2 import Environment, PackageLoader, select_autoescape
+
+    record, problems = RunFolder.open(folder), list(problems or ())
+    # Comparisons in the folder, the truth's first, and the run's own statistics.
+    comparisons: list[Comparison] = []
+    try:
+        comparisons = sorted(read_comparisons(folder), key=lambda c: (c.against != "groundtruth", c.against))
+    except InputError as error:
+        problems.append(f"{error}.")
+    try:
+        comparisons.append(compare_with_itself(record))
+    except InputError as error:
+        problems.append(f"{error}.")
+    verdict = verdict_of(record, comparisons)
+    drawn = {name for comparison in comparisons for name in comparison.pictures}
+    drawn |= {own for name, own in _SAME.items() if name in drawn}
+    own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
+    try:
+        world = World.of(record)
+    except InputError:
+        world = World()  # the truth is damaged, which is said among the problems
+    titles = {"groundtruth": "Against the ground truth", "itself": "Innovations"}
+    sections = [
+        {
+            "title": titles.get(comparison.against, f"Against {comparison.against}"),
+            "accuracy": comparison.accuracy,
+            "statistics": comparison.statistics,
+            "figures": {} if comparison.against == "itself" else comparison.figures,
+            "images": _images(folder, comparison.pictures),
+        }
+        for comparison in comparisons
+    ]
+    sections.append({"title": "The run", "figures": record.summary, "images": _images(folder, own)})
+    video = VIDEO if (folder / VIDEO).is_file() else None
+    loader = PackageLoader("rbpf.validation.report", "templates")
+    template = Environment(loader=loader, autoescape=select_autoescape()).get_template(PAGE)
+    page = template.render(
+        title=record.name, verdict=verdict, world=world, problems=problems, sections=sections, video=video
+    )
+    write_text(folder / PAGE, page)
+    return verdict
+
+
+def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
+    """The verdict on a run from all its comparisons, the truth's first and its own statistics among them."""
+    statistics = [statistic for comparison in comparisons for statistic in comparison.statistics]
+    by_name = {comparison.against: comparison for comparison in comparisons if comparison.accuracy}
+    accuracy, figures, key = PathGrade().sentence, {}, "position_rmse_m"
+    if "groundtruth" in by_name:
+        accuracy, figures = by_name["groundtruth"].accuracy, by_name["groundtruth"].figures
+    elif by_name:
+        best = by_name.get("relations", by_name.get("gtsam", next(iter(by_name.values()))))
+        accuracy = best.accuracy
+        if best.against != "relations":
+            accuracy += " How far it is from the truth is not known."
+        figures, key = best.figures, "filter_minus_batch_rmse_m"
+    try:
+        lost, frames = tracking_losses(record)
+    except InputError:
+        lost, frames = None, 0
+    path = grade_path(accuracy, figures.get(key), figures.get("path_spread_m"), lost, frames)
+    verdict = judge(statistics, independent_names(comparisons), path)
+    return replace(verdict, advice=noise_advice(record, statistics))
+
+
+def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
+    # A link may show what its maker must not see of the disk of whoever opens the run.
+    inside = folder.resolve()
+    there = [name for name in names if (folder / name).is_file() and (folder / name).resolve().is_relative_to(inside)]
+    return [(Path(name).stem, base64.b64encode((folder / name).read_bytes()).decode()) for name in there]

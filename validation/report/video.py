@@ -1,20 +1,31 @@
-"""The annotated video of a run over images: what was looked for and seen in each, drawn and encoded one after the other.
+"""What was looked for and seen in each frame of a run over images: an annotated video, and a recording for the Rerun viewer.
 
-A further system is one function from a run and the number of a frame to a picture, entered into `PICTURES`.
+A further system is one function from a run and the number of a frame to a picture, entered into `PICTURES`, and one that
+logs a frame, entered into `DRAWN`. A recording (https://rerun.io) is written without a screen:
+
+world/camera                   the camera's pose; of a robot world/body
+world/camera/image             the frames, with what was looked for and seen in them
+world/seen                     points that were seen in the frame
+world/path, world/odometry     the whole path, and that of the odometry alone
+world/map                      the final map: points with 3σ ellipsoids, rays as lines; known points
+plots/…                        figures over the frames
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rbpf.runs.files import whole
-from rbpf.runs.plots import outline
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.runs.files import prepare_folder, whole
+from rbpf.runs.plots import SIGMAS, outline
 from rbpf.runs.run import Run
 from rbpf.sensors.readers import ImageFrame
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.landmarks import FeatureKind
 
 Colour = tuple[int, int, int]
@@ -27,10 +38,6 @@ _SMALL_PX = 800
 _ARM, _BAND = 4, 24
 _LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
 """Height of letters as a fraction of the drawn width, and its bounds, px."""
-
-
-Caption = tuple[str, str]
-"""Figures of a frame and a warning, empty where all is well: what is written above it."""
 
 
 def drawn_size(width: int, height: int) -> tuple[int, int]:
@@ -47,18 +54,14 @@ def drawn_scale(width: int) -> int:
 def annotate(
     image: np.ndarray | None,
     size: tuple[int, int],
-    caption: Caption,
+    caption: tuple[str, str],
     legend: Sequence[tuple[str, Colour]],
     paint: Callable[[Any, Place], None],
 ) -> np.ndarray:
-    """The frame (H, W, 3) uint8 as it is shown.
+    """The frame (H, W, 3) uint8 as it is shown, under a caption (figures, warning) and a legend of names and colours.
 
-    Args:
-        image: (height, width) uint8; None where it could not be read.
-        size: width and height of the images, px.
-        caption: what is written above.
-        legend: names and colours.
-        paint: called with PIL's drawing of the picture, and with what tells where a pixel lies in it.
+    The image is (height, width) uint8 of a size (width, height), or None where it could not be read. `paint` is called with
+    PIL's drawing of the picture, and with what tells where a pixel lies in it.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -111,7 +114,7 @@ def picture_of_search(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
 
 
 def draw_search(
-    image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: Caption, size: tuple[int, int]
+    image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: tuple[str, str], size: tuple[int, int]
 ) -> np.ndarray:
     """The frame (H, W, 3) uint8 of a size (width, height), with what was looked for in it, see `MonoSlam.observed`."""
     found, stroke = np.isfinite(seen["px"]).all(axis=1), drawn_scale(size[0])
@@ -121,11 +124,7 @@ def draw_search(
             draw.line(place(_clipped(line, size)), fill=RAY, width=stroke)
         for ellipse, hit in zip(outline(seen["mean"], seen["cov"]), found.tolist(), strict=True):
             draw.line(place(ellipse), fill=FOUND if hit else MISSED, width=stroke)
-        for name, rows, colour in (
-            ("px", found, FOUND),
-            ("mean", ~found, MISSED),
-            ("started_px", slice(None), STARTED),
-        ):
+        for name, rows, colour in (("px", found, FOUND), ("mean", ~found, MISSED), ("started_px", ..., STARTED)):
             for px in seen[name][rows]:
                 cross(draw, place(px)[0], colour)
 
@@ -153,32 +152,25 @@ FEATURES: Mapping[FeatureKind, tuple[str, Colour]] = {
 
 
 def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
-    """A frame of a stereo run (H, W, 3): the left image, with what each of its features was to the map."""
+    """A frame of a stereo run (H, W, 3): the left image, with what each of its features was to the map.
+
+    A line leads from each to where the right camera has it.
+    """
     log = run.log
     held = f"{log['observed'][t]} landmarks" if log["updated"][t] else "no update"
     text = f"pair {t}   {log['features'][t]} features   {log['agreeing'][t]} agree   {held}"
     alarm = "" if t == 0 or log["agreeing"][t] else "NO MOTION FOUND"
     if frame.image is None or frame.right is None:
         alarm = "NO PAIR"
-    camera = run.system.rig.camera
-    return draw_pair(frame.image, log.observed(t), (text, alarm), (camera.width, camera.height))
-
-
-def draw_pair(
-    image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: Caption, size: tuple[int, int]
-) -> np.ndarray:
-    """A left image (H, W, 3) uint8 of a size (width, height) with its features, see `StereoSlam.observed`.
-
-    A line leads from each to where the right camera has it.
-    """
+    camera, seen = run.system.rig.camera, log.observed(t)
 
     def paint(draw: Any, place: Place) -> None:
         for kind, (_, colour) in FEATURES.items():
             for u, v, right in seen["z"][seen["kind"] == kind].tolist():
-                draw.line(place(np.array([[u, v], [right, v]])), fill=colour, width=drawn_scale(size[0]))
+                draw.line(place(np.array([[u, v], [right, v]])), fill=colour, width=drawn_scale(camera.width))
                 cross(draw, place(np.array([u, v]))[0], colour)
 
-    return annotate(image, size, caption, list(FEATURES.values()), paint)
+    return annotate(frame.image, (camera.width, camera.height), (text, alarm), list(FEATURES.values()), paint)
 
 
 PICTURES: dict[str, Callable[[Run, int, ImageFrame], np.ndarray]] = {
@@ -197,15 +189,13 @@ def annotated_frames(run: Run) -> Iterator[np.ndarray]:
 
 def write_annotated(run: Run, path: Path, on_frame: Callable[[int, int], None] | None = None) -> None:
     """Writes an MP4 of all frames that were filtered of a run of a system in `PICTURES`; see `write_video`."""
-    frames = annotated_frames(run)
-    first = next(frames)
-    size = first.shape[1], first.shape[0]
-    write_video(chain([first], frames), size, run.log.stamps_ns, path, on_frame)
+    first = next(frames := annotated_frames(run))
+    write_video(chain([first], frames), first.shape[1::-1], run.log.stamps_ns, path, on_frame)
 
 
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
 """Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""
-QUALITY = "23"
+RATE_FACTOR = "23"
 """Constant rate factor of H.264: 18 is nearly without loss, 28 poor."""
 ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact"
 
@@ -217,17 +207,10 @@ def write_video(
     path: Path,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Writes an MP4 of pictures (H, W, 3) uint8; it appears under its name when it is complete.
+    """Writes an MP4 of pictures (H, W, 3) uint8 of one size (width, height), even numbers, as fast as their stamps (T,).
 
-    Args:
-        pictures: of one size.
-        size: width and height, even numbers.
-        stamps_ns: (T,) of the pictures; it runs as fast as these.
-        path: the file.
-        on_frame: called with the pictures written and their number.
-
-    Raises:
-        InputError: the place cannot be written to, or the disk is full.
+    It appears under its name when it is complete; an InputError says that the place cannot be written to. `on_frame` is called
+    with the pictures written and their number.
     """
     import imageio_ffmpeg
 
@@ -240,7 +223,7 @@ def write_video(
             quality=None,
             macro_block_size=2,
             pix_fmt_out="yuv420p",
-            output_params=["-crf", QUALITY, *ENCODING],
+            output_params=["-crf", RATE_FACTOR, *ENCODING],
             ffmpeg_log_level="error",
         )
         with closing(encoder):
@@ -276,3 +259,133 @@ def frame_rate(stamps_ns: np.ndarray) -> float:
     gaps = gaps[gaps > 0.0]
     typical = float(np.median(gaps)) if gaps.size else LONGEST_S
     return round(1.0 / min(max(typical, SHORTEST_S), LONGEST_S), 3)
+
+
+JPEG_QUALITY = 75
+"""Of the JPEG images in the recording, in per cent."""
+AXIS_M = 0.1
+"""Length of the camera's drawn image plane from its centre."""
+NEAREST = 0.02
+"""Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m."""
+
+
+def require_rerun() -> Any:
+    """The package; an InputError where it is not installed."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise InputError(
+            "--rerun needs the package rerun-sdk, which is not installed: pip install 'rbpf[viewing]', or leave it out"
+        ) from error
+    return rerun
+
+
+def write_rerun(run: Run, path: Path) -> None:
+    """Writes the recording (.rrd) of a run over images, whose source is read once more.
+
+    Raises:
+        InputError: Rerun is not installed, or the file cannot be written.
+    """
+    log, (log_seen, plots) = run.log, DRAWN[run.system.name]
+    stamps, poses, plotted = log.stamps_ns, log.poses, {name: log[name] for name in plots}
+    with recording(path, run.name) as (rr, stream):
+        # Rerun's pixels start at a corner, not at a centre.
+        camera = run.system.camera if run.system.name == "mono" else run.system.rig.camera
+        lens = rr.Pinhole(
+            focal_length=[camera.fx, camera.fy],
+            principal_point=[camera.cx + 0.5, camera.cy + 0.5],
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=AXIS_M,
+        )
+        stream.log("world/camera", lens, static=True)
+        stream.log("world/path", rr.LineStrips3D([SE3.translation(poses)]), static=True)
+        if "odometry" in log:
+            stream.log("world/odometry", rr.LineStrips3D([SE3.translation(log["odometry"])]), static=True)
+        found = run.system.map()
+        stream.log("world/map/points", ellipsoids(rr, found.points()), static=True)
+        if found.ray_ends is not None and found.is_ray().any():
+            rays = rr.LineStrips3D(found.ray_ends[found.is_ray()], colors=[RAY])
+            stream.log("world/map/rays", rays, static=True)
+        known = getattr(run.system, "known_points", None)
+        if known is not None:
+            stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
+        for t, frame in zip(range(len(log)), run.source.frames(), strict=False):
+            log_time(stream, t, int(stamps[t] - stamps[0]))
+            if frame.image is not None:
+                stream.log("world/camera/image", rr.Image(frame.image).compress(jpeg_quality=JPEG_QUALITY))
+            log_pose(rr, stream, "camera", poses[t])
+            log_seen(rr, stream, run, log.observed(t), poses[t])
+            for name, values in plotted.items():
+                stream.log(f"plots/{name}", rr.Scalars(float(values[t])))
+
+
+@contextmanager
+def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
+    """The package and a stream into a file (.rrd); the file appears when it is complete. Errors as of `write_rerun`."""
+    rr = require_rerun()
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: Rerun writes to no path that is not UTF-8: choose another name") from error
+    prepare_folder(path.parent)
+    readable = name.encode(errors="replace").decode()  # bytes of a file's name that are no UTF-8
+    with whole(path) as partial, rr.RecordingStream("rbpf", recording_id=readable) as stream:
+        stream.save(str(partial))
+        yield rr, stream
+        stream.flush()
+
+
+def log_time(stream: Any, t: int, after_ns: int) -> None:
+    """Number of a frame and time since the first one [ns]; what is logged next belongs to it."""
+    stream.set_time("frame", sequence=t)
+    stream.set_time("time", duration=1e-9 * float(after_ns))
+
+
+def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
+    """Where a camera or a robot is in the world, (7,)."""
+    turned = rr.Quaternion(xyzw=pose[:4])
+    stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
+
+
+def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
+    """A map's 3σ ellipsoids, with the landmarks' names."""
+    values, vectors = np.linalg.eigh(landmarks.cov)
+    turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
+    poses = np.concatenate([turned, landmarks.mean[..., None]], axis=-1)
+    return rr.Ellipsoids3D(
+        centers=landmarks.mean,
+        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
+        quaternions=SE3.from_matrix(poses)[:, :4],
+        labels=[str(name) for name in landmarks.ids],
+        show_labels=False,
+    )
+
+
+def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
+    """Features that were looked for; Rerun's pixels start at a corner, not at a centre."""
+    found = np.isfinite(seen["px"]).all(axis=1)
+    ellipses = outline(seen["mean"], seen["cov"]) + 0.5
+    for name, chosen, colour in (("found", found, FOUND), ("missed", ~found, MISSED)):
+        stream.log(f"world/camera/image/{name}/ellipses", rr.LineStrips2D(ellipses[chosen], colors=[colour]))
+    stream.log("world/camera/image/found/places", rr.Points2D(seen["px"][found] + 0.5, colors=[FOUND]))
+    stream.log("world/camera/image/new", rr.Points2D(seen["started_px"] + 0.5, colors=[STARTED]))
+    lines = seen["line"][np.isfinite(seen["line"]).all(axis=(1, 2))] + 0.5
+    stream.log("world/camera/image/epipolar_lines", rr.LineStrips2D(lines, colors=[RAY]))
+    near = found & (seen["position"][:, 3] >= NEAREST)
+    places = seen["position"][near, :3] / seen["position"][near, 3:]
+    stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
+
+
+def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
+    """Features of the left image by what they were to the map, and where the pair itself has its landmarks."""
+    for kind, (name, colour) in FEATURES.items():
+        pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour])
+        stream.log(f"world/camera/image/{name}", pixels)
+    rig = run.system.rig
+    places = SE3.transform(pose, rig.triangulate(seen["z"][seen["kind"] == FeatureKind.LANDMARK]))
+    stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
+
+
+DRAWN = {"mono": (_log_search, ("found", "lost")), "stereo": (_log_pair, ("features", "agreeing", "observed"))}
+"""By the system's name, what logs what a frame showed, and which figures are plotted."""

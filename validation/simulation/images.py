@@ -58,7 +58,6 @@ class Imaging:
     jpeg: Annotated[int, Range(ge=0, le=100)] = 0
     known: CountOrNone = 6  #: number of corners in the first image whose positions are given, at least 4; 0 for none.
     known_std_m: Positive = 0.001  #: standard deviation of these positions, the root of their covariance's trace.
-    known_exact: bool = False  #: leave the positions without their error.
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -68,11 +67,6 @@ class Imaging:
             raise InputError(
                 "blackout names frame 0, in which the known points are seen: leave it out or set known = 0"
             )
-
-    @property
-    def suffix(self) -> str:
-        """Of the images' files."""
-        return ".jpg" if self.jpeg else ".png"
 
 
 class Shutter:
@@ -164,10 +158,7 @@ def known_corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`count` strong corners spread over the middle of the first image; the first few of them spread as well as all.
 
-    Pixels (M, 2) in the first image, and positions (M, 3) in the world, m.
-
-    Raises:
-        InputError: there are too few, or they lie on a line.
+    Pixels (M, 2) in the first image, and positions (M, 3) in the world, m; an InputError where they are too few or on a line.
     """
     import cv2
 
@@ -232,11 +223,7 @@ TRUTH_COLUMNS = [
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `folder` when all is done, and vanishes if it is interrupted.
-
-    Raises:
-        InputError: there is something at `folder` already.
-    """
+    """A folder to write into, which becomes `folder`, not there before, when all is done, and vanishes if interrupted."""
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists already: delete it or choose another folder for the images")
     partial = folder.with_name(folder.name + ".partial")
@@ -251,11 +238,6 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-
-
-def image_path(folder: Path, sensor: str, stamp_ns: int, suffix: str = ".png") -> Path:
-    """Where an image of a sensor (cam0, cam1, depth0) belongs."""
-    return folder / "mav0" / sensor / "data" / f"{stamp_ns}{suffix}"
 
 
 def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
@@ -306,17 +288,13 @@ def write_sensor(
     (place / "sensor.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-OnFrame = Callable[[int, int], None]
-"""Called with how many images are done, and how many there will be."""
-
-
 def simulate_images(
     world: ImageWorld,
     imaging: Imaging,
     camera: Pinhole | RectifiedStereo,
     folder: Path,
     seed: int,
-    on_frame: OnFrame | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
     baseline_m: float | None = None,
 ) -> None:
     """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.
@@ -331,7 +309,7 @@ def simulate_images(
         camera: that takes them; the path is the left one's.
         folder: to write; must not exist, or be empty.
         seed: of all that is random.
-        on_frame: called after every image, in order.
+        on_frame: called after every image, in order, with how many are done, and how many there will be.
         baseline_m: to a second camera like a `Pinhole`, to its right; a `RectifiedStereo` has its own.
 
     Raises:
@@ -358,7 +336,7 @@ def simulate_images(
     if baseline_m is not None and not baseline_m > 0.0:
         raise InputError(f"the stereo baseline must be positive, got {baseline_m!r} m")
     renderer = Renderer(scene.rectangles, left, imaging.grid)
-    shutter = Shutter(scene, imaging, left, renderer, rng)
+    shutter, suffix = Shutter(scene, imaging, left, renderer, rng), ".jpg" if imaging.jpeg else ".png"
     with whole_folder(folder) as partial:
         sensors = {"cam0": 0.0}
         if baseline_m is not None:
@@ -366,8 +344,7 @@ def simulate_images(
         if imaging.depth:
             sensors["depth0"] = 0.0
         for sensor, offset_m in sensors.items():
-            suffix = ".png" if sensor == "depth0" else imaging.suffix
-            write_sensor(partial, sensor, scene, left, offset_m, suffix)
+            write_sensor(partial, sensor, scene, left, offset_m, ".png" if sensor == "depth0" else suffix)
         # camera.yaml: the (left) camera, and the baseline of a stereo pair.
         lens = ", ".join(left.lens.coefficient_names)
         intrinsics = zip(("fx", "fy", "cx", "cy"), left.params[:4].tolist(), strict=True)
@@ -394,8 +371,7 @@ def simulate_images(
         (place / "data.csv").write_text(text, encoding="utf-8")
         if imaging.known:
             px, positions = known_corners(scene, renderer, left, imaging.known)
-            per_axis = 0.0 if imaging.known_exact else imaging.known_std_m / np.sqrt(3.0)
-            positions = positions + per_axis * rng.standard_normal(positions.shape)
+            positions = positions + imaging.known_std_m / np.sqrt(3.0) * rng.standard_normal(positions.shape)
             lines = ["id,u_px,v_px,x_m,y_m,z_m,sigma_m"]
             for name, (uv, xyz) in enumerate(zip(px, positions, strict=True), start=1):
                 numbers = [f"{x:.4f}" for x in uv] + [f"{x:.6f}" for x in xyz]
@@ -403,11 +379,7 @@ def simulate_images(
             (partial / "known_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
         if scene.boards:
             # Poses as [qx, qy, qz, qw, x, y, z].
-            names = ("columns", "rows", "square_m")
-            boards = [
-                {name: getattr(board, name) for name in names} | {"world_from_board": board.world_from_board.tolist()}
-                for board in scene.boards
-            ]
+            boards = [vars(board) | {"world_from_board": pose.tolist()} for board, pose in scene.boards]
             text = yaml.safe_dump(boards, sort_keys=False)
             (partial / "chessboard.yaml").write_text(text, encoding="utf-8")
         if scene.odometry is not None:
@@ -416,20 +388,19 @@ def simulate_images(
         def take(frame: int) -> None:
             stamp = int(scene.stamps_ns[frame])
             for sensor, image in zip(("cam0", "cam1"), shutter.images(frame, baseline_m), strict=False):
-                write_image(image_path(partial, sensor, stamp, imaging.suffix), image, imaging.jpeg)
+                path = partial / "mav0" / sensor / "data" / f"{stamp}{suffix}"
+                write_image(path, image, imaging.jpeg)
             if imaging.depth:
                 depth, _ = renderer.depth(scene.world_from_camera[frame])
                 steps = np.rint(DEPTH_PER_M * depth)
                 coded = np.where(steps <= np.iinfo(np.uint16).max, steps, 0.0).astype(np.uint16)
-                write_image(image_path(partial, "depth0", stamp), coded)
+                write_image(partial / "mav0" / "depth0" / "data" / f"{stamp}.png", coded)
 
         # All frames, several at a time; they are reported in order.
         frames = len(scene.stamps_ns)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            pending = [pool.submit(take, frame) for frame in range(frames)]
             try:
-                for done, future in enumerate(pending, start=1):
-                    future.result()
+                for done, _ in enumerate(pool.map(take, range(frames)), start=1):
                     if on_frame is not None:
                         on_frame(done, frames)
             except BaseException:

@@ -90,19 +90,6 @@ def walls() -> list[Wall]:
     ]
 
 
-def partition() -> np.ndarray:
-    """(3, 2, 3) blocks of the wall between the rooms: on both sides of the door and above it."""
-    (x0, x1), (y0, y1) = PARTITION_M, DOOR_M
-    width, height = SIZE_M[1:]
-    return np.array(
-        [
-            [[x0, 0.0, 0.0], [x1, y0, height]],
-            [[x0, y1, 0.0], [x1, width, height]],
-            [[x0, y0, LINTEL_M], [x1, y1, height]],
-        ]
-    )
-
-
 ISLANDS = np.array([[[3.9, 3.8], [5.7, 6.2]], [[13.4, 4.0], [14.8, 6.0]]])
 """(2, 2, 2) where tables stand in the middle of the rooms, least and greatest x and y."""
 
@@ -131,8 +118,6 @@ def turn_back() -> Drive:
     return Drive(np.array([0.0, 1.6, 2.1]), moves, (TURN_BACK_FRAMES - 1) / RATE_HZ, ARM_M, RAMP_S)
 
 
-Box = np.ndarray
-"""(2, 3) least and greatest corner."""
 ABOVE_M = 0.9
 """What hangs higher than this is seen from below as well."""
 TOUCHING_M = 0.002
@@ -159,13 +144,25 @@ class Furnishing:
     """Collects what stands and hangs in the laboratory: opaque boxes, and what can be seen of them, and posters."""
 
     rng: np.random.Generator
-    blocks: list[Box] = field(default_factory=list)
+    blocks: list[np.ndarray] = field(default_factory=list)  #: (2, 3) least and greatest corner of each.
     surfaces: list[Surface] = field(default_factory=list)
 
-    def add(self, box: Box, side: Paint, top: Paint) -> None:
-        """A box with its visible faces."""
+    def add(self, box: np.ndarray, side: Paint, top: Paint) -> None:
+        """A box (2, 3): sides, top and, high above the floor, bottom, seen from without; not those that touch a wall."""
         self.blocks.append(box)
-        self.surfaces += faces(box, side, top)
+        (x0, y0, z0), (x1, y1, z1) = box
+        up = np.array([0.0, 0.0, z1 - z0])
+        ring = np.array([[x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1]])
+        ends = [(1, y0), (0, x1), (1, y1), (0, x0)]
+        self.surfaces += [
+            Surface(left, right - left, -up, side)
+            for left, right, (axis, at) in zip(ring, np.roll(ring, -1, axis=0), ends, strict=True)
+            if min(abs(at), abs(SIZE_M[axis] - at)) >= TOUCHING_M
+        ]
+        if z1 < SIZE_M[2] - TOUCHING_M:
+            self.surfaces.append(Surface(ring[3], ring[2] - ring[3], ring[0] - ring[3], top))
+        if z0 > ABOVE_M:
+            self.surfaces.append(Surface(ring[0] - up, ring[1] - ring[0], ring[3] - ring[0], side))
 
     def hang(self, wall: Wall, middle: float, high: float, size: tuple[float, float], deep: float = 0.0) -> None:
         """A print (wide, high) so far before a wall, its middle at a place along it and above the floor."""
@@ -179,29 +176,13 @@ class Furnishing:
         return float(self.rng.uniform(low, high))
 
 
-def faces(box: Box, side: Paint, top: Paint) -> list[Surface]:
-    """Sides, top and, high above the floor, bottom of a box, seen from without; not those that touch a wall."""
-    (x0, y0, z0), (x1, y1, z1) = box
-    up = np.array([0.0, 0.0, z1 - z0])
-    ring = np.array([[x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1]])
-    ends = [(1, y0), (0, x1), (1, y1), (0, x0)]
-    found = [
-        Surface(left, right - left, -up, side)
-        for left, right, (axis, at) in zip(ring, np.roll(ring, -1, axis=0), ends, strict=True)
-        if min(abs(at), abs(SIZE_M[axis] - at)) >= TOUCHING_M
-    ]
-    if z1 < SIZE_M[2] - TOUCHING_M:
-        found.append(Surface(ring[3], ring[2] - ring[3], ring[0] - ring[3], top))
-    if z0 > ABOVE_M:
-        found.append(Surface(ring[0] - up, ring[1] - ring[0], ring[3] - ring[0], side))
-    return found
-
-
 def furnished(rng: np.random.Generator) -> Furnishing:
     """The laboratory without floor, ceiling and outer walls; the same generator gives the same laboratory."""
-    lab = Furnishing(rng)
-    for block in partition():
-        lab.add(block, textures.plaster, textures.plaster)
+    lab, (x0, x1), (y0, y1), (_, width, height) = Furnishing(rng), PARTITION_M, DOOR_M, SIZE_M
+    # The wall between the rooms: on both sides of the door and above it.
+    sides = ((0.0, y0, 0.0), (y1, width, 0.0), (y0, y1, LINTEL_M))
+    for start, end, low in sides:
+        lab.add(np.array([[x0, start, low], [x1, end, height]]), textures.plaster, textures.plaster)
     for wall in walls():
         for start, end in wall.free_m:
             _along(lab, wall, start, end)
@@ -259,16 +240,12 @@ def _row(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, l
     place = along[0] + lab.uniform(0.0, 0.1)
     while place + 0.15 < along[1]:
         wide = min(lab.uniform(0.15, 0.55), along[1] - place)
-        books = lab.rng.random() < BOOKS
+        books = lab.rng.random() < 0.5
         high = min(lab.uniform(0.6, 0.95) * (top - low), 0.33 if books else 0.45)
         front = deep - lab.uniform(0.01, 0.08)
         paint = textures.spines if books else textures.carton
         lab.add(wall.box((place, place + wide), (BACK_M, front), (low, low + high)), paint, textures.carton)
         place += wide + lab.uniform(0.01, 0.2)
-
-
-BOOKS = 0.5
-"""Fraction of books among what stands on shelves."""
 
 
 def _table(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
@@ -346,8 +323,6 @@ def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
             lab.hang(side, place, 1.22, size)
 
 
-Trajectory = Literal["tour", "turn_back"]
-
 ROBOT_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.06], [0.0, -1.0, 0.0, 1.0]]))
 """(7,) the left camera looks forwards, 1 m above the floor, from a little before and to the left of the wheels' middle;
 the robot's frame has x forwards, y to the left, z up, its origin between the wheels on the floor."""
@@ -355,15 +330,11 @@ the robot's frame has x forwards, y to the left, z up, its origin between the wh
 
 @dataclass(frozen=True)
 class LabDrive:
-    """How a robot drives through the laboratory.
-
-    Raises:
-        InputError: there is no such trajectory, or it has not as many frames.
-    """
+    """How a robot drives through the laboratory."""
 
     #: "tour" through both rooms and back, 4,000 frames over 67.9 m; or "turn_back", 600 frames, on which the robot
     #: twice looks away for 5 s and back.
-    trajectory: Trajectory = "tour"
+    trajectory: Literal["tour", "turn_back"] = "tour"
     frames: Annotated[int | None, Range(ge=2, le=MOST)] = None  #: most images; None for all.
     every: Count = 1  #: only each so many-th frame of the trajectory becomes an image.
 
@@ -403,8 +374,6 @@ class TexturedLab(Ranged):
     """Two rooms of 18 m × 10 m together, with shelves, tables, cabinets, cartons and posters."""
 
     drive: LabDrive = LabDrive()  #: of the robot that carries the camera.
-    #: of the same robot; it is read in every frame of the trajectory, whether that becomes an image or not.
-    odometer: WheelOdometer = field(default_factory=WheelOdometer)
     texel_m: Positive = 0.003  #: side of a texel; of floors twice, of the ceiling four times as much.
     contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
 
@@ -423,5 +392,6 @@ class TexturedLab(Ranged):
         images, travelled = self.drive.images, self.drive.travelled()
         path = world_from_camera(travelled.world_from_robot)[images]
         stamps = stamps_ns(int(images[-1]) + 1, RATE_HZ)
-        odometry = self.odometer.measure(travelled, stamps, ROBOT_FROM_CAMERA, slip)
+        # The wheels are read in every frame of the trajectory, whether that becomes an image or not.
+        odometry = WheelOdometer().measure(travelled, stamps, ROBOT_FROM_CAMERA, slip)
         return TexturedScene("lab", stamps[images], path, rectangles, odometry=odometry)

@@ -49,11 +49,6 @@ class Wave:
         return (self.amplitude * np.sin(angle)).sum(axis=-1)
 
 
-def frame_seconds(frames: int, rate_hz: float) -> np.ndarray:
-    """(T,) times of the frames, the first at 0 [s]."""
-    return np.arange(frames) / rate_hz
-
-
 def frame_stamps(frames: int, rate_hz: float) -> np.ndarray:
     """(T,) int64 nanoseconds of the frames, the first at 0."""
     return np.round(np.arange(frames) * 1e9 / rate_hz).astype(np.int64)
@@ -79,18 +74,14 @@ def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return SE3.from_matrix(columns)
 
 
-def speeds(world_from_camera: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of turn (T - 1,) [rad/s] and speeds (T - 1,) [m/s] between poses (T, 7) at times (T,)."""
-    step = SE3.local(world_from_camera[:-1], world_from_camera[1:]) / np.diff(seconds)[:, None]
-    return np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
-
-
 def slowed(
     path: Callable[[np.ndarray], np.ndarray], seconds: np.ndarray, speed_m_s: float, turn_rad_s: float
 ) -> Callable[[np.ndarray], np.ndarray]:
     """The path, poses (T, 7) at times (T,), as slow as it takes that neither limit is passed at the `seconds` (T,)."""
-    turn, speed = speeds(path(seconds), seconds)
-    pace = min(1.0, 1.0 / max(float(turn.max()) / turn_rad_s, float(speed.max()) / speed_m_s))
+    poses = path(seconds)
+    step = SE3.local(poses[:-1], poses[1:]) / np.diff(seconds)[:, None]
+    turn, speed = (float(np.linalg.norm(part, axis=1).max()) for part in (step[:, :3], step[:, 3:]))
+    pace = min(1.0, 1.0 / max(turn / turn_rad_s, speed / speed_m_s))
     return lambda time: path(pace * time)
 
 
@@ -104,8 +95,10 @@ WRIST_HZ = 0.8, 2.0
 """Before the path is slowed down to the speed of a hand, to about a third."""
 TREMOR_HZ = 1.0, 3.0
 
-RISE = 0.25
-"""How far the camera goes up and down about the point looked at, as a fraction of how far it goes to the side."""
+SWEEP_DEG, RISE = 40.0, 0.25
+"""Greatest turn about the point looked at to either side; up and down it is this fraction of that."""
+WRIST_DEG, TREMOR_DEG, TREMOR_M = 10.0, 0.3, 0.002
+"""Greatest rotation by the wrist, and rotation and displacement by the hand's tremor, per axis."""
 
 
 @dataclass(frozen=True)
@@ -118,36 +111,26 @@ class HandHeld:
 
     nearest_m: Positive = 1.0  #: least distance of the camera from the point that it looks at.
     farthest_m: Positive = 1.5  #: greatest distance.
-    elevation_deg: float = 55.0  #: the camera looks down at this angle, on the average.
-    #: greatest turn about the point looked at to either side; a quarter as much up and down.
-    sweep_deg: NotNegative = 40.0
+    #: the camera looks down at this angle, on the average, and never along the vertical.
+    elevation_deg: Annotated[float, Range(gt=-80.0, lt=80.0)] = 55.0
     wander: NotNegative = 0.3  #: greatest shift of the point looked at, as a fraction of the box's size.
-    wrist_deg: NotNegative = 10.0  #: greatest rotation by the wrist, per axis.
     speed_m_s: Positive = 0.3  #: highest speed.
     turn_rad_s: Positive = 0.5  #: highest rate of turn.
-    tremor_m: NotNegative = 0.002  #: greatest displacement by the hand's tremor, per axis.
-    tremor_deg: NotNegative = 0.3  #: greatest rotation by it, per axis.
     start_s: NotNegative = 1.0  #: the camera reaches its pace after this time.
 
     def __post_init__(self) -> None:
         check_ranges(self)
         if not self.nearest_m < self.farthest_m:
             raise InputError(f"nearest_m = {self.nearest_m} must be less than farthest_m = {self.farthest_m}")
-        steepest = abs(self.elevation_deg) + RISE * self.sweep_deg
-        if not steepest < 90.0:
-            raise InputError(
-                f"elevation_deg = {self.elevation_deg} and sweep_deg = {self.sweep_deg} let the camera look along the "
-                "vertical, where it has no upright pose: lessen one of them"
-            )
 
     def poses(self, seconds: np.ndarray, size_m: Sequence[float], rng: np.random.Generator) -> np.ndarray:
         """(T, 7) at times (T,), over a box of a size (x, y, z) with its base on z = 0 and its middle over the origin."""
-        turn = np.deg2rad(self.sweep_deg) * np.array([1.0, RISE])
+        turn = np.deg2rad(SWEEP_DEG) * np.array([1.0, RISE])
         reach = 0.5 * (self.farthest_m - self.nearest_m)
         arm = Wave.random(np.array([*(0.5 * self.wander * np.array(size_m)), *turn, reach]), ARM_HZ, rng)
         start = arm(np.zeros(1))[:, :3] - [0.0, 0.0, 0.5 * size_m[2]]
-        wrist = Wave.random(np.deg2rad([self.wrist_deg] * 3 + [0.0] * 3), WRIST_HZ, rng)
-        bound = [np.deg2rad(self.tremor_deg)] * 3 + [self.tremor_m] * 3
+        wrist = Wave.random(np.deg2rad([WRIST_DEG] * 3 + [0.0] * 3), WRIST_HZ, rng)
+        bound = [np.deg2rad(TREMOR_DEG)] * 3 + [TREMOR_M] * 3
         tremor = Wave.random(np.array(bound), TREMOR_HZ, rng)
 
         def sweep(time: np.ndarray) -> np.ndarray:
@@ -203,10 +186,8 @@ class Drive:
     def __init__(self, start: np.ndarray, moves: Sequence[Move], seconds: float, arm_m: float, ramp_s: float) -> None:
         """Plans the drive from a pose (3,) world_from_robot.
 
-        `seconds` are for all moves; turning by one radian counts as driving `arm_m`; the pace is reached in `ramp_s`.
-
-        Raises:
-            InputError: the time does not suffice for the rests and for starting and stopping.
+        `seconds` are for all moves, rests, starts and stops, else an InputError; turning by one radian counts as driving
+        `arm_m`; the pace is reached in `ramp_s`.
         """
         self._length = np.array([move.length_m for move in moves])
         self._turn = np.array([move.turn_rad for move in moves])
@@ -266,10 +247,7 @@ class Drive:
 def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np.ndarray, list[Move]]:
     """Pose (3,) at the start and moves along a polyline (K, 2) [m] with rounded corners.
 
-    A bend begins `bend_m` before its corner and ends as far behind it.
-
-    Raises:
-        InputError: a side is too short for its bends, or the way turns back in a corner.
+    A bend begins `bend_m` before its corner and ends as far behind it: an InputError where a side is too short for that.
     """
     sides = np.diff(np.asarray(corners, float), axis=0)
     length = np.linalg.norm(sides, axis=1)

@@ -9,8 +9,6 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides, sides
 
-SIDES = "corner", "across", "down"
-
 NEAR_M = 1e-3
 """What is nearer to the camera's plane is not seen."""
 
@@ -26,7 +24,7 @@ class Renderer:
         from rbpf.validation.simulation import raster_kernel
 
         self._kernel = raster_kernel
-        self._camera, self._grid = camera, grid
+        self._grid = grid
         rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
         px = np.stack([columns, rows], axis=-1)
         self._uv = camera.unproject(px)
@@ -43,8 +41,8 @@ class Renderer:
         place = {key: k for k, key in enumerate(sheets)}
         self._sheet = np.array([place[id(r.texture)] for r in rectangles], dtype=np.int64)
         self._gain = np.array([r.gain for r in rectangles])
-        self._levels, self._texels = _packed([_pyramid(texture) for texture in sheets.values()])
-        corner, across, down = (np.array([getattr(r, side) for r in rectangles]) for side in SIDES)
+        self._levels, self._texels = _packed(list(sheets.values()))
+        across, down, corner = np.moveaxis(self._sides, 1, 0)
         # (S, 4, 3) in order round each rectangle.
         self._corners = np.stack([corner, corner + across, corner + across + down, corner + down], axis=1)
 
@@ -56,7 +54,10 @@ class Renderer:
         """
         poses = np.atleast_2d(world_from_camera)
         seen = self._in_view(poses)
-        shifts = rotated_grid(max(self._grid, math.isqrt(len(poses))))
+        # Places in a pixel [px], n² on a rotated grid: i/n² in one direction, n i mod (n² + 1) in the other, around 0.
+        side = max(self._grid, math.isqrt(len(poses)))
+        i = np.arange(1, side * side + 1)
+        shifts = (np.stack([i, side * i % (side * side + 1)], axis=-1) - 0.5) / (side * side) - 0.5
         light = np.empty(self._uv.shape[:2], dtype=np.float32)
         self._kernel.expose(
             np.array([rays_to_sides(self._sides[seen], pose) for pose in poses]),
@@ -111,12 +112,6 @@ class Renderer:
         return _extent(uv.reshape(len(uv), -1, 2))
 
 
-def rotated_grid(side: int) -> np.ndarray:
-    """(n², 2) places in a pixel [px], n = side: i/n² in one direction, n i mod (n² + 1) in the other, around 0."""
-    i = np.arange(1, side * side + 1)
-    return (np.stack([i, side * i % (side * side + 1)], axis=-1) - 0.5) / (side * side) - 0.5
-
-
 def _extent(uv: np.ndarray) -> np.ndarray:
     """(R, 4) least and greatest of (R, K, 2), NaN left out."""
     low = np.where(np.isnan(uv), np.inf, uv).min(axis=1)
@@ -124,30 +119,23 @@ def _extent(uv: np.ndarray) -> np.ndarray:
     return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=-1)
 
 
-def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
-    """The texture and its means over 2 × 2 texels, again and again until a side is one texel.
+def _packed(textures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Start, height and width (S, L, 3) of every level of each texture, the last one repeated, and all texels end to end.
 
-    An odd side is resampled to half of it, rounded down, so that all levels cover the same sheet.
+    A level has the means over 2 × 2 texels of the one before, until a side is one texel; an odd side is resampled to half of
+    it, rounded down, so that all levels cover the same sheet. Each level lies in a border of one texel that repeats the
+    outermost: interpolation needs no case for the edge.
     """
     import cv2
 
-    levels = [texture]
-    while min(levels[-1].shape) > 1:
-        height, width = levels[-1].shape
-        levels.append(np.asarray(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)))
-    return levels
-
-
-def _packed(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Start, height and width (S, L, 3) of every level, the last one repeated, and all texels end to end.
-
-    Each level lies in a border of one texel that repeats the outermost: interpolation needs no case for the edge.
-    """
-    depth = max(len(pyramid) for pyramid in pyramids)
-    levels = np.empty((len(pyramids), depth, 3), dtype=np.int64)
+    depths = [min(texture.shape).bit_length() for texture in textures]
+    levels = np.empty((len(textures), max(depths), 3), dtype=np.int64)
     start, texels = 0, []
-    for k, pyramid in enumerate(pyramids):
-        for level, texture in enumerate(pyramid):
+    for k, (texture, depth) in enumerate(zip(textures, depths, strict=True)):
+        for level in range(depth):
+            if level:
+                height, width = texture.shape
+                texture = np.asarray(cv2.resize(texture, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
             levels[k, level:] = start, *texture.shape
             texels.append(np.pad(texture, 1, mode="edge").ravel())
             start += texels[-1].size

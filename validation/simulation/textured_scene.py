@@ -25,6 +25,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import NotNegative, check_ranges
+from rbpf.sensors.calibration import Board
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
 from rbpf.validation.simulation.paths import frame_stamps
 from rbpf.validation.simulation.textures import Paint, chessboard, faded
@@ -48,7 +50,7 @@ class Rectangle:
     #: (3,) from there to the bottom left corner, m; not parallel to `across`, nor need it be perpendicular.
     down: np.ndarray
     texture: np.ndarray  #: (H, W) uint8 grey levels, at least 2 × 2.
-    gain: float = 1.0  #: brightness of the light on it, a factor on the grey levels.
+    gain: NotNegative = 1.0  #: brightness of the light on it, a factor on the grey levels.
 
     def __post_init__(self) -> None:
         sides = np.array([self.corner, self.across, self.down], dtype=float)
@@ -63,8 +65,7 @@ class Rectangle:
                 "a rectangle's texture must be a grey image of uint8, at least 2 x 2, got shape "
                 f"{texture.shape} of {texture.dtype}"
             )
-        if not 0.0 <= self.gain < np.inf:
-            raise InputError(f"a rectangle's gain must be zero or a positive number, got {self.gain!r}")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -75,28 +76,9 @@ class TexturedScene:
     stamps_ns: np.ndarray  #: (T,) int64 times of the frames, rising.
     world_from_camera: np.ndarray  #: (T, 7) true poses at these times, the middles of the exposures.
     rectangles: Sequence[Rectangle]  #: what there is to see.
-    boards: Sequence["Chessboard"] = ()  #: chessboards among it.
+    #: chessboards among it, and their poses world_from_board (7,): the first inner corner, x across, y down, z into it.
+    boards: Sequence[tuple[Board, np.ndarray]] = ()
     odometry: WheelOdometry | None = None  #: what the wheels say, if the camera stands on a robot.
-
-
-@dataclass(frozen=True)
-class Chessboard:
-    """A printed chessboard, as OpenCV counts its inner corners along its x (columns) and y axis (rows).
-
-    Of `world_from_board` (7,) the first inner corner is the origin, x runs across, y down, z into the sheet.
-    """
-
-    columns: int
-    rows: int
-    square_m: float
-    world_from_board: np.ndarray
-
-    @property
-    def corners(self) -> np.ndarray:
-        """(rows · columns, 3) inner corners in the world, row by row, m."""
-        y, x = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        local = self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1)
-        return SE3.transform(self.world_from_board, local)
 
 
 class ImageWorld(Protocol):
@@ -207,7 +189,7 @@ class Furniture:
         corner = [*(middle - 0.5 * size[0] * along), z1 - place[1] * (z1 - z0) + 0.5 * size[1]]
         self.sheet(np.array(corner), size[0] * np.array([*along, 0.0]), np.array([0.0, 0.0, -size[1]]), paint)
 
-    def board(self, middle: np.ndarray, squares: tuple[int, int], square_m: float) -> Chessboard:
+    def board(self, middle: np.ndarray, squares: tuple[int, int], square_m: float) -> tuple[Board, np.ndarray]:
         """A chessboard of squares (columns, rows) that lies with its middle at (3,); its x axis is the world's."""
         across, down = np.diag([squares[0] + 2.0, -squares[1] - 2.0, 0.0])[:2] * square_m
         corner = middle - 0.5 * across - 0.5 * down
@@ -215,7 +197,7 @@ class Furniture:
         self.rectangles.append(Rectangle(corner, across, down, paper, _gain(across, down)))
         origin = corner + 2.0 * square_m * np.array([1.0, -1.0, 0.0])
         pose = SE3.from_matrix(np.column_stack([np.diag([1.0, -1.0, -1.0]), origin]))
-        return Chessboard(squares[0] - 1, squares[1] - 1, square_m, pose)
+        return Board(squares[0] - 1, squares[1] - 1, square_m), pose
 
 
 def apart(

@@ -82,7 +82,9 @@ def picture(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     _scatter(image, rng, per_texel=40.0 / image.size, size=(0.01 * extent, 0.03 * extent), contrast=95.0)
     high = max(GLYPH[0], round(0.08 * extent))
     _write(image, rng, top=int(rng.uniform(0.1, 0.7) * shape[0]), high=high, ink=rng.uniform(10, 60))
-    _frame(image, rng.uniform(15, 240), max(1, round(0.015 * extent)))
+    level, thick = round(rng.uniform(15, 240)), max(1, round(0.015 * extent))
+    for border in (image[:thick], image[-thick:], image[:, :thick], image[:, -thick:]):
+        border[...] = level
     return image
 
 
@@ -200,8 +202,3 @@ def _write(image: np.ndarray, rng: np.random.Generator, top: int, high: int, ink
             place[...] = grey_levels(place + cover * (ink - place))
             column += pitch
         column += pitch
-
-
-def _frame(image: np.ndarray, level: float, thick: int) -> None:
-    for border in (image[:thick], image[-thick:], image[:, :thick], image[:, -thick:]):
-        border[...] = round(level)

@@ -9,7 +9,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import KnownPixels
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
-from rbpf.validation.simulation.paths import UP, HandHeld, Wave, eased, frame_seconds, looking, shaken
+from rbpf.validation.simulation.paths import UP, HandHeld, Wave, eased, looking, shaken
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, stamps_ns
 
 RATE_HZ = 30.0
@@ -57,7 +57,7 @@ class LoopOverDesk:
         return replace(desk, name="loop", stamps_ns=stamps, world_from_camera=self._path(rng))
 
     def _path(self, rng: np.random.Generator) -> np.ndarray:
-        seconds = frame_seconds(self.frames, RATE_HZ)
+        seconds = np.arange(self.frames) / RATE_HZ
         time = eased(seconds, 1.0)
         turn = 2.0 * np.pi * self.laps * time / time[-1] - 0.5 * np.pi
         gaze = self.radius_m * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
