@@ -291,7 +291,7 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
                 expected = sizes.setdefault(expected, size)
             fits = fits and expected in ("", size)
     if not fits:
-        shape = ", ".join(_sized(expected, sizes) for expected in entry.shape)
+        shape = ", ".join(f"{size} = {sizes[size]}" if size in sizes else str(size) or "any" for size in entry.shape)
         raise InputError(
             f"the array {name} must hold {_WORDS[wanted.kind]} of shape ({shape}), got {array.shape} {array.dtype}"
         )
@@ -327,9 +327,3 @@ def _require(is_right: np.ndarray, array: np.ndarray, name: str, words: str) -> 
         row = tuple(int(i) for i in np.argwhere(~np.asarray(is_right))[0])
         where = f" at {', '.join(map(str, row))}" if row else ""
         raise InputError(f"the array {name} must hold {words}, got {array[row].tolist()}{where}")
-
-
-def _sized(expected: int | str, sizes: Mapping[str, int]) -> str:
-    if isinstance(expected, int):
-        return str(expected)
-    return f"{expected} = {sizes[expected]}" if expected in sizes else expected or "any"
