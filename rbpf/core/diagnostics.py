@@ -110,7 +110,7 @@ class HealthWarning(UserWarning):
 class Health:
     """What the last steps show. `findings` holds the sentences; each kind is told once, as a `HealthWarning` unless `silent`.
 
-    Too much caution is a finding without a warning: nothing that the filter says is wrong.
+    Too much caution is no finding but one of the `remarks`: nothing that the filter says is wrong.
 
     Args:
         n: number of particles.
@@ -119,7 +119,7 @@ class Health:
 
     def __init__(self, n: int, space: LieGroup) -> None:
         self.n = n
-        self.findings = dict[str, str]()
+        self.findings, self.remarks = dict[str, str](), dict[str, str]()
         self.silent = False
         self._squared, self._rows = 0.0, 0.0
         self._few = max(2.0, FEW * n)
@@ -145,12 +145,13 @@ class Health:
             # A mean, for a filter that is too cautious is no failure, and there is time; large ones only hide it.
             self._squared, self._rows = self._squared + nis, self._rows + rows
             if self._rows >= ENOUGH and self._squared < SMALL * self._rows:
-                self._tell(
-                    "caution",
-                    f"step {step}: what is measured is {self._squared / self._rows:.2f} times as far off (squared) as the "
-                    "noise explains, 1 is right: the noise of motion or measurements is stated too large",
-                    warns=False,
+                ratio = self._squared / self._rows
+                self.remarks["caution"] = (
+                    f"what was measured is {ratio:.2f} times as far off (squared) as the noise explains, 1 is right: the noise of "
+                    "motion or measurements is stated too large"
                 )
+            else:
+                self.remarks.pop("caution", None)
         self._ess.append(-ess)
         few = -_lasting(self._ess, step)
         if few < self._few:
@@ -211,10 +212,10 @@ class Health:
                 "(KalmanSubstate), or give it some noise",
             )
 
-    def _tell(self, kind: str, sentence: str, warns: bool = True) -> None:
+    def _tell(self, kind: str, sentence: str) -> None:
         if kind not in self.findings:
             self.findings[kind] = sentence
-            if warns and not self.silent:
+            if not self.silent:
                 warnings.warn(sentence, HealthWarning, stacklevel=4)
 
 
