@@ -147,8 +147,8 @@ class Health:
             if self._rows >= ENOUGH and self._squared < SMALL * self._rows:
                 ratio = self._squared / self._rows
                 self.remarks["caution"] = (
-                    f"what was measured is {ratio:.2f} times as far off (squared) as the noise explains, 1 is right: the noise of "
-                    "motion or measurements is stated too large"
+                    f"what was measured is {ratio:.2f} times as far off (squared) as the noise explains, 1 is right: the "
+                    "noise of motion or measurements is stated too large"
                 )
             else:
                 self.remarks.pop("caution", None)
