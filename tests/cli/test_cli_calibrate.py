@@ -10,7 +10,7 @@ from rbpf.cli import main
 from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.images.calibration import read_calibration
 from tests.cli.mono_sequences import sentence
-from tests.sensors.board_pictures import BOARD, CAMERA, FISHEYE, pictures
+from tests.sensors.board_pictures import BOARD, CAMERA, pictures
 
 pytestmark = pytest.mark.slow
 
@@ -30,29 +30,18 @@ def calibrate(images, out, *arguments, board=BOARD_OPTIONS):
     return main(["calibrate", str(images), *board, "--out", str(out), *arguments])
 
 
-@pytest.mark.parametrize(
-    ("lens", "options"), [(CAMERA, ()), (FISHEYE, ("--model", "fisheye"))], ids=["pinhole", "fisheye"]
-)
-def test_the_camera_is_written_for_the_readers(tmp_path, capsys, lens, options):
-    images = tmp_path / "images"
-    images.mkdir()
-    for number, image in enumerate(pictures() if lens is CAMERA else pictures(20, lens)):
-        cv2.imwrite(str(images / f"{number:02d}.png"), image)
-    assert calibrate(images, tmp_path / "out", *options, "--json") == 0
+def test_the_camera_is_written_for_the_readers(images, tmp_path, capsys):
+    assert calibrate(images, tmp_path / "out", "--json") == 0
     entries = json.loads(capsys.readouterr().out)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "camera.yaml", "calibration.json", "calibration.png"
     }  # fmt: skip
     camera = read_calibration(tmp_path / "out" / "camera.yaml").camera
-    assert (camera.width, camera.height, camera.distortion_model) == (lens.width, lens.height, lens.distortion_model)
-    np.testing.assert_allclose(camera.params[:4], lens.params[:4], atol=0.5)
-    assert entries["fx"] == pytest.approx(camera.fx, abs=1e-5) and entries["std"].keys() >= {
-        "fx",
-        "fy",
-        "cx",
-        "cy",
-        "k1",
-    }
+    assert (camera.width, camera.height) == (CAMERA.width, CAMERA.height)
+    np.testing.assert_allclose(camera.params[:4], CAMERA.params[:4], atol=0.5)
+    assert (
+        entries["fx"] == pytest.approx(camera.fx, abs=1e-5) and {"fx", "fy", "cx", "cy", "k1"} <= entries["std"].keys()
+    )
     assert 0.0 < entries["reprojection_rms_px"] < 0.08 and entries["views"] >= 10
     assert open_images(images, tmp_path / "out" / "camera.yaml").camera == camera
 

@@ -34,7 +34,7 @@ SHORTER = {
 }
 """Added to a command that would render or simulate for minutes."""
 
-SHORTER_OF_PAGE = {"docs/how_to/datasets.md": {("run",): ["--no-batch"]}}
+SHORTER_OF_PAGE = {"docs/how_to/datasets.md": {("run",): ["--no-batch", "--no-video"]}}
 """On a page about something else."""
 
 LEFT_OUT = {("sweep",): "--scheduler"}

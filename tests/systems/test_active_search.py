@@ -1,7 +1,5 @@
 """Active search: appearances, the gate that matches pass, who is trusted, and what moves by itself."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -146,15 +144,13 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     recording = open_images(tmp_path / "desk")
     known = read_known_points(tmp_path / "desk" / "known_points.csv")
     damaged = cover_view(1 / 3, 60, 60)(recording)
-    worst = {}
-    credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0))
-    for name, config, seeds in (("credulous", credulous, (2,)), ("usual", MonoConfig(), (1, 2))):
-        runs = [filter_opened(open_mono(damaged, replace(config, seed=seed), known)) for seed in seeds]
-        stamps = recording.stamps_ns
-        paths = [Trajectory(stamps, poses) for poses in (*(run.log.poses for run in runs), runs[0].truth.poses)]
-        worst[name] = max(ate(path, paths[-1]).rmse for path in paths[:-1])
-    assert worst["usual"] < 0.03
-    assert worst["credulous"] > 2.0 * worst["usual"]
+    off, stamps = {}, recording.stamps_ns
+    credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0), seed=2)
+    for name, config in (("credulous", credulous), ("usual", MonoConfig(seed=2))):
+        run = filter_opened(open_mono(damaged, config, known))
+        off[name] = ate(Trajectory(stamps, run.log.poses), Trajectory(stamps, run.truth.poses)).rmse
+    assert off["usual"] < 0.03
+    assert off["credulous"] > 2.0 * off["usual"]
 
 
 def test_what_is_often_missed_only_updates_the_map():

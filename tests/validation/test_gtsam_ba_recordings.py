@@ -12,7 +12,7 @@ from rbpf import gaussian
 from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_vo import MotionPrior
 from rbpf.runs.trajectory import align
-from rbpf.sensors.readers import LogNoise, RobotLog, open_log
+from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measurements, initial_estimate, point_dim
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
@@ -145,20 +145,12 @@ def test_visual_odometry_alone(tracks, solved):
 
 @pytest.mark.parametrize(("folder", "error"), [("mrpt_kf_slam_2d", 0.01), ("mrclam6_robot1", 0.15)])
 def test_the_evidence_of_a_recording_does_not_hang_on_the_seed(data_dir, folder, error):
-    found = []
-    for scale in (0.5, 1.0, 2.0):
-        m = from_log(open_log(data_dir / folder, LogNoise(scale_odometry=scale)))
-        batch = solve(m, marginals=False, incremental=True)
-        start = InitialEstimate(batch.world_from_body, batch.landmarks)
-        draws = [
-            draw_posterior(m, start, np.random.default_rng(seed), 200) for seed in ((0, 1) if scale == 1.0 else (0,))
-        ]
-        found.append(draws[0].log_evidence)
-        if scale == 1.0:
-            assert max(one.error for one in draws) < error
-            assert abs(draws[0].log_evidence - draws[1].log_evidence) < 4.0 * error
-    # The simulator's noise is the stated one, that of the other log the best of these too.
-    assert found[1] > max(found[0], found[2]) + 20.0
+    m = from_log(open_log(data_dir / folder))
+    batch = solve(m, marginals=False, incremental=True)
+    start = InitialEstimate(batch.world_from_body, batch.landmarks)
+    one, other = (draw_posterior(m, start, np.random.default_rng(seed), 200) for seed in (0, 1))
+    assert max(one.error, other.error) < error
+    assert abs(one.log_evidence - other.log_evidence) < 4.0 * error
 
 
 def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
