@@ -73,15 +73,10 @@ def errors(run):
 
 
 @slow
-def test_tracking_is_not_disturbed(tracked, tmp_path):
-    """Nor by being broken off."""
+def test_tracking_is_not_disturbed(tracked):
     run = tracked.run
     assert not run.log.lost().any() and not np.flatnonzero(run.log["relocalised"]).tolist() and not run.messages
     assert errors(run).max() < 0.05
-    again = resumed(tracked, tmp_path, lambda t, image: image)
-    assert again.log.poses == pytest.approx(run.log.poses, abs=1e-9)
-    assert again.system.loss.trusted[0] == pytest.approx(run.system.loss.trusted[0])
-    assert again.system.loss.stamp_ns == run.log.stamps_ns[-1]
 
 
 @slow

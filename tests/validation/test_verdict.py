@@ -26,7 +26,7 @@ from rbpf.validation.report.validate import verdict_of
 from tests.validation.fixes import Receiver, Walk
 
 ALIKE = {
-    "sensor noise × 2", "odometry noise × 3", "nothing, another world", "the same in another world",
+    "sensor noise × 2", "sensor noise ÷ 3", "odometry noise × 3", "nothing, another world", "the same in another world",
     "the same in another world, joint map",
 }  # fmt: skip
 SLOW = {"20 % wrong names"}
