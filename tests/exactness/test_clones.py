@@ -233,24 +233,6 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
         np.testing.assert_allclose(whole[[0, 1, 2, 4, 5, 6, 8]], rest, rtol=1e-9)
 
 
-def test_depth_without_parallax_is_considered():
-    joint, _ = rays(5)
-    ids, z = np.array([20, 21]), np.full((2, 2), 300.0)
-    joint._held.kinds[1] = InverseDepth(0.1, least_parallax=1e9)
-    state = SE3.retract(
-        joint._poses(joint.mean, joint._held.clone_columns(np.array([0])), joint.clones)[:, 0], np.full(6, 0.01)
-    )
-    depth = joint._held.of_one_kind(ids).columns[:, 2]
-    before = joint.mean.copy(), joint.cov.copy()
-    joint.correct(
-        state, np.zeros((5, 6)), [Observations(z, np.repeat(np.eye(2)[None], 2, axis=0), CameraRay(CAMERA), ids=ids)]
-    )
-    np.testing.assert_allclose(joint.mean[:, depth].mean(axis=0), before[0][:, depth].mean(axis=0), rtol=1e-12)
-    spread = np.cov((joint.mean - before[0])[:, depth].T)
-    np.testing.assert_allclose(joint.cov[np.ix_(depth, depth)] + spread, before[1][np.ix_(depth, depth)], rtol=1e-9)
-    assert np.trace(joint.cov) < np.trace(before[1])
-
-
 def test_particles_that_are_far_off_leave_a_covariance():
     """Innovations of many standard deviations: what is considered is not told to be better known than that allows."""
     joint, _ = rays(5)

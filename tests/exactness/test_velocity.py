@@ -88,27 +88,6 @@ def test_the_exact_velocity_given_the_path():
     assert filter_.lineage.generation == 0
 
 
-def test_a_shared_covariance_is_the_one_of_each_particle():
-    """Told per particle, the same filter gives the same numbers."""
-    shared, own = substate(0.2), substate(0.2)
-    results = []
-    for part in (shared, own):
-        filter_ = build(part, 20, 9, np.full(6, 0.5))
-        if part is own:
-            part.cov = np.repeat(part.cov, 20, axis=0)
-        for t, stamp in enumerate(STAMPS_S):
-            filter_.step(Frame([single(measurements(2)[t], R, Position())]), None, round(stamp * 1e9))
-        results.append(filter_)
-    assert shared.cov.shape == (1, 6, 6)
-    assert own.cov.shape == (20, 6, 6)
-    one, other = results
-    assert one.lineage.generation > 0
-    np.testing.assert_allclose(one.particles.state, other.particles.state, atol=1e-9)
-    np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-9)
-    np.testing.assert_allclose(shared.mean, own.mean, atol=1e-9)
-    np.testing.assert_allclose(np.broadcast_to(shared.cov, own.cov.shape), own.cov, atol=1e-10)
-
-
 def test_sampled_and_marginal_velocity_have_one_law():
     """Three steps without measurements, rotation included: first and second moments of the pose agree."""
     n, walk = 15_000, np.array([0.5, 0.4, 0.6, 0.6, 0.9, 0.4])

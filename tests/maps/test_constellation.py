@@ -101,28 +101,6 @@ def test_covariance_of_the_frame_of_uncertain_points():
     assert (np.abs(moved.T @ moved / n - expected) / scale).max() < 0.04
 
 
-def test_uncertain_points_told_in_their_own_frame():
-    """Turning the world changes nothing; the covariance is that of a numeric derivative, and of what the fit leaves."""
-    group, records = shape_and_records(3, seed=6, scale=0.001)
-    local, covs = group.in_group(records)
-    turn = SE3.exp(np.array([0.2, -1.1, 0.6, 3.0, 1.0, -2.0]))
-    rotation = np.kron(np.eye(4), SE3.rotation(turn))
-    turned = SE3.transform(turn, group.in_world(records)).reshape(3, 1, 12)
-    again = group.in_group(Records(turned, rotation @ records.cov @ rotation.T))
-    np.testing.assert_allclose(again[0], local, atol=1e-9)
-    np.testing.assert_allclose(again[1], covs, atol=1e-9)
-    step, bare = 1e-6, np.zeros((3, 1, 12, 12))
-
-    def told(mean: np.ndarray) -> np.ndarray:
-        return group.in_group(Records(mean, bare))[0]
-
-    axes = [(told(records.mean + d) - told(records.mean - d)) / (2 * step) for d in step * np.eye(12)]
-    slope = np.stack(axes, axis=-1)
-    left = group.in_group(Records(records.mean, bare))[1]
-    expected = slope @ records.cov[:, :1] @ np.swapaxes(slope, -1, -2) + left
-    np.testing.assert_allclose(covs, expected, rtol=0.02, atol=1e-8)
-
-
 def test_two_groups_in_one_map():
     """Equal groups share a layout, others get their own."""
     held = LandmarkMap(SE3)

@@ -10,11 +10,6 @@ from tests.motion.stereo_pairs import CAR, LEAP, ROAD, correlated, noiseless
 worlds = pytest.mark.parametrize("world", [ROAD, LEAP], ids=["road", "leap"])
 
 
-def numeric(function, at, step):
-    columns = [(function(at + step * unit) - function(at - step * unit)) / (2.0 * step) for unit in np.eye(len(at))]
-    return np.stack(columns, axis=-1)
-
-
 @worlds
 def test_points_are_seen_where_the_camera_projects_them(world):
     before, now, delta = noiseless(world, 50, np.random.default_rng(0))
@@ -22,19 +17,6 @@ def test_points_are_seen_where_the_camera_projects_them(world):
     np.testing.assert_allclose(seen.pixels, now, atol=1e-9)
     np.testing.assert_allclose(seen.inverse_depth, 1.0 / world.camera.triangulate(before)[:, 2], rtol=1e-9)
     assert seen.front.all()
-
-
-@worlds
-def test_derivatives(world):
-    before, _, delta = noiseless(world, 3, np.random.default_rng(1))
-    seen = reproject(world.camera, delta, before)
-    for row, pixels in enumerate(before):
-        by_motion = numeric(
-            lambda xi, z=pixels: reproject(world.camera, SE3.retract(delta, xi), z[None]).pixels[0], np.zeros(6), 1e-5
-        )
-        by_pixels = numeric(lambda z: reproject(world.camera, delta, z[None]).pixels[0], pixels, 1e-3)
-        np.testing.assert_allclose(seen.by_motion[row], by_motion, atol=1e-4 * np.abs(by_motion).max())
-        np.testing.assert_allclose(seen.by_pixels[row], by_pixels, atol=1e-6)
 
 
 def test_infinity_is_nowhere_special():

@@ -12,7 +12,6 @@ from rbpf.sensors.readers import LogNoise, open_log
 from tests.readers.small import COV_6D, DELTA_6D, GRAPH, MRCLAM, MRPT, MRPT_IN_SPACE, QUARTER, write
 
 SEEN = "Robot3_Measurement.dat"
-SECOND = 10**9
 DRIVEN = [(0.2, 0.5, 0), (0.6, 0.2, 1), (0.5, 0, -2), (0.5, 0.4, 0.5)]
 TURNED = [[9, -0.75, -0.25], [-0.75, 4, -0.5], [-0.25, -0.5, 1]]
 """Of x, y, heading (1, 0.5, 0.25; 4, -0.75; 9): reordered, and turned into a body whose x axis is the old y axis."""
@@ -191,20 +190,3 @@ def test_noise_that_has_no_effect_is_refused(tmp_path, files, kind, names):
     for name in names:
         with pytest.raises(InputError, match=re.escape(f"{name} has no effect on {kind}; leave it out")):
             open_log(tmp_path, LogNoise(**{name: 1.0}))
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize(
-    ("folder", "frames", "observations", "landmarks"),
-    [
-        ("mrclam6_robot1", 1012, 1534, 15),
-        ("mrpt_kf_slam_2d", 250, 3607, 70),
-        ("mrpt_kf_slam_6d", 600, 5824, 50),
-        ("victoria_park", 6969, 3640, 151),
-    ],
-)
-def test_counts_of_recordings(data_dir, folder, frames, observations, landmarks):
-    log = open_log(data_dir / folder)
-    assert (len(log.frames), sum(len(frame.z) for frame in log.frames)) == (frames, observations)
-    seen = {name for frame in log.frames for name in frame.landmarks.tolist()}
-    assert len(log.truth.landmarks if log.truth else seen) == landmarks

@@ -3,12 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from scipy.integrate import cumulative_trapezoid
 
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
-from rbpf.validation.simulation import lab as lab_plan
 from rbpf.validation.simulation.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, world_from_camera
 from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners
 from rbpf.validation.simulation.textured_scene import stamps_ns
@@ -29,20 +26,6 @@ def test_a_polyline_is_followed_but_for_its_corners() -> None:
     end = drive(np.array([40.0]))
     np.testing.assert_allclose(end.world_from_robot[0], drive.waypoints[-1], atol=1e-9)
     np.testing.assert_allclose(end.way_m, sum(move.length_m for move in moves), atol=1e-9)
-
-
-@pytest.mark.parametrize("drive", [lab_plan.tour(), lab_plan.turn_back()], ids=["tour", "turn_back"])
-def test_it_goes_where_it_faces(drive: Drive) -> None:
-    """The position is the integral of its speed along its heading; here by the trapezoidal rule."""
-    seconds = np.linspace(0.0, 39.0, 40001)
-    path = drive(seconds)
-    theta = path.world_from_robot[0, 0] + path.heading_rad
-    wrapped = np.exp(1j * theta) / np.exp(1j * path.world_from_robot[:, 0])
-    np.testing.assert_allclose(wrapped, 1.0, atol=1e-9)
-    for axis, part in enumerate((np.cos(theta), np.sin(theta)), start=1):
-        gone = cumulative_trapezoid(part, path.way_m, initial=0.0)
-        np.testing.assert_allclose(path.world_from_robot[:, axis] - path.world_from_robot[0, axis], gone, atol=1e-6)
-    assert (np.diff(path.way_m) >= -1e-12).all()
 
 
 EXACT = WheelOdometer(scale=0.0, inequality=0.0, wheelbase_error=0.0, slip_m=0.0)

@@ -9,7 +9,6 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.runs import plots
 from rbpf.runs.folder import write_map, write_run, write_trajectory
-from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.runs.results import load
 from rbpf.runs.trajectory import Similarity, read_tum, write_tum
@@ -17,7 +16,6 @@ from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import LANDMARKS, NEES, compare_with_truth, truth_errors
-from rbpf.validation.metrics.scores import score_landmarks
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 
 STEPS = 200
@@ -81,20 +79,6 @@ def in_another_world(folder):
     truth = record.truth
     landmarks = {name: away.transform(point) for name, point in truth.landmarks.items()}
     write_truth(folder, RunTruth(truth.rows, away.transform_poses(truth.poses), landmarks, "rigid"))
-
-
-def test_landmarks_are_scored_in_the_world_of_the_path(folder):
-    def scored():
-        record = load(folder)
-        estimate = PathAndMap(record.path.stamps_ns, record.path.mean, record.path.cov, record.map)
-        return score_landmarks(estimate, record.truth)
-
-    here = scored()
-    in_another_world(folder)
-    there = scored()
-    name = "landmark_error_aligned_mean_m"
-    assert there[name] == pytest.approx(here[name])
-    assert there["landmark_error_mean_m"] < 2.0 * here["landmark_error_mean_m"]
 
 
 def test_the_batch_is_moved_as_the_filter_is(folder):

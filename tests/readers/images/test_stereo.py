@@ -10,7 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, open_stereo
-from rbpf.sensors.readers.images.rectification import OUTSIDE, Rectification, pair_stamps
+from rbpf.sensors.readers.images.rectification import OUTSIDE, Rectification
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,
@@ -65,16 +65,6 @@ def test_two_clocks_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"within 0.005 s, the nearest two are 0.010000 s apart"):
         open_stereo(tmp_path)
     assert len(open_stereo(tmp_path, tolerance_s=0.011)) == 3
-
-
-def test_each_image_has_one_partner():
-    left, right = np.array([0, 10, 20, 30]), np.array([9, 11, 19, 33, 50])
-    pairs = pair_stamps(left, right, 5e-9, "here")
-    assert pairs[0].tolist() == [1, 2, 3] and pairs[1].tolist() == [0, 2, 3]
-    assert pairs[2] == (
-        "here: 1 of 4 left images have no partner within 5e-09 s and are left out.",
-        "here: 2 of 5 right images have no partner within 5e-09 s and are left out.",
-    )
 
 
 @pytest.mark.parametrize(("camera", "damage"), [("cam0", "missing"), ("cam1", "empty"), ("cam1", "size")])
