@@ -7,12 +7,10 @@ import pytest
 
 from rbpf.cli import main
 from rbpf.runs.measurement_files import read_feature_log
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers import open_stereo
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.calibration import read_calibration
-from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from tests.cli import stereo_sequences
 from tests.cli.mono_sequences import FRAMES, run, summary
 
 pytestmark = pytest.mark.slow
@@ -58,13 +56,3 @@ def test_its_run_is_validated_and_calibrates_its_camera(finished, tmp_path, caps
     assert camera.distortion_model == "equidistant" and camera.distortion[1:] == CAMERA.distortion[1:]
     assert told["k1"] == {"before": CAMERA.distortion[0], "after": pytest.approx(camera.distortion[0], abs=1e-8)}
     assert abs(camera.fx / CAMERA.fx - 1.0) < 0.02
-
-
-def test_two_cameras_are_rectified_and_as_near_to_the_truth(tmp_path):
-    lens = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
-    world = TexturedRoom(frames=stereo_sequences.FRAMES, rate_hz=5.0)
-    simulate_images(world, Imaging(known=0, noise_std=1.0), lens, tmp_path / "room", 1, baseline_m=0.12)
-    rig = open_stereo(tmp_path / "room").rig
-    assert rig == RectifiedStereo(Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5), 0.12)
-    assert stereo_sequences.run(tmp_path / "room", tmp_path / "run", "--no-video", "--no-batch") == 0
-    assert summary(tmp_path / "run")["ate_rmse_m"] < 0.01

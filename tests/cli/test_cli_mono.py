@@ -124,16 +124,6 @@ def test_the_video_has_every_frame(finished):
     assert green > 200
 
 
-def test_a_checkpoint_of_another_run_is_refused(desk, folder, tmp_path, capsys):
-    assert run(desk, tmp_path / "run", "--set", "checkpoint_every=5", known=False) == 0
-    assert run(folder, tmp_path / "run", "--resume", known=False) == 2
-    assert "recording = content of SHA-256 " in sentence(capsys)
-    assert run(desk, tmp_path / "run", "--resume") == 2
-    assert "known_points = nothing, this one has content of " in sentence(capsys)
-    assert run(desk, tmp_path / "run", "--set", "search.measurements=7", "--resume", known=False) == 2
-    assert "search.measurements = " in sentence(capsys)
-
-
 def test_it_starts_without_known_points(desk, tmp_path):
     assert run(desk, tmp_path, known=False) == 0
     entries = summary(tmp_path)

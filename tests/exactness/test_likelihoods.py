@@ -6,7 +6,7 @@ import pytest
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.marginals import Marginals
-from rbpf.core.models import NewLandmarks, ObservationModel, Observations, Records
+from rbpf.core.models import ObservationModel, Observations, Records
 from rbpf.core.proposals import EkfProposal, PriorProposal, refined
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean
@@ -174,23 +174,3 @@ def test_the_density_of_two_sightings_of_an_uncertain_landmark_integrates_to_one
     groups = [Observations(zero, R, Along(axis), likelihood, ids) for axis in (0, 1)]
     densities = held.correct(state, np.zeros_like(state), groups)
     assert np.exp(densities.all).sum() * step**2 == pytest.approx(1.0, abs=0.02)
-
-
-def test_an_outlier_moves_no_landmark(rng):
-    """Particles that reject a sighting keep their landmark; those that accept it move it."""
-    n = 40
-    held = LandmarkMap(PLANE)
-    motion = LinearMotion(np.eye(2), 0.5 * np.eye(2))
-    filter_ = Filter(motion, Scripted(), held, PriorProposal(), n=n, rng=rng)
-    R = 0.1 * np.eye(2)
-    born = NewLandmarks(np.array([[3.0, 1.0]]), R[None], Relative(), Point(2))
-    filter_.step(Frame((), [born]))
-    before = held.read(held.ids).mean
-    seen = Observations(np.array([[3.4, 1.0]]), R[None], Relative(), TRUNCATED, held.ids)
-    state = filter_.particles.state + np.array([0.3, 0.0]) * (np.arange(n) % 2)[:, None] * 5.0
-    held.correct(state, np.zeros((n, 2)), [seen])
-    stayed = (held.read(held.ids).mean == before).all(axis=(1, 2))
-    nu = 3.4 - (before[:, 0] - state)[:, 0], 1.0 - (before[:, 0] - state)[:, 1]
-    rejected = (nu[0] ** 2 + nu[1] ** 2) / 0.2 > 4.0
-    np.testing.assert_array_equal(stayed, rejected)
-    assert 0 < rejected.sum() < n

@@ -125,23 +125,3 @@ def test_evidence_and_component_weights_are_unbiased(frames, proposal, resampler
         components.append(np.exp(log_ratio[-1]) * (first - posterior[:, 0]))
     assert_unbiased(np.array(log_ratio))
     assert deviation(np.array(components), 0.0) <= 3.5
-
-
-def test_mixtures_take_no_part_in_the_refinement(frames):
-    filter_ = build(EkfProposal(), Systematic(), 5, np.linalg.cholesky(Q), np.random.default_rng(1))
-    state = filter_.particles.state
-    group = frames[1].groups[0]
-    prior = filter_.marginals.predict(filter_.motion.transition(state, None, 0.0), PLANE, 0.0)
-    mixtures, all_of_them, points = (
-        filter_.marginals.information(
-            state, [Observations(group.z[rows], group.cov[rows], group.model, ids=group.ids[rows])], prior
-        )
-        for rows in ([0, 1], [0, 1, 2], [2])
-    )
-    np.testing.assert_array_equal(mixtures.info, 0.0)
-    np.testing.assert_array_equal(mixtures.quad, 0.0)
-    np.testing.assert_array_equal(all_of_them.info, points.info)
-    assert (np.abs(points.info) > 0.1).any()
-    densities = filter_.marginals.correct(state, np.zeros((5, 2)), [group])
-    assert (densities.after_sampling != 0.0).all()
-    assert (densities.all != densities.after_sampling).all()

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.least_squares import Rule
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit, trimming
+from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit
 from rbpf.sensors.camera import RectifiedStereo
 from tests.motion.stereo_pairs import (
     CAR,
@@ -190,15 +189,6 @@ class TestDegenerate:
 def test_wrong_input_is_refused(z_prev, z_now, cov, complaint):
     with pytest.raises(InputError, match=complaint):
         Matches.checked(HAND, z_prev, z_now, cov, cov)
-
-
-@pytest.mark.parametrize("gate", [3.0, 11.345, 25.0])
-def test_what_a_gate_costs(gate):
-    """Beside SciPy's distributions, and the mean square of what is within."""
-    assert trimming(gate) == pytest.approx(chi2.cdf(gate, 3) / chi2.cdf(gate, 5), rel=1e-12)
-    squared = np.square(np.random.default_rng(8).normal(size=(200_000, 3))).sum(axis=1)
-    assert 3.0 / squared[squared <= gate].mean() == pytest.approx(trimming(gate), rel=0.01)
-    assert trimming(np.inf) == 1.0
 
 
 def trials(world, points, count, runs, noise_px):

@@ -7,7 +7,7 @@ from rbpf.conformance import Example, check_model
 from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
-from rbpf.sensors.camera.points import CameraPoint, ConstellationView, MembersView
+from rbpf.sensors.camera.points import ConstellationView, MembersView
 from tests.sensors.camera_scenes import CAMERAS, PLAIN
 
 POINTS = np.random.default_rng(0).uniform([-0.5, -0.4, -0.3], [0.5, 0.4, 0.3], size=(4, 3))
@@ -50,18 +50,6 @@ def test_sound_model(camera, errors, turn):
     cov = np.tile(np.eye(group.dim), (5, 1, 1, 1))
     example = Example(state=state[:, 0], landmark=group, records=Records(mean, cov, const))
     assert check_model(view(camera, errors), SE3, example=example) == []
-
-
-@every_group
-@every_camera
-def test_the_points_are_seen_one_after_the_other(camera, errors):
-    state, mean, const = scene(errors)
-    px = view(camera, errors).predict(state, mean, const)
-    assert px.shape == (5, 1, 6)
-    world = seen_in_world(errors, mean, const)
-    for k in range(3):
-        expected = CameraPoint(camera).predict(state, world[:, :, k])
-        np.testing.assert_allclose(px[..., 2 * k : 2 * k + 2], expected, rtol=1e-12)
 
 
 @every_group

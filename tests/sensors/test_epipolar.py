@@ -1,7 +1,5 @@
 """The part of a ray's measurement that does not depend on its depth (E06 §5.2)."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from rbpf.core.particles import Information, Prior
 from rbpf.lie import SE3
 from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from tests.exactness.models import known
-from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays
+from tests.sensors.camera_scenes import CAMERAS, Rays
 
 every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 R = np.diag([1.7, 1.7])
@@ -93,14 +91,3 @@ def test_limit_of_the_marginal_with_unknown_depth(camera):
     np.testing.assert_allclose(errors[2], 1e-4 * np.array(errors[0]), rtol=0.3)
     again = terms(EpipolarRay(camera), rays, z, 1e6)
     np.testing.assert_allclose(again.info, limit.info, rtol=1e-7, atol=1e-9 * scale_info)
-
-
-def test_without_baseline_it_is_the_full_residual():
-    rays = Rays.random(seed=7, moved=0.0)
-    turned = replace(rays, const=np.repeat(rays.state[:, None], 5, axis=1))
-    z = measured(turned, PLAIN)
-    at = (SE3.retract(turned.state, 0.05 * np.eye(6)[1])[:, None], turned.mean, turned.const)
-    model, full = EpipolarRay(PLAIN), CameraRay(PLAIN)
-    np.testing.assert_allclose(model.innovation(z, *at), full.innovation(z, *at), rtol=1e-14)
-    for found, expected in zip(model.jacobians(*at)[:2], full.jacobians(*at)[:2], strict=True):
-        np.testing.assert_allclose(known(found), known(expected), rtol=1e-14)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.particles import Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
@@ -102,15 +101,6 @@ def draw(space, n: int, spread: float, seed: int = 0):
     factor = 0.02 * rng.normal(size=(n, space.dim, space.dim + 1))
     log_weights = np.log(rng.dirichlet(np.ones(n)))
     return Anchored(frames, factor), space.compose(frames, relative), relative, log_weights
-
-
-@every_space
-def test_frames_that_are_known_exactly(space):
-    anchored, state, relative, log_weights = draw(space, 6, 0.1)
-    found = relative_estimate(space, Anchored(anchored.mean, 0.0 * anchored.factor), state, log_weights)
-    expected = mixture_estimate(Prior.exactly(space, relative), None, log_weights)
-    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-12)
-    np.testing.assert_allclose(found.cov, expected.cov, atol=1e-12)
 
 
 @every_space

@@ -52,16 +52,6 @@ def test_chained_motions_over_persistent_features(independent, low, high):
     assert low < np.mean(nees) < high
 
 
-def test_every_draw_comes_from_the_filters_generator(monkeypatch):
-    """Also those of the odometry, between updates."""
-    one, recorded, states = slam(**NEVER), frames(), []
-    monkeypatch.setattr(np.random, "default_rng", None)
-    for frame in recorded:
-        one.take(frame)
-        states.append(one.filter.rng.bit_generator.state["state"]["state"])
-    assert len(set(states[1:])) == 3
-
-
 def test_cameras_that_begin_to_disagree_are_noticed_once(monkeypatch, tmp_path):
     """A twentieth of the matches has a negative disparity from pair 20 on; a checkpoint knows what was said."""
     one, again = slam(**NEVER), slam(**NEVER)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from rbpf.lie import SE3
 from rbpf.validation.consistency.statistic import (
     Statistic,
     coverage,
@@ -16,7 +15,6 @@ from rbpf.validation.consistency.statistic import (
     posterior_ratio,
     step_ratio,
     variance_ratio,
-    whitened_errors,
 )
 
 
@@ -153,16 +151,3 @@ def test_a_map_that_is_turned_is_one_error_however_many_landmarks_it_has():
     assert map_ratio("x", places, 3.0 * own).outcome == "contradicts"
     assert map_ratio("x", places, own).outcome == "supports"
     assert map_ratio("x", places, 2.0 * turned + 0.1 * own).outcome == "leaves open"
-
-
-def test_nees_of_errors_drawn_from_the_covariance_is_six():
-    rng = np.random.default_rng(0)
-    factor = 0.1 * rng.normal(size=(4000, 6, 6))
-    truth = SE3.exp(rng.normal(size=(4000, 6)))
-    cov = factor @ np.swapaxes(factor, 1, 2)
-    drawn = np.einsum("tab,tb->ta", factor, rng.normal(size=(4000, 6)))
-    inverse = SE3.retract(SE3.identity(), drawn)
-    estimate = SE3.compose(truth, SE3.inverse(inverse))
-    errors = whitened_errors(SE3, estimate, cov, truth)
-    assert errors.nees.mean() == pytest.approx(6.0, abs=0.25)
-    assert (errors.ranks == 6).all()
