@@ -37,9 +37,8 @@ class Hypothesis:
     filter: Filter
     log_weight: float = 0.0
     log_odds: dict[int, float] = field(default_factory=dict)  #: that a landmark exists, by name.
-    chosen: list[np.ndarray] = field(
-        default_factory=list
-    )  #: name of every measurement, step by step, where they are kept.
+    #: name of every measurement, step by step, where they are kept.
+    chosen: list[np.ndarray] = field(default_factory=list)
 
     @property
     def map(self) -> JointMap:
