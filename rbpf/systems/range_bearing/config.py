@@ -47,11 +47,11 @@ class RangeBearingConfig:
 
     particles: Count = 100  #: number of particles.
     seed: Seed = 0  #: of the only random generator.
-    #: landmarks named by the log, or by maximum likelihood: in each particle, or of a joint map in each of some hypotheses.
+    #: landmarks named by the log, or by maximum likelihood: in each of some hypotheses (joint map), or in each particle.
     association: Literal["known", "ml"] = "known"
     #: one Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true; or
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles). By default
-    #: (auto) joint, but particles where landmarks have no names or a lag is set.
+    #: (auto) joint, but particles where a lag is set.
     map: Literal["auto", "joint", "particles"] = "auto"
     #: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.
@@ -83,13 +83,12 @@ class RangeBearingConfig:
         """The map of a run, and in one sentence why it is this one."""
         if self.map != "auto":
             return self.map, f"The map is as asked for: map={self.map}."
-        if self.association != "known":
-            why = "landmarks without names are associated in every particle by itself"
-        elif self.lag is not None:
-            why = "a lag asks for the paths of particles"
-        else:
+        if self.lag is None:
             return "joint", "All landmarks and the robot are one Gaussian (map=joint)."
-        return "particles", f"Every particle has its own landmarks (map=particles): {why}."
+        return (
+            "particles",
+            "Every particle has its own landmarks (map=particles): a lag asks for the paths of particles.",
+        )
 
     def of_innovations(self, misread: bool) -> Likelihood:
         """The likelihood of an innovation, where readings may be misread or not."""
