@@ -157,8 +157,7 @@ class LandmarkMap(Map):
             if not weights.any():
                 weights = particles.weights * np.isfinite(self.log_odds(np.array([landmark_id]))[:, 0])
             moments.append(gaussian.mixture_moments(weights / weights.sum(), records.mean[:, 0], records.cov[:, 0]))
-        means, covs = zip(*moments, strict=True) if moments else ((), ())
-        return np.array(means), np.array(covs)
+        return np.array([mean for mean, _ in moments]), np.array([cov for _, cov in moments])
 
     def innovations(
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int

@@ -62,7 +62,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
             held = landmark_map.existing(landmark_id, weights)
             points = relative_points(filter_.space, anchored, landmark_map.read(ids[row : row + 1]))
             moments.append(gaussian.mixture_moments(held / held.sum(), *points))
-        mean, cov = (np.array(part) for part in zip(*moments, strict=True)) if moments else np.zeros((2, 0))
+        mean, cov = np.array([mean for mean, _ in moments]), np.array([cov for _, cov in moments])
     return MapEstimate(ids, mean.reshape(-1, dim), cov.reshape(-1, dim, dim))
 
 
