@@ -16,7 +16,7 @@ says which m̂: by default that of least Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -189,47 +189,34 @@ def reproject(camera: StereoCamera, delta: Array, pixels: Array) -> Reprojection
     return Reprojection(seen, front, by_pixels, slope @ skew(point[..., :3]), -slope, point[..., 3])
 
 
-@dataclass(frozen=True)
-class Innovation:
-    """ν and what goes with it."""
-
-    nu: Array  #: (K, 3), infinite where a point would be behind the camera.
-    cov: Array  #: (K, 3, 3) S.
-    seen: Reprojection  #: g at m̂, and its derivatives.
-
-
-class WhiteRows(NamedTuple):
-    """Innovations, whitened."""
-
-    rows: Array  #: (K, 3, 7) L⁻¹ [ν, −∂g/∂ξ] with S = L Lᵀ; zeros for a point behind the camera.
-    front: np.ndarray  #: (K,) `Reprojection.front`.
-    pixels: Array  #: (K, 3) m̂.
-
-
 def residuals(matches: Matches, delta: Array, points: Points) -> tuple[Array, Array]:
     """Whitened residuals (3K,) and their derivative (3K, 6) by the motion, for least squares (compiled).
 
     Infinite where a point would be behind the camera.
     """
-    found = white_rows(matches, delta, points)
-    if not found.front.all():
+    rows, front, _ = white_rows(matches, delta, points)
+    if not front.all():
         return np.full(3 * len(matches), np.inf), np.zeros((3 * len(matches), 6))
-    flat = found.rows.reshape(-1, 7)
+    flat = rows.reshape(-1, 7)
     return flat[:, 0].copy(), flat[:, 1:].copy()
 
 
 def squared_distances(matches: Matches, delta: Array, points: Points) -> Array:
     """Squared Mahalanobis distances (K,) from a motion, infinite for points behind the camera (compiled)."""
-    found = white_rows(matches, delta, points)
-    return np.where(found.front, np.square(found.rows[..., 0]).sum(axis=-1), np.inf)
+    rows, front, _ = white_rows(matches, delta, points)
+    return np.where(front, np.square(rows[..., 0]).sum(axis=-1), np.inf)
 
 
-def white_rows(matches: Matches, delta: Array, points: Points) -> WhiteRows:
-    """The innovations at a motion, with m̂ as `points` says, whitened (compiled)."""
+def white_rows(matches: Matches, delta: Array, points: Points) -> tuple[Array, np.ndarray, Array]:
+    """The innovations at a motion, with m̂ as `points` says, whitened (compiled).
+
+    Returns:
+        L⁻¹ [ν, −∂g/∂ξ] (K, 3, 7) with S = L Lᵀ, zeros for a point behind the camera; `Reprojection.front` (K,); m̂ (K, 3).
+    """
     from rbpf.motion import stereo_kernels
 
     count = len(matches)
-    found = WhiteRows(np.empty((count, 3, 7)), np.empty(count, dtype=bool), np.empty((count, 3)))
+    found = np.empty((count, 3, 7)), np.empty(count, dtype=bool), np.empty((count, 3))
     stereo_kernels.white_rows(
         homography(matches.camera, delta),
         intrinsics(matches.camera),
@@ -242,12 +229,9 @@ def white_rows(matches: Matches, delta: Array, points: Points) -> WhiteRows:
     return found
 
 
-def linearised(matches: Matches, delta: Array, pixels: Array, points: Points) -> Innovation:
-    """ν at a motion (7,), linearised about m̂ = `pixels` (K, 3)."""
+def linearised(matches: Matches, delta: Array, pixels: Array, points: Points) -> tuple[Array, Reprojection]:
+    """S (K, 3, 3) at a motion (7,), linearised about m̂ = `pixels` (K, 3), and g there with its derivatives."""
     seen = reproject(matches.camera, delta, pixels)
-    off = (seen.by_pixels @ (matches.z_prev - pixels)[..., None])[..., 0]
-    nu = np.where(seen.front[:, None], matches.z_now - seen.pixels - off, np.inf)
-    cov = matches.cov_now
-    if points != "exact":
-        cov = cov + seen.by_pixels @ matches.cov_prev @ seen.by_pixels.mT
-    return Innovation(nu, cov, seen)
+    if points == "exact":
+        return matches.cov_now, seen
+    return matches.cov_now + seen.by_pixels @ matches.cov_prev @ seen.by_pixels.mT, seen

@@ -8,7 +8,8 @@ import math
 import numpy as np
 from numba import njit
 
-from rbpf.kernels.se3 import cross, exp_pair, multiply, turned
+from rbpf.kernels.dense import factor, solve, solve_lower
+from rbpf.kernels.se3 import cross, exp_pair, multiply, turned, unit
 
 STIFFNESS = 1e-9
 """Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open."""
@@ -37,7 +38,8 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
             _innovate(k, pixels, seen, slope, z_prev, z_now, cov_prev, cov_now, noisy, rows, gain, chol)
             if sweep == sweeps or change <= swept:
                 break
-            _solve_cholesky(chol, rows[k, :, 0], gained)
+            gained[:] = rows[k, :, 0]
+            solve(chol, gained)
             change = 0.0
             for i in range(3):
                 moved = z_prev[k, i]
@@ -47,8 +49,11 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
                 pixels[i] = moved
         best[k] = pixels
         if front[k]:
-            _motion_jacobian(camera, pixels, seen, depth, rows[k])
-            _whiten(chol, rows[k])
+            x, y = (seen[0] - camera[2]) * depth / camera[0], (seen[1] - camera[3]) * depth / camera[1]
+            _pixel_jacobian((x, y, depth), (pixels[0] - pixels[2]) / camera[4], seen, camera, rows[k, :, 1:])
+            rows[k, :, 1:] *= -1.0
+            for n in range(7):
+                solve_lower(chol, rows[k, :, n])
         else:
             rows[k] = 0.0
 
@@ -70,7 +75,7 @@ def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
                     miss[i] = z_now[k, i] - _raised(matrix, i, z_prev[k]) / depth
                 squared = 0.0
                 for i in range(3):
-                    part = white[k, i, 0] * miss[0] + white[k, i, 1] * miss[1] + white[k, i, 2] * miss[2]
+                    part = _whitened(white[k], miss, i)
                     squared += part * part
             if squared <= gate:
                 count += 1
@@ -113,45 +118,8 @@ def _innovate(k, pixels, seen, slope, z_prev, z_now, cov_prev, cov_now, noisy, r
             if noisy:
                 for m in range(3):
                     entry += slope[i, m] * gain[m, j]
-            for m in range(j):
-                entry -= chol[i, m] * chol[j, m]
-            chol[i, j] = np.sqrt(entry) if i == j else entry / chol[j, j]
-
-
-@njit(cache=True, error_model="numpy")
-def _solve_cholesky(chol, b, x):
-    # x = (L Lᵀ)⁻¹ b.
-    for i in range(3):
-        x[i] = b[i]
-        for j in range(i):
-            x[i] -= chol[i, j] * x[j]
-        x[i] /= chol[i, i]
-    for i in range(2, -1, -1):
-        for j in range(i + 1, 3):
-            x[i] -= chol[j, i] * x[j]
-        x[i] /= chol[i, i]
-
-
-@njit(cache=True, error_model="numpy")
-def _motion_jacobian(camera, pixels, seen, depth, row):
-    # −∂g/∂ξ into row[:, 1:]: with the slope (a, b, c) of a pixel by the point p, −(slope × [p])  and  ρ · slope.
-    fx, fy, cx, cy, shift = camera[0], camera[1], camera[2], camera[3], camera[4]
-    x, y = (seen[0] - cx) * depth / fx, (seen[1] - cy) * depth / fy
-    nearness = (pixels[0] - pixels[2]) / shift
-    for i in range(3):
-        a, b = (0.0, fy / depth) if i == 1 else (fx / depth, 0.0)
-        c = ((cy if i == 1 else cx) - seen[i]) / depth
-        row[i, 1], row[i, 2], row[i, 3] = c * y - b * depth, a * depth - c * x, b * x - a * y
-        row[i, 4], row[i, 5], row[i, 6] = nearness * a, nearness * b, nearness * c
-
-
-@njit(cache=True, error_model="numpy")
-def _whiten(chol, row):
-    for n in range(row.shape[1]):
-        for i in range(3):
-            for j in range(i):
-                row[i, n] -= chol[i, j] * row[j, n]
-            row[i, n] /= chol[i, i]
+            chol[i, j] = entry
+    factor(chol)
 
 
 @njit(cache=True, error_model="numpy")
@@ -171,7 +139,8 @@ def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motio
             quat, shift = guess
         for _ in range(steps):
             _normal_equations(quat, shift, triple, z_prev, z_now, white, camera, row, vector, info)
-            _solve_normal_equations(info, vector)
+            factor(info)
+            solve(info, vector)
             turn, way = exp_pair((vector[0], vector[1], vector[2]), (vector[3], vector[4], vector[5]))
             way = turned(quat, way)
             quat, shift = multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2])
@@ -228,8 +197,7 @@ def _quat(r):
         q = (xy, 1.0 + 2.0 * r[1, 1] - trace, yz, y)
     else:
         q = (xz, yz, 1.0 + 2.0 * r[2, 2] - trace, z)
-    length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return q[0] / length, q[1] / length, q[2] / length, q[3] / length
+    return unit(q[0], q[1], q[2], q[3])
 
 
 @njit(cache=True, error_model="numpy")
@@ -306,21 +274,3 @@ def _pixel_jacobian(point, nearness, seen, camera, row):
         row[i, 0], row[i, 1] = b * point[2] - c * point[1], c * point[0] - a * point[2]
         row[i, 2] = a * point[1] - b * point[0]
         row[i, 3], row[i, 4], row[i, 5] = -nearness * a, -nearness * b, -nearness * c
-
-
-@njit(cache=True, error_model="numpy")
-def _solve_normal_equations(matrix, vector):
-    """Replaces a vector (6,) by the solution, and the lower triangle of a definite matrix (6, 6) by its factor."""
-    for a in range(6):
-        for b in range(a + 1):
-            rest = matrix[a, b]
-            for c in range(b):
-                rest -= matrix[a, c] * matrix[b, c]
-            matrix[a, b] = math.sqrt(rest) if a == b else rest / matrix[b, b]
-        for b in range(a):
-            vector[a] -= matrix[a, b] * vector[b]
-        vector[a] /= matrix[a, a]
-    for a in range(5, -1, -1):
-        for b in range(a + 1, 6):
-            vector[a] -= matrix[b, a] * vector[b]
-        vector[a] /= matrix[a, a]

@@ -20,15 +20,7 @@ from rbpf.lie import SE3, Array
 from rbpf.motion.least_squares import Minimum, Rule, minimise
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_consensus import RansacConfig, consensus
-from rbpf.motion.stereo_geometry import (
-    Innovation,
-    Matches,
-    Points,
-    linearised,
-    residuals,
-    squared_distances,
-    white_rows,
-)
+from rbpf.motion.stereo_geometry import Matches, Points, linearised, residuals, squared_distances, white_rows
 from rbpf.ranges import Formerly, Positive, Range, Ranged
 
 ROUNDS = 5
@@ -125,10 +117,10 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
 
     (K, 6, 3) of the earlier pixels and (K, 6, 3) of the later ones, in the right chart at the estimate.
     """
-    pixels = white_rows(matches, motion.delta, "adjusted").pixels if config.points == "adjusted" else matches.z_prev
-    found = linearised(matches, motion.delta, pixels, config.points)
-    slope = found.seen.by_motion
-    by_score = np.linalg.solve(found.cov, slope)
+    pixels = white_rows(matches, motion.delta, "adjusted")[2] if config.points == "adjusted" else matches.z_prev
+    cov_nu, seen = linearised(matches, motion.delta, pixels, config.points)
+    slope = seen.by_motion
+    by_score = np.linalg.solve(cov_nu, slope)
     # K with K I Kᵀ = cov, where the estimate is its matches' alone, and K = cov in directions in which a prior has its say.
     # What the gate costs is in the covariance, not in the gains: of noise in two estimates both cut off their part.
     cov = motion.cov if config.points == "exact" else motion.cov / trimming(config.gate)
@@ -137,7 +129,7 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
     half = root @ axes
     later = half / np.sqrt(np.maximum(values, 1.0)) @ half.T @ by_score.mT
     # The paper's earlier points have no noise.
-    return np.zeros_like(later) if config.points == "exact" else -later @ found.seen.by_pixels, later
+    return np.zeros_like(later) if config.points == "exact" else -later @ seen.by_pixels, later
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
@@ -146,7 +138,7 @@ def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
         return _minimum(matches, start, config.points, config.rule)
     for _ in range(REWEIGHTED):
         # S as it is at the last motion takes the place of R, and stays while the motion is sought.
-        weighted = replace(matches, cov_now=linearised(matches, start, matches.z_prev, "propagated").cov)
+        weighted = replace(matches, cov_now=linearised(matches, start, matches.z_prev, "propagated")[0])
         found = _minimum(weighted, start, "exact", config.rule)
         start = found.x
     return found
@@ -172,7 +164,12 @@ def _refined(matches: Matches, plausible: np.ndarray, motion: Array, start: Arra
     if not found.converged:
         return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations")
     rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
-    return MotionEstimate(motion, _covariance(part, found, config), inliers, float(rms))
+    cov = found.cov
+    if config.points == "adjusted":
+        cov = _consistent_covariance(part, motion, found.factor)
+    if config.points != "exact":
+        cov = trimming(config.gate) * cov
+    return MotionEstimate(motion, cov, inliers, float(rms))
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
@@ -186,18 +183,8 @@ def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:
     return MotionEstimate(start, np.full((6, 6), np.nan), nobody, float("nan"), why)
 
 
-def _covariance(matches: Matches, found: Minimum[Array], config: VoConfig) -> Array:
-    if config.points == "exact":
-        return found.cov
-    if config.points == "propagated":
-        return trimming(config.gate) * found.cov
-    pixels = white_rows(matches, found.x, "adjusted").pixels
-    adjusted = linearised(matches, found.x, pixels, "adjusted")
-    return trimming(config.gate) * _consistent_covariance(matches, adjusted, found.factor)
-
-
-def _consistent_covariance(matches: Matches, found: Innovation, factor: Array) -> Array:
-    """Covariance (6, 6) of a motion, in the right chart there; `factor` is F with F Fᵀ = I⁻¹.
+def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Array:
+    """Covariance (6, 6) of a motion (7,), in the right chart there; `factor` is F with F Fᵀ = I⁻¹.
 
     (JᵀS⁻¹J)⁻¹ at the solution is the usual answer, and too small where points are far: the translation's derivative is
     proportional to the inverse depth ρ̂, and the square of a noisy ρ̂ is larger than that of the true one by var ρ̂, on
@@ -208,11 +195,11 @@ def _consistent_covariance(matches: Matches, found: Innovation, factor: Array) -
         cov = (I − D)⁻¹ I (I − D)⁻¹,    Mathematics (vo-covariance).
     """
     # ρ = (u_left − u_right) / (f b), of the pixels m̂: cov m̂ = R⁻ − R⁻Aᵀ S⁻¹ A R⁻.
-    seen = found.seen
+    cov, seen = linearised(matches, motion, white_rows(matches, motion, "adjusted")[2], "adjusted")
     shift = matches.camera.camera.fx * matches.camera.baseline_m
     across = matches.cov_prev @ (np.array([1.0, 0.0, -1.0]) / shift)
     gain = seen.by_pixels @ across[..., None]
-    solved = np.linalg.solve(found.cov, np.concatenate([gain, seen.by_scaled_translation], axis=-1))
+    solved = np.linalg.solve(cov, np.concatenate([gain, seen.by_scaled_translation], axis=-1))
     variance = (across[:, 0] - across[:, 2]) / shift - (gain * solved[..., :1]).sum(axis=(1, 2))
     # D is zero but for the translation.
     d = np.zeros((6, 6))

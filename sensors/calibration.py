@@ -22,7 +22,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import skew
-from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera import LENSES, Pinhole
 from rbpf.sensors.features.interface import checked_image
 from rbpf.sensors.readers.known_points import KnownPixels
 
@@ -234,20 +234,8 @@ OUTLYING = 4.0
 """Views whose error is this many times the median one are left out, and …"""
 HARMLESS_PX = 0.3
 """… those with less than this are not."""
-MODELS = {
-    "radial-tangential": (
-        (0, ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
-        (2, ("CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
-        (4, ("CALIB_FIX_K3",)),
-        (5, ()),
-    ),
-    "equidistant": (
-        (0, ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_FIX_K4")),
-        (2, ("CALIB_FIX_K3", "CALIB_FIX_K4")),
-        (4, ()),
-    ),
-}
-"""Of each kind of lens: numbers of coefficients, and what OpenCV is asked to leave at zero."""
+COUNTS = {"radial-tangential": (0, 2, 4, 5), "equidistant": (0, 2, 4)}
+"""Of each kind of lens: how many of its coefficients, the first ones, may be needed."""
 
 
 class BoardView(NamedTuple):
@@ -313,8 +301,8 @@ def calibrate(
             )
         # The model of distortion with the least information criterion.
         scores, fits = [], []
-        for count, fixed in MODELS[model]:
-            fit = _fitted(used, board, (width, height), model, fixed)
+        for count in COUNTS[model]:
+            fit = _fitted(used, board, (width, height), model, count)
             numbers, parameters = fit.residuals.size, 4 + count + 6 * len(used)
             mean_square = max(float(np.square(fit.residuals).mean()), np.finfo(float).tiny)
             scores.append(numbers * np.log(mean_square) + parameters * np.log(numbers))
@@ -335,17 +323,19 @@ def calibrate(
 
 
 def _fitted(
-    views: Sequence[BoardView], board: Board, size: tuple[int, int], model: str, fixed: Sequence[str]
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], model: str, count: int
 ) -> BoardCalibration:
-    """The camera of least squared error, where OpenCV leaves at zero what the flags `fixed` name.
+    """The camera of least squared error, whose lens has so many coefficients; the others are zero.
 
     Raises:
         InputError: OpenCV finds none, or what it finds is no camera.
     """
     import cv2
 
-    corners, px = board.corners, np.array([view.px for view in views])
-    flags = sum(getattr(cv2, name) for name in fixed)
+    corners, px, names = board.corners, np.array([view.px for view in views]), LENSES[model].coefficient_names
+    # The tangential coefficients, p1 and p2, are one thing to OpenCV.
+    flags = sum(getattr(cv2, f"CALIB_FIX_{name.upper()}") for name in names[count:] if name.startswith("k"))
+    flags |= cv2.CALIB_ZERO_TANGENT_DIST if "p1" in names[count:] else 0
     try:
         if model == "equidistant":
             flags |= cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
@@ -371,8 +361,7 @@ def _fitted(
     rotations = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
     places = corners @ rotations.mT + np.array(shifts).reshape(-1, 1, 3)
     if std is None:
-        free = [f"CALIB_FIX_{name.upper()}" not in fixed for name in camera.lens.coefficient_names]
-        std = _deviations(camera, places, px, np.array([True] * 4 + free))
+        std = _deviations(camera, places, px, np.arange(4 + len(names)) < 4 + count)
     return BoardCalibration(camera, std, tuple(views), px - camera.project(places), rotations[..., 2])
 
 

@@ -69,7 +69,7 @@ def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> Des
     if limits.mutual and kept.size:
         preferred = (first @ second[where[kept]].T).argmax(axis=0)
         kept = kept[preferred == kept]
-    return one_each(_chosen(kept, where[kept], product[kept]))
+    return one_each(kept, where[kept], product[kept])
 
 
 def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,8 +98,13 @@ def match_pairs(
     """Matches descriptors (K, d) with descriptors (M, d) where only pairs (C,), (C,) of their rows are possible, each once."""
     k, m = pairs
     if not k.size:
-        return _chosen(k, m, np.zeros(0))
-    products = _products(first, second, k, m)
+        return one_each(k, m, np.zeros(0))
+    # All at once by a matrix product where the pairs are many, else one by one.
+    if k.size * GATHERED > first.shape[0] * second.shape[0]:
+        products = (first @ second.T)[k, m]
+    else:
+        parts = [slice(start, start + PAIRS) for start in range(0, k.size, PAIRS)]
+        products = np.concatenate([np.einsum("cd,cd->c", first[k[part]], second[m[part]]) for part in parts])
     best = np.full(first.shape[0], -np.inf, dtype=np.float32)
     np.maximum.at(best, k, products)
     top = _first_of(k, np.flatnonzero(products == best[k]))
@@ -110,7 +115,7 @@ def match_pairs(
         wanted = np.full(second.shape[0], -np.inf, dtype=np.float32)
         np.maximum.at(wanted, m, products)
         top = top[products[top] == wanted[m[top]]]
-    return one_each(_chosen(k[top], m[top], products[top]))
+    return one_each(k[top], m[top], products[top])
 
 
 def within(best: np.ndarray, next_best: np.ndarray, limits: MatchLimits, length: int) -> np.ndarray:
@@ -126,28 +131,17 @@ def distances(products: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(2.0 - 2.0 * products.astype(np.float64), 0.0))
 
 
-def one_each(matches: DescriptorMatches) -> DescriptorMatches:
-    """Of matches that share a row of the second set the nearest, of equally near ones the first."""
+def one_each(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> DescriptorMatches:
+    """Of pairs (P,), (P,) that share a row of the second set the nearest, of equally near ones the first."""
+    matches = DescriptorMatches(first, second, distances(products))
     order = np.lexsort((matches.distance, matches.second))
     return matches.take(np.sort(_first_of(matches.second, order)))
-
-
-def _products(first: np.ndarray, second: np.ndarray, k: np.ndarray, m: np.ndarray) -> np.ndarray:
-    """Of the descriptors of pairs (C,): all at once by a matrix product where the pairs are many, else one by one."""
-    if k.size * GATHERED > first.shape[0] * second.shape[0]:
-        return (first @ second.T)[k, m]
-    parts = [slice(start, start + PAIRS) for start in range(0, k.size, PAIRS)]
-    return np.concatenate([np.einsum("cd,cd->c", first[k[part]], second[m[part]]) for part in parts])
 
 
 def _first_of(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Of the rows those at which a value occurs first."""
     _, first = np.unique(values[rows], return_index=True)
     return np.asarray(rows[first])
-
-
-def _chosen(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> DescriptorMatches:
-    return DescriptorMatches(first, second, distances(products))
 
 
 def band_pairs(first: np.ndarray, second: np.ndarray, reach: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:

@@ -103,8 +103,7 @@ class FeatureLog:
             where = f"frame {index} of {self.name}"
             stamp_ns: object = frame.stamp_ns
             if not isinstance(stamp_ns, Integral):
-                problem = f"stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}"
-                raise InputError(f"{where}: {problem}")
+                raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
             _check_names(where, "landmarks", "K", frame.landmarks)
             shape = (len(frame.landmarks), self.camera.dim)
             _check_numbers(where, "z", frame.z, shape)
@@ -118,15 +117,6 @@ class FeatureLog:
     def stamps_ns(self) -> np.ndarray:
         """(T,) int64 times of the frames."""
         return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
-
-    def outside(self, margin_px: float = 0.0) -> np.ndarray:
-        """Measurements that are not in the image, or nearer than `margin_px` to its border: (F, 2) frame and row of its `z`.
-
-        A log may hold them, because a predicted or noisy pixel can be there: the caller drops or refuses them.
-        """
-        rows = (np.flatnonzero(~self.camera.inside(frame.z, margin_px)) for frame in self.frames)
-        found = [(index, int(row)) for index, outside in enumerate(rows) for row in outside]
-        return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
 def _check_whole(where: str, what: str, letter: str, values: np.ndarray) -> None:

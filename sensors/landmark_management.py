@@ -52,6 +52,7 @@ class LandmarkManager:
         """Frames so far."""
         self.next_name = 0
         self._table = np.zeros((0, 3), dtype=np.int64)
+        """Of each descriptor held its name, how often it was seen, and the frame in which it was seen last."""
 
     @property
     def names(self) -> np.ndarray:
@@ -64,11 +65,6 @@ class LandmarkManager:
         return self._table[:, 1]
 
     @property
-    def last_observed(self) -> np.ndarray:
-        """(M,) frame in which each was seen last."""
-        return self._table[:, 2]
-
-    @property
     def confirmed(self) -> np.ndarray:
         """(M,) whether each is a landmark."""
         return self.observations >= self.config.observations
@@ -79,7 +75,7 @@ class LandmarkManager:
         self.frame += 1
         self._table[rows, 1] += 1
         self._table[rows, 2] = self.frame
-        overdue = ~self.confirmed & (self.frame - self.last_observed >= self.config.patience)
+        overdue = ~self.confirmed & (self.frame - self._table[:, 2] >= self.config.patience)
         dropped = self.names[overdue].copy()
         self._table = self._table[~overdue]
         return dropped

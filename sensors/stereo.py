@@ -18,7 +18,7 @@ Without the refinement both places have their own error, and cov = σ_p² I.
 """
 
 from dataclasses import dataclass, field, fields
-from typing import Annotated, NamedTuple, final
+from typing import Annotated, final
 
 import numpy as np
 
@@ -267,8 +267,8 @@ class StereoMatcher:
         config = self.config
         if not (config.refine and u.size):
             return np.ones(u.size, dtype=bool), u
-        found = refine(*images, px, u, config.half_px)
-        return (np.abs(found.u - u) <= config.shift_px) & (found.correlation >= config.least_correlation), found.u
+        found, correlation = refine(*images, px, u, config.half_px)
+        return (np.abs(found - u) <= config.shift_px) & (correlation >= config.least_correlation), found
 
     def noise(self, scale: np.ndarray) -> np.ndarray:
         """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""
@@ -291,7 +291,13 @@ class StereoMatcher:
         near &= np.abs(np.log(left.scale[k] / right.scale[m])) <= np.log(config.scale_ratio)
         near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
         pairs = k[near], m[near]
-        return one_per_place(match_pairs(left.descriptors, right.descriptors, pairs, config.limits), left, right)
+        matches = match_pairs(left.descriptors, right.descriptors, pairs, config.limits)
+        # Of those that share their place in an image the nearest descriptors, in the order of the first.
+        order = np.argsort(matches.distance, kind="stable")
+        for keypoints, rows in ((left, matches.first), (right, matches.second)):
+            _, first = np.unique(keypoints.px[rows[order]], axis=0, return_index=True)
+            order = order[np.sort(first)]
+        return matches.take(np.sort(order))
 
     def check(self, left: np.ndarray, right: np.ndarray) -> None:
         """Refuses images that these cameras cannot have taken.
@@ -300,21 +306,11 @@ class StereoMatcher:
             InputError: they are no (H, W) uint8, or not of the camera's size.
         """
         left, right, camera = checked_image(left), checked_image(right), self.rig.camera
-        sizes = [f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right)]
-        if sizes[0] != sizes[1]:
-            found = " and ".join(sizes)
-            raise InputError(f"left and right image must be of one size, got {found}: give a rectified pair")
+        one, other = (f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))
+        if one != other:
+            raise InputError(f"left and right image must be of one size, got {one} and {other}: give a rectified pair")
         if left.shape != (camera.height, camera.width):
-            raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {sizes[0]}")
-
-
-def one_per_place(matches: DescriptorMatches, left: Features, right: Features) -> DescriptorMatches:
-    """Of matches whose keypoints share their place in an image those of the nearest descriptors, in the order of the first."""
-    order = np.argsort(matches.distance, kind="stable")
-    for keypoints, rows in ((left, matches.first), (right, matches.second)):
-        _, first = np.unique(keypoints.px[rows[order]], axis=0, return_index=True)
-        order = order[np.sort(first)]
-    return matches.take(np.sort(order))
+            raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {one}")
 
 
 ITERATIONS = 5
@@ -324,20 +320,16 @@ LONGEST_PX = 1.0
 _TINY = 1e-9
 
 
-@final
-class SubpixelMatches(NamedTuple):
-    """Places in the right image."""
-
-    u: np.ndarray  #: (K,) column there, px; NaN where a window reaches beyond its image.
-    correlation: np.ndarray  #: (K,) of the two windows, normalised, −1 to 1; 0 where there is no u or no texture.
-
-
 def refine(
     left: np.ndarray, right: np.ndarray, px: np.ndarray, u_right: np.ndarray, half_px: int = 5
-) -> SubpixelMatches:
+) -> tuple[np.ndarray, np.ndarray]:
     """Refines columns u_right (K,), good to a pixel or two, at which places px (K, 2) of the left image are in the right one.
 
     The window has 2 half_px + 1 pixels along each side; images are (H, W) uint8.
+
+    Returns:
+        Columns (K,), NaN where a window reaches beyond its image; the normalised correlation (K,) of the two windows, −1 to 1,
+        0 where there is no column or no texture.
     """
     u, v = u_right.astype(float), px[:, 1]
     template = _centred(_windows(left, px[:, 0], v, half_px, half_px))
@@ -353,7 +345,7 @@ def refine(
     window = _centred(_windows(right, u, v, half_px, half_px))
     correlation = _dot(template, window) / np.sqrt(energy * np.maximum(_dot(window, window), _TINY))
     whole = _inside(left, px[:, 0], v, half_px) & _inside(right, u, v, half_px)
-    return SubpixelMatches(np.where(whole, u, np.nan), np.where(whole, correlation, 0.0))
+    return np.where(whole, u, np.nan), np.where(whole, correlation, 0.0)
 
 
 def _windows(image: np.ndarray, u: np.ndarray, v: np.ndarray, high: int, wide: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from numba import boolean, int64, njit, types
 
 from rbpf.kernels.block import flat
-from rbpf.kernels.se3 import rotation
+from rbpf.kernels.se3 import cross, rotation
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
 from rbpf.sensors.camera.distortion import NEAR
 
@@ -340,15 +340,10 @@ def _coefficients(square):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _cross(a, b):
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def _turned(k1, k2, w, x):
     """The sum x + k1 ω × x + k2 ω × (ω × x)."""
-    once = _cross(w, x)
-    twice = _cross(w, once)
+    once = cross(w, x)
+    twice = cross(w, once)
     return (
         x[0] + k1 * once[0] + k2 * twice[0],
         x[1] + k1 * once[1] + k2 * twice[1],
@@ -359,13 +354,13 @@ def _turned(k1, k2, w, x):
 @njit(cache=True, error_model="numpy", inline="always")
 def _by_turn(g, k1, k2, d1, d2, w, x):
     """gᵀ ∂/∂ω of `_turned`, where k1 and k2 change by d1 ω and d2 ω."""
-    once = _cross(w, x)
-    twice = _cross(w, once)
+    once = cross(w, x)
+    twice = cross(w, once)
     along = d1 * (g[0] * once[0] + g[1] * once[1] + g[2] * once[2])
     along += d2 * (g[0] * twice[0] + g[1] * twice[1] + g[2] * twice[2])
-    first = _cross(x, g)
-    second = _cross(once, g)
-    third = _cross(x, _cross(g, w))
+    first = cross(x, g)
+    second = cross(once, g)
+    third = cross(x, cross(g, w))
     return (
         k1 * first[0] + k2 * (second[0] + third[0]) + along * w[0],
         k1 * first[1] + k2 * (second[1] + third[1]) + along * w[1],

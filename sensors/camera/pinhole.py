@@ -47,8 +47,7 @@ class Pinhole:
         for name in ("width", "height"):
             size = getattr(self, name)
             if isinstance(size, bool) or not isinstance(size, Integral) or int(size) <= 0:
-                expected = "must be a positive whole number of pixels"
-                raise InputError(f"the camera's {name} {expected}, got {size!r}")
+                raise InputError(f"the camera's {name} must be a positive whole number of pixels, got {size!r}")
         for name in ("fx", "fy", "cx", "cy"):
             _check_finite(f"the camera's {name}", getattr(self, name))
         if not (self.fx > 0.0 and self.fy > 0.0):

@@ -7,7 +7,6 @@ c = Rᵀ(x − w t), moves by −ω × c − w v. Where the state holds more tha
 """
 
 from abc import abstractmethod
-from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -257,9 +256,9 @@ class MembersView(PointsView):
         super().__init__(camera, places.size)
         self.places = places
         self._point = CameraPoint(camera)
+        self._params = np.concatenate([camera.params, places])
 
     def in_world(self, landmark: Array, const: Given) -> Array:
-        """The points (…, m, 3) in the world."""
         points = landmark.reshape(*landmark.shape[:-1], -1, 3)
         return np.asarray(points[..., self.places, :])
 
@@ -277,11 +276,6 @@ class MembersView(PointsView):
 
         return FusedKernel(members_view, self._params)
 
-    @cached_property
-    def _params(self) -> Array:
-        """The camera's, then which points: asked for several times in a step."""
-        return np.concatenate([self.camera.params, self.places])
-
 
 @final
 class ConstellationView(PointsView):
@@ -293,9 +287,9 @@ class ConstellationView(PointsView):
     def __init__(self, camera: Pinhole, points: Array) -> None:
         super().__init__(camera, points.shape[0])
         self.points = points
+        self._params = np.concatenate([camera.params, points.ravel()])
 
     def in_world(self, landmark: Array, const: Given) -> Array:
-        """The points (…, m, 3) in the world."""
         assert const is not None
         return SE3.transform(SE3.retract(const, landmark)[..., None, :], self.points)
 
@@ -316,8 +310,3 @@ class ConstellationView(PointsView):
         from rbpf.sensors.camera.kernels import constellation_view
 
         return FusedKernel(constellation_view, self._params)
-
-    @cached_property
-    def _params(self) -> Array:
-        """The camera's, then (x, y, z) of each point: asked for several times in a step."""
-        return np.concatenate([self.camera.params, self.points.ravel()])

@@ -13,6 +13,7 @@ two descriptors the Bhattacharyya coefficient of two histograms (R. ArandjeloviÄ
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -47,13 +48,12 @@ class Sift(FeatureExtractor, Descriptor):
     def __init__(self, config: SiftConfig | None = None) -> None:
         self.config = config or SiftConfig()
         self.length = self.config.length
-        self._opencv: Any = None
 
     def extract(self, image: np.ndarray) -> Features:
         """A place with two strong directions is two keypoints."""
         config = self.config
         reduced = self._reduced(image)
-        found, histograms = self._sift().detectAndCompute(reduced, None)
+        found, histograms = self._sift.detectAndCompute(reduced, None)
         if not found:
             return Features(*_NONE, np.zeros((0, config.length), dtype=np.float32))
         table = np.array([(*p.pt, p.size, p.angle, p.response) for p in found])
@@ -80,7 +80,7 @@ class Sift(FeatureExtractor, Descriptor):
         size = 2.0 * config.working_scale * keypoints.scale
         degrees = np.rad2deg(keypoints.orientation) % 360.0
         places = [cv2.KeyPoint(*place) for place in np.column_stack([px, size, degrees]).tolist()]
-        _, histograms = self._sift().compute(reduced, places)
+        _, histograms = self._sift.compute(reduced, places)
         return descriptors_from_histograms(histograms, config.length, config.norm)
 
     def _reduced(self, image: np.ndarray) -> np.ndarray:
@@ -91,14 +91,13 @@ class Sift(FeatureExtractor, Descriptor):
 
         return cv2.resize(image, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)
 
+    @cached_property
     def _sift(self) -> Any:
-        if self._opencv is None:
-            import cv2
+        import cv2
 
-            config = self.config
-            # Without the precise scaling every pixel is a quarter off.
-            self._opencv = cv2.SIFT.create(config.features, config.layers, config.contrast, config.edge, _SIGMA, True)
-        return self._opencv
+        config = self.config
+        # Without the precise scaling every pixel is a quarter off.
+        return cv2.SIFT.create(config.features, config.layers, config.contrast, config.edge, _SIGMA, True)
 
 
 _NONE = np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0)

@@ -183,15 +183,8 @@ def levels(part, padding):
 
     Their mean is taken off: a template without mean does not feel it, and rounding comes down.
     """
-    total = np.int64(0)
-    for y in range(part.shape[0]):
-        for x in range(part.shape[1]):
-            total += np.int64(part[y, x])
-    middle = np.float32(total // part.size)
     grey = np.zeros((part.shape[0], part.shape[1] + padding), np.float32)
-    for y in range(part.shape[0]):
-        for x in range(part.shape[1]):
-            grey[y, x] = np.float32(part[y, x]) - middle
+    grey[:, : part.shape[1]] = part.astype(np.float32) - np.float32(np.int64(part.sum()) // part.size)
     return grey
 
 
@@ -374,11 +367,7 @@ def search_one(image, template, centre, cov, limits, found):
         return
     scores = np.full((height, width), OUTSIDE, np.float32)
     score_ellipse(image, unit, template.shape[0], centre, cov, limits[0], columns, rows, scores)
-    v, u, highest = 0, 0, scores[0, 0]
-    for y in range(height):
-        for x in range(width):
-            if scores[y, x] > highest:
-                v, u, highest = y, x, scores[y, x]
+    v, u = divmod(scores.argmax(), width)
     if scores[v, u] <= -1.0:
         return
     found[2] = scores[v, u]

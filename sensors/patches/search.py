@@ -129,8 +129,7 @@ def search(
         expected = f"centres ({count}, 2) and covs ({count}, 2, 2), one for each template"
         raise InputError(f"a search needs {expected}, got {centres.shape} and {covs.shape}")
     if not (0.0 < limits[0] < np.inf and limits[1] >= 0.0):
-        given = f"{limits[0]!r} and {limits[1]!r}"
-        raise InputError(f"sigmas must be positive and most_px not negative, got {given}")
+        raise InputError(f"sigmas must be positive and most_px not negative, got {limits[0]!r} and {limits[1]!r}")
     found = np.full((count, 7), np.nan)
     found[:, 2:4] = -1.0
     # What it costs, in the unit of `rbpf.kernels.signature`.

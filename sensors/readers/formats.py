@@ -32,7 +32,7 @@ def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
     Raises:
         InputError: nothing is there, it is of no known format, or a file of it is malformed.
     """
-    path = _existing(path, "a robot log")
+    path = existing(path, "a robot log")
     for one in ROBOT_LOGS:
         if one.recognises(path):
             return one.read(path, noise or LogNoise())
@@ -56,7 +56,7 @@ def open_images(
             is malformed; a topic is named that is not there.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics)
-    return _opened(_existing(path, "an image sequence"), options, part, stereo=False)
+    return _opened(existing(path, "an image sequence"), options, part, stereo=False)
 
 
 def open_stereo(
@@ -85,7 +85,7 @@ def open_stereo(
             is zero, or the right camera is not to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
-    return _opened(_existing(path, "a stereo sequence"), options, part, stereo=True)
+    return _opened(existing(path, "a stereo sequence"), options, part, stereo=True)
 
 
 def _opened(path: Path, options: ReadOptions, part: Part, stereo: bool) -> ImageSequence:
@@ -105,7 +105,8 @@ def _opened(path: Path, options: ReadOptions, part: Part, stereo: bool) -> Image
     raise InputError(f"{path}: found {_content(path)}, expected {kinds}.")
 
 
-def _existing(path: str | Path, what: str) -> Path:
+def existing(path: str | Path, what: str) -> Path:
+    """The path of a recording; an InputError where nothing is there, which says what was expected."""
     path = Path(path)
     try:
         path.stat()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_lines
+from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted
 
 COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
 
@@ -53,8 +53,7 @@ def read_known_points(path: str | Path) -> KnownPixels:
         InputError: the file is missing, a column is, or a line is not as described above.
     """
     path = Path(path)
-    numbered = enumerate(read_lines(path, f"a table with the columns {', '.join(COLUMNS)}"), 1)
-    rows = [(i, line) for i, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+    rows = numbered_lines(path, f"a table with the columns {', '.join(COLUMNS)}")
     line, header = rows[0] if rows else (1, "")
     names = [name.strip() for name in header.split(",")]
     if any(names.count(column) != 1 for column in COLUMNS):
@@ -64,8 +63,7 @@ def read_known_points(path: str | Path) -> KnownPixels:
     for i, row in rows[1:]:
         fields = row.split(",")
         if len(fields) != len(names):
-            problem = f"expected {len(names)} columns as in the header, found {len(fields)}"
-            raise line_error(path, i, problem)
+            raise line_error(path, i, f"expected {len(names)} columns as in the header, found {len(fields)}")
         picked.append((i, ",".join(fields[names.index(column)] for column in COLUMNS)))
     table = parse_table(path, COLUMNS, picked, ",")
     table.require(table["sigma_m"] >= 0.0, "sigma_m", "zero or positive")

@@ -29,10 +29,10 @@ A clock that is set back by more is refused. Scans that turn against the odometr
 import logging
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
@@ -40,9 +40,10 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.ranges import Positive, Ranged
 from rbpf.sensors.laser import LaserLog, Scanner
-from rbpf.sensors.readers.images.bag import SUFFIXES, Bag, opened
+from rbpf.sensors.readers.formats import existing
+from rbpf.sensors.readers.images.bag import SUFFIXES, Bag, numbers_of, opened
 from rbpf.sensors.readers.part import WHOLE, Part
-from rbpf.sensors.readers.text import line_error, parse_number, parse_time, quoted, read_lines
+from rbpf.sensors.readers.text import line_error, numbered_lines, parse_number, parse_time, quoted
 
 SCANNERS = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER", "ROBOTLASER2", "RAWLASER2")
 """Messages of a CARMEN log that hold scans; the first that a log has is read where none is named."""
@@ -75,25 +76,24 @@ class LaserOptions(Ranged):
     part: Part = WHOLE  #: which of its scans.
 
 
-class ScanOfFile(NamedTuple):
-    """One scan as it stands in a file."""
-
-    place: str  #: where, for messages.
-    stamp_ns: int
-    ranges: Array  #: (B,)
-    odometry: Array | None  #: (E,) world_from_robot.
-
-
-@dataclass
+@dataclass(frozen=True)
 class ScansOfFile:
-    """All scans of one scanner, in the order of the file."""
+    """All scans of one scanner, S of them, in the order of the file."""
 
     angles: Array  #: (B,) of the beams, from one side to the other.
-    min_range_m: float
-    max_range_m: float | None  #: None where the log does not say.
+    places: np.ndarray  #: (S,) where each stands in the file, in words.
+    stamps_ns: np.ndarray  #: (S,) int64.
+    ranges: Array  #: (S, B).
+    odometry: Array | None = None  #: (S, E) world_from_robot.
+    min_range_m: float = 0.0
+    max_range_m: float | None = None  #: None where the log does not say.
     robot_from_sensor: Array = field(default_factory=SE2.identity)  #: (E,).
     upside_down: bool = False
-    scans: list[ScanOfFile] = field(default_factory=list)
+
+    def take(self, rows: np.ndarray) -> Self:
+        """Some of the scans."""
+        kept = {name: getattr(self, name)[rows] for name in ("places", "stamps_ns", "ranges")}
+        return replace(self, **kept, odometry=None if self.odometry is None else self.odometry[rows])
 
 
 class LaserFormat(ABC):
@@ -122,20 +122,24 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
         InputError: nothing is there, a line is not as described (it is named), there are no scans or none of the scanner
             that is asked for, all are outside of the part, or the clock runs backwards.
     """
-    path, options = Path(path), options or LaserOptions()
-    try:
-        path.stat()
-    except (OSError, ValueError):
-        raise InputError(f"{path}: no such file or folder; expected {_kinds()}.") from None
+    kinds, options = "; or ".join(one.kind for one in LASERS), options or LaserOptions()
+    path = existing(path, kinds)
     found = next((one for one in LASERS if one.recognises(path)), None)
     if found is None:
-        raise InputError(f"{path}: found a folder, expected {_kinds()}.")
+        raise InputError(f"{path}: found a folder, expected {kinds}.")
     read = found.read(path, options)
-    scans = _in_order(path, read.scans)
-    stamps_ns = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
-    rows = options.part.rows((stamps_ns - stamps_ns[0]) * 1e-9, f"{path}: no scan is left")
+    # In order of time; those that come a little late are left out.
+    late_ns = np.maximum.accumulate(read.stamps_ns)[:-1] - read.stamps_ns[1:]
+    if (far := np.flatnonzero(late_ns > LATE_NS)).size:
+        problem = f"the time runs backwards by {late_ns[far[0]] * 1e-9:.3f} s, expected scans in order of time"
+        raise InputError(f"{path}, {read.places[far[0] + 1]}: {problem}.")
+    if left := int((late_ns >= 0).sum()):
+        _log.warning("%s: left out %d scans whose time is not after that of the scan before.", path, left)
+        read = read.take(np.flatnonzero(np.append(True, late_ns < 0)))
+    after_s = (read.stamps_ns - read.stamps_ns[0]) * 1e-9
+    read = read.take(options.part.rows(after_s, f"{path}: no scan is left"))
     # What a range means: too near, a wall, nothing.
-    ranges = np.stack([scan.ranges for scan in scans])[rows]
+    ranges = read.ranges
     longest = ranges[np.isfinite(ranges)].max(initial=0.0)
     millimetres = _MILLIMETRES_M[0] <= longest < _MILLIMETRES_M[1]
     max_range_m = options.max_range_m or read.max_range_m or (_MILLIMETRES_M[0] if millimetres else _FAR_M)
@@ -149,34 +153,19 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
         scanner = Scanner(angles, read.min_range_m, max_range_m, read.robot_from_sensor)
     except InputError as error:
         raise InputError(f"{path}: {error}; give the greatest range that counts.") from None
-    odometry = None
-    poses = [scan.odometry for scan in scans if scan.odometry is not None]
-    if poses:
-        odometry = SE2.normalise(np.stack(poses))[rows]
+    odometry = None if read.odometry is None else SE2.normalise(read.odometry)
     whole = path.resolve()
     name = whole.name if whole.is_dir() else whole.name.removesuffix(".gz").rpartition(".")[0] or whole.name
-    log = LaserLog(name, scanner, stamps_ns[rows], ranges, odometry)
+    log = LaserLog(name, scanner, read.stamps_ns, ranges, odometry)
     _tell_mirrored(path, log)
     return log
 
 
-def _kinds() -> str:
-    return "; or ".join(one.kind for one in LASERS)
-
-
-def _in_order(path: Path, scans: list[ScanOfFile]) -> list[ScanOfFile]:
-    """Scans of ascending times; those that come a little late are left out."""
-    kept = scans[:1]
-    for scan in scans[1:]:
-        late_ns = kept[-1].stamp_ns - scan.stamp_ns
-        if late_ns > LATE_NS:
-            problem = f"the time runs backwards by {late_ns * 1e-9:.3f} s, expected scans in order of time"
-            raise InputError(f"{path}, {scan.place}: {problem}.")
-        if late_ns < 0:
-            kept.append(scan)
-    if left := len(scans) - len(kept):
-        _log.warning("%s: left out %d scans whose time is not after that of the scan before.", path, left)
-    return kept
+def _chosen(path: Path, what: str, names: Sequence[str], given: str | None = None) -> str:
+    """The one given, or the first, which is said where there are several."""
+    if len(names) > 1:
+        _log.warning("%s: %s of %s, of %s.", path, what, given or names[0], ", ".join(names))
+    return given or names[0]
 
 
 def _tell_mirrored(path: Path, log: LaserLog) -> None:
@@ -211,23 +200,22 @@ def _tell_mirrored(path: Path, log: LaserLog) -> None:
         )  # fmt: skip
 
 
-def _interpolated(path: Path, scans: list[ScanOfFile], stamps_ns: list[int], poses: list[Array]) -> list[ScanOfFile]:
+def _interpolated(path: Path, scans: ScansOfFile, stamps_ns: list[int], poses: list[Array]) -> ScansOfFile:
     """Scans with odometry of other times than theirs; those before it begins and after it ends are left out."""
     if not poses:
         return scans
     times, first = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
     known = np.stack(poses)[first]
-    wanted = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
-    inside = np.flatnonzero((times[0] <= wanted) & (wanted <= times[-1]))
+    inside = np.flatnonzero((times[0] <= scans.stamps_ns) & (scans.stamps_ns <= times[-1]))
     if not inside.size:
         raise InputError(f"{path}: the odometry and the scans have no time in common, expected one clock.")
-    if left := len(scans) - inside.size:
+    if left := scans.stamps_ns.size - inside.size:
         _log.warning("%s: left out %d scans before the odometry begins or after it ends.", path, left)
-    after = np.searchsorted(times, wanted[inside]).clip(min=min(1, times.size - 1))
+    scans = scans.take(inside)
+    after = np.searchsorted(times, scans.stamps_ns).clip(min=min(1, times.size - 1))
     before = (after - 1).clip(min=0)
-    fraction = (wanted[inside] - times[before]) / np.maximum(times[after] - times[before], 1)
-    at = SE2.interpolate(known[before], known[after], fraction)
-    return [scans[row]._replace(odometry=pose) for row, pose in zip(inside.tolist(), at, strict=True)]
+    fraction = (scans.stamps_ns - times[before]) / np.maximum(times[after] - times[before], 1)
+    return replace(scans, odometry=SE2.interpolate(known[before], known[after], fraction))
 
 
 @final
@@ -240,8 +228,7 @@ class Carmen(LaserFormat):
         return not path.is_dir()
 
     def read(self, path: Path, options: LaserOptions) -> ScansOfFile:
-        lines = [(number, line.split()) for number, line in enumerate(read_lines(path, self.kind), 1)]
-        lines = [(number, words) for number, words in lines if words and not words[0].startswith("#")]
+        lines = [(number, line.split()) for number, line in numbered_lines(path, self.kind)]
         there = dict.fromkeys(words[0] for _, words in lines)
         names = [name for name in SCANNERS if name in there]
         if options.scanner is not None and options.scanner not in names:
@@ -249,15 +236,13 @@ class Carmen(LaserFormat):
         if not names:
             beginnings = ", ".join(quoted(name) for name in list(there)[:5]) or "none"
             raise InputError(f"{path}: expected {self.kind}; found lines of {beginnings}.")
-        name = options.scanner or names[0]
-        if len(names) > 1:
-            _log.warning("%s: the scans are those of %s, of %s.", path, name, ", ".join(names))
+        name = _chosen(path, "the scans are those", names, options.scanner)
         rear = name == "RLASER" or name.endswith("2")
         side = "rear" if rear else "front"
         offsets = (f"robot_{side}laser_angular_offset", f"robot_{side}laser_offset", f"robot_{side}laser_side_offset")
         wanted, params = {*offsets, f"robot_{side}_laser_max"}, dict[str, float]()
         stamps, poses = list[int](), list[Array]()
-        found, mounts = list[tuple[int, "_Line"]](), list[Array]()
+        found = list[tuple[int, "_Line"]]()
         for number, words in lines:
             if words[0] == "PARAM" and len(words) > 2 and words[1] in wanted:
                 params[words[1]] = parse_number(path, number, words[1], words[2])
@@ -270,18 +255,25 @@ class Carmen(LaserFormat):
                 poses.append(np.array([theta, x, y]))
             elif words[0] == name:
                 found.append((number, _Line.parse(path, number, words)))
-        (line, first), scans = found[0], list[ScanOfFile]()
+        line, first = found[0]
         for number, one in found:
             if one.beams != first.beams:
                 raise line_error(path, number, f"expected {first.beams} as in line {line}, found {one.beams}")
-            scans.append(ScanOfFile(f"line {number}", one.stamp_ns, one.ranges, one.odometry))
-            if one.odometry is not None and one.laser is not None:
-                mounts.append(SE2.between(one.odometry, one.laser))
-        if scans[0].odometry is None:
+        scans = ScansOfFile(
+            first.angles(path, line),
+            np.array([f"line {number}" for number, _ in found]),
+            np.array([one.stamp_ns for _, one in found], dtype=np.int64),
+            np.stack([one.ranges for _, one in found]),
+        )
+        mounts = np.empty((0, 3))
+        if first.poses is None:
             scans = _interpolated(path, scans, stamps, poses)
+        else:
+            laser, odometry = np.stack([one.poses for _, one in found if one.poses is not None], axis=1)
+            scans, mounts = replace(scans, odometry=odometry), SE2.between(odometry, laser)
         mount = _mount(path, name, mounts, np.array([params.get(key, 0.0) for key in offsets]), rear)
         farthest = first.head[4] if first.head else min(params.get(f"robot_{side}_laser_max", 0.0), _FAR_M)
-        return ScansOfFile(first.angles(path, line), 0.0, farthest if farthest > 0.0 else None, mount, scans=scans)
+        return replace(scans, max_range_m=farthest if farthest > 0.0 else None, robot_from_sensor=mount)
 
 
 class _Line(NamedTuple):
@@ -290,8 +282,7 @@ class _Line(NamedTuple):
     head: tuple[float, ...]
     ranges: Array
     stamp_ns: int
-    laser: Array | None
-    odometry: Array | None
+    poses: Array | None  #: (2, E) of the scanner and of the robot.
 
     @classmethod
     def parse(cls, path: Path, number: int, words: list[str]) -> "_Line":
@@ -320,16 +311,15 @@ class _Line(NamedTuple):
             raise line_error(path, number, "expected readings, found none")
         if not old:
             take_list("remissions")
-        laser, odometry = None, None
+        poses = None
         if not name.startswith("RAW"):
-            pose = take(_POSES)
-            laser, odometry = pose[[2, 0, 1]], pose[[5, 3, 4]]
+            poses = np.roll(take(_POSES).reshape(2, 3), 1, axis=1)
             at += 0 if old else 5
         # The time, and then mostly the name of a computer and the time at which the line was written.
         if not 1 <= len(words) - at <= 3:
             problem = f"expected a time, a host and a time after {at} words, found {len(words) - at} words"
             raise line_error(path, number, f"{problem}; is the number of readings right?")
-        return cls(head, ranges, parse_time(path, number, words[at]), laser, odometry)
+        return cls(head, ranges, parse_time(path, number, words[at]), poses)
 
     @property
     def beams(self) -> str:
@@ -379,12 +369,11 @@ def _ranges(path: Path, line: int, what: str, words: list[str]) -> Array:
     return values
 
 
-def _mount(path: Path, name: str, mounts: list[Array], told: Array, rear: bool) -> Array:
+def _mount(path: Path, name: str, implied: Array, told: Array, rear: bool) -> Array:
     """robot_from_sensor (E,), from those that lines imply and the one that parameters tell, zero where they do not."""
-    between = np.array(mounts).reshape(-1, 3)
-    same = len(between) > 0 and float(np.abs(SE2.local(between[0], between)).max()) < 1e-3
-    if same and (np.abs(between[0]).max() > 1e-3 or not told.any()):
-        return np.asarray(between[0])
+    same = len(implied) > 0 and float(np.abs(SE2.local(implied[0], implied)).max()) < 1e-3
+    if same and (np.abs(implied[0]).max() > 1e-3 or not told.any()):
+        return np.asarray(implied[0])
     if not rear:
         return np.asarray(SE2.normalise(told))
     _log.warning("%s: nothing says where %s sits; taken as in the robot's middle, looking backwards.", path, name)
@@ -404,50 +393,50 @@ class LaserBag(LaserFormat):
         with opened(path) as bag:
             topics = bag.of_type(SCAN)
             if not topics or options.scanner not in (None, *topics):
-                found = f"found {', '.join(topics)}" if topics else "found none"
-                raise InputError(f"{path}: expected a topic {options.scanner or 'of LaserScan'}, {found} of LaserScan.")
-            topic = options.scanner or topics[0]
-            if len(topics) > 1:
-                _log.warning("%s: the scans are those of %s, of %s.", path, topic, ", ".join(topics))
-            where, first, scans, damaged = f"{path}, {topic}", None, list[ScanOfFile](), 0
+                wanted, held = options.scanner or "of LaserScan", ", ".join(topics) or "none"
+                raise InputError(f"{path}: expected a topic {wanted}, found {held} of LaserScan.")
+            topic = _chosen(path, "the scans are those", topics, options.scanner)
+            where, frame, damaged = f"{path}, {topic}", "", 0
+            beams: tuple[int, float, float, float, float] | None = None
+            places, stamps_ns, ranges = list[str](), list[int](), list[Array]()
             for number, raw in enumerate(bag.messages(topic)):
                 try:
                     message = bag.message(raw)
                 except InputError:
                     damaged += 1
                     continue
-                first = first or message
-                if _beams(message) != _beams(first):
+                reach = float(message.range_min), float(message.range_max)
+                found = len(message.ranges), float(message.angle_min), float(message.angle_increment), *reach
+                beams, frame = beams or found, frame or message.header.frame_id
+                if found != beams:
                     raise InputError(f"{where}, scan {number}: expected beams as in the scans before, found others.")
-                scans.append(ScanOfFile(f"scan {number}", raw.stamp_ns, np.array(message.ranges, dtype=float), None))
-            if first is None:
+                places.append(f"scan {number}")
+                stamps_ns.append(raw.stamp_ns)
+                ranges.append(np.array(message.ranges, dtype=float))
+            if beams is None:
                 raise InputError(f"{where}: no scan can be read.")
             if damaged:
                 _log.warning("%s: left out %d damaged scans.", where, damaged)
-            count, start, step, nearest, farthest = _beams(first)
+            count, start, step, nearest, farthest = beams
             if problem := _not_beams(start, step, count):
                 raise InputError(f"{where}: {problem}.")
             transforms = _Transforms(bag)
-            stamps, poses, base = transforms.odometry(first.header.frame_id)
-            mount = transforms.mount(base, first.header.frame_id)
-        turned, upside_down = SE2.identity(), False
+            stamps, poses, base = transforms.odometry(frame)
+            mount = transforms.mount(base, frame)
         if mount is None:
             _log.warning("%s: nothing says where the scanner sits; taken as in the robot's middle.", where)
-        else:
-            turned, upside_down = _planar(mount), bool(SE3.rotation(mount)[2, 2] < 0.0)
-        return ScansOfFile(
+            mount = SE3.identity()
+        scans = ScansOfFile(
             np.asarray(start + step * np.arange(count), dtype=float),
-            nearest if np.isfinite(nearest) and nearest > 0.0 else 0.0,
-            farthest if np.isfinite(farthest) and farthest > 0.0 else None,
-            turned,
-            upside_down,
-            _interpolated(path, scans, stamps, poses),
+            np.array(places),
+            np.array(stamps_ns, dtype=np.int64),
+            np.stack(ranges),
+            min_range_m=nearest if np.isfinite(nearest) and nearest > 0.0 else 0.0,
+            max_range_m=farthest if np.isfinite(farthest) and farthest > 0.0 else None,
+            robot_from_sensor=_planar(mount),
+            upside_down=bool(SE3.rotation(mount)[2, 2] < 0.0),
         )
-
-
-def _beams(message: Any) -> tuple[int, float, float, float, float]:
-    start, step = float(message.angle_min), float(message.angle_increment)
-    return len(message.ranges), start, step, float(message.range_min), float(message.range_max)
+        return _interpolated(path, scans, stamps, poses)
 
 
 def _planar(pose: Array) -> Array:
@@ -470,29 +459,28 @@ class _Transforms:
                 except InputError:
                     continue
                 for one in message.transforms:
-                    child, stamp = _name(one.child_frame_id), one.header.stamp
-                    pose = _pose(one.transform.translation, one.transform.rotation)
+                    child, stamp = one.child_frame_id.strip("/"), one.header.stamp
+                    pose = _pose(one.transform)
                     if pose is not None:
-                        self._parents[child] = _name(one.header.frame_id)
+                        self._parents[child] = one.header.frame_id.strip("/")
                         self._poses[child].append((stamp.sec * 10**9 + stamp.nanosec, pose))
 
     def odometry(self, scanner: str) -> tuple[list[int], list[Array], str]:
         """Times, poses (E,), and the frame of the robot: of a topic, or of the transforms; none where there is none."""
         topics = self._bag.of_type(ODOMETRY)
         if topics:
-            topic = "/odom" if "/odom" in topics else topics[0]
-            if len(topics) > 1:
-                _log.warning("%s: the odometry is that of %s, of %s.", self._bag.path, topic, ", ".join(topics))
+            given = "/odom" if "/odom" in topics else None
+            topic = _chosen(self._bag.path, "the odometry is that", topics, given)
             stamps, poses, base = list[int](), list[Array](), ""
             for raw in self._bag.messages(topic):
                 message = self._bag.message(raw)
-                pose = _pose(message.pose.pose.position, message.pose.pose.orientation)
-                base = base or _name(message.child_frame_id)
+                pose = _pose(message.pose.pose)
+                base = base or message.child_frame_id.strip("/")
                 if pose is not None:
                     stamps.append(raw.stamp_ns)
                     poses.append(_planar(pose))
             return stamps, poses, base
-        chain = self._chain(_name(scanner))
+        chain = self._chain(scanner)
         for child in chain:
             if self._parents.get(child, "").endswith("odom"):
                 return [stamp for stamp, _ in self._poses[child]], [_planar(p) for _, p in self._poses[child]], child
@@ -501,7 +489,7 @@ class _Transforms:
     def mount(self, base: str, scanner: str) -> Array | None:
         """robot_from_sensor (7,), None where the transforms do not say."""
         pose = SE3.identity()
-        for child in self._chain(_name(scanner)):
+        for child in self._chain(scanner):
             if child == base:
                 return pose
             if child in self._poses:
@@ -510,21 +498,16 @@ class _Transforms:
 
     def _chain(self, frame: str) -> list[str]:
         """A frame, its parent, and so on."""
-        chain = [frame]
+        chain = [frame.strip("/")]
         while (parent := self._parents.get(chain[-1])) is not None and parent not in chain:
             chain.append(parent)
         return chain
 
 
-def _name(frame: str) -> str:
-    return frame.strip("/")
-
-
-def _pose(place: Any, turn: Any) -> Array | None:
+def _pose(message: Any) -> Array | None:
     """(7,), None where it is none."""
-    pose = np.array([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z], dtype=float)
-    length = float(np.linalg.norm(pose[:4]))
-    if not (np.isfinite(pose).all() and abs(length - 1.0) < 1e-2):
+    pose = numbers_of(message)
+    if not (np.isfinite(pose).all() and abs(float(np.linalg.norm(pose[:4])) - 1.0) < 1e-2):
         return None
     return np.asarray(SE3.normalise(pose))
 

@@ -69,48 +69,41 @@ class Mrclam(RobotLogFormat):
         barcodes.require(barcodes["subject"] >= 1, "subject", "1 or more")
         names = barcodes.names("barcode").tolist(), barcodes.names("subject").tolist()
         subjects = dict(zip(*names, strict=True))
-        stamps, frame, landmarks, z = self._observations(folder / f"{prefix}{_SUFFIX}", subjects)
-        delta, cov_delta = self._motion(folder / f"{prefix}_Odometry.dat", stamps, noise)
+        # The observations of landmarks, whose instants are the frames.
+        file = folder / f"{prefix}{_SUFFIX}"
+        table = read_columns(file, ("time", "barcode", "range", "bearing"), self.kind)
+        require_ranges(table, "range", "bearing")
+        landmarks = np.array([subjects.get(barcode, 0) for barcode in table.integers("barcode").tolist()])
+        kept = landmarks > _LAST_ROBOT
+        unknown = np.count_nonzero(landmarks == 0)
+        moving = len(kept) - np.count_nonzero(kept) - unknown
+        _log.info("%s: left out %d observations of robots and %d of unknown barcodes", file, moving, unknown)
+        if not kept.any():
+            raise InputError(f"{file}: expected observations of landmarks, found no barcode of one.")
+        stamps, frame = np.unique(table.stamps_ns()[kept], return_inverse=True)
+        z = table.block("range", "bearing")[kept]
         cov_z = diagonal([np.full(len(z), noise.std_range_m), np.full(len(z), noise.std_bearing_rad)])
+        # The motion between them.
+        table = read_columns(folder / f"{prefix}_Odometry.dat", ("time", "forward speed", "turn rate"), self.kind)
+        readings_ns = table.stamps_ns()
+        # Holding the last reading longer than any reading was ever held would invent motion.
+        late = int(stamps[-1]) - int(readings_ns[-1])
+        if late > int(np.diff(readings_ns).max(initial=0)):
+            ends = f"the odometry ends {late / 1e9:.3f} s before the last observation"
+            raise table.error(len(readings_ns) - 1, f"{ends}, expected it to last longer")
+        delta, by_noise = integrate(readings_ns, table["turn rate"], table["forward speed"], stamps)
+        variance = np.square(np.array([noise.std_turn_rate_radps, noise.std_speed_mps], dtype=float))
+        cov_delta = noise.odometry_variance_factor() * np.einsum("tsab,s->tab", by_noise, variance)
         name = folder.resolve().name
         return RobotLog(
             name=name if path.is_dir() else f"{name}_{prefix}",
             space=SE2,
             measurement="range_bearing",
             robot_from_sensor=SE2.identity(),
-            frames=assemble(stamps, delta, cov_delta, frame, landmarks, z, cov_z),
+            frames=assemble(stamps, delta, cov_delta, frame, landmarks[kept], z, cov_z),
             misread=True,
             truth=_read_truth(folder / f"{prefix}_Groundtruth.dat", folder / "Landmark_Groundtruth.dat"),
         )
-
-    def _observations(
-        self, path: Path, by_barcode: dict[int, int]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
-        """Times of the frames, and each observation's frame, landmark, range and bearing."""
-        table = read_columns(path, ("time", "barcode", "range", "bearing"), self.kind)
-        require_ranges(table, "range", "bearing")
-        subjects = np.array([by_barcode.get(barcode, 0) for barcode in table.integers("barcode").tolist()])
-        kept = subjects > _LAST_ROBOT
-        unknown = np.count_nonzero(subjects == 0)
-        robots = len(kept) - np.count_nonzero(kept) - unknown
-        _log.info("%s: left out %d observations of robots and %d of unknown barcodes", path, robots, unknown)
-        if not kept.any():
-            raise InputError(f"{path}: expected observations of landmarks, found no barcode of one.")
-        stamps, frame = np.unique(table.stamps_ns()[kept], return_inverse=True)
-        return stamps, frame, subjects[kept], table.block("range", "bearing")[kept]
-
-    def _motion(self, path: Path, stamps_ns: NDArray[np.int64], noise: LogNoise) -> tuple[Array, Array]:
-        """Motion between the frames, and its covariance."""
-        table = read_columns(path, ("time", "forward speed", "turn rate"), self.kind)
-        readings_ns = table.stamps_ns()
-        # Holding the last reading longer than any reading was ever held would invent motion.
-        late = int(stamps_ns[-1]) - int(readings_ns[-1])
-        if late > int(np.diff(readings_ns).max(initial=0)):
-            ends = f"the odometry ends {late / 1e9:.3f} s before the last observation"
-            raise table.error(len(readings_ns) - 1, f"{ends}, expected it to last longer")
-        delta, cov = integrate(readings_ns, table["turn rate"], table["forward speed"], stamps_ns)
-        variance = np.square(np.array([noise.std_turn_rate_radps, noise.std_speed_mps], dtype=float))
-        return delta, noise.odometry_variance_factor() * np.einsum("tsab,s->tab", cov, variance)
 
 
 def _read_truth(path_file: Path, landmark_file: Path) -> Truth | None:

@@ -27,7 +27,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf.lie import SE2, SE3, Array
+from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.robot_log import (
     UNNAMED,
     LogNoise,
@@ -68,43 +68,53 @@ class Mrpt(RobotLogFormat):
         odometry = read_csv(path / "odometry.csv", [_PLANAR, _SPATIAL], self.kind)
         table = read_csv(path / "observations.csv", _OBSERVATIONS, self.kind)
         planar = odometry.columns == _PLANAR
-        robot_from_sensor, pitch_sign = _read_sensor(path / "sensor.yaml", planar, self.kind)
+        applicable = ["std_range_m", "std_bearing_rad", "scale_odometry"] + ["std_pitch_rad"] * (not planar)
+        noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
+        # Where the sensor sits; in the plane its height is left out.
+        entries = read_yaml(path / "sensor.yaml", self.kind).entries(("robot_from_sensor", "positive_pitch"), ("std",))
+        placed = entries["robot_from_sensor"].entries(_MOUNT, optional=())
+        x, y, height, *angles = (placed[key].number() for key in _MOUNT)
+        yaw, pitch, roll = np.deg2rad(angles)
+        pitch_sign = _PITCH_SIGNS[entries["positive_pitch"].choice(tuple(_PITCH_SIGNS))]
+        if planar and (pitch or roll):
+            problem = "expected pitch_deg and roll_deg to be 0, as the odometry is planar"
+            raise entries["robot_from_sensor"].error(problem)
         if planar:
+            robot_from_sensor = SE2.normalise(np.array([yaw, x, y]))
             delta = SE2.normalise(np.roll(odometry.block("dx_m", "dphi_rad"), 1, axis=1))
             cov_delta = planar_to_chart(delta, read_covariances(odometry, "cxx", "cpp"))
         else:
+            robot_from_sensor = SE3.from_ypr(np.array([x, y, height]), yaw, pitch, roll)
             ypr = odometry.block("yaw_rad", "roll_rad")
             delta = SE3.from_ypr(odometry.block("dx_m", "dz_m"), *ypr.T)
             cov_delta = spatial_to_chart(delta, ypr, read_covariances(odometry, "cov00", "cov55"))
         cov_delta *= noise.odometry_variance_factor()
         step, landmarks = _require_order(table, odometry)
-        z, cov_z = _measurements(table, planar, noise, path)
+        # Measurements and their covariances.
+        require_ranges(table, "range_m", "yaw_rad")
+        std = [
+            std_column(table, "std_range_m", noise.std_range_m),
+            std_column(table, "std_yaw_rad", noise.std_bearing_rad),
+        ]
+        if planar:
+            table.require(table["pitch_rad"] == 0, "pitch_rad", "0, as the odometry is planar")
+            table.require(table["std_pitch_rad"] >= 0, "std_pitch_rad", "zero or positive")
+        else:
+            right = np.abs(table["pitch_rad"]) <= np.pi / 2
+            table.require(right, "pitch_rad", "in radians, within a quarter turn")
+            std.append(std_column(table, "std_pitch_rad", noise.std_pitch_rad))
+        z = table.block("range_m", "yaw_rad" if planar else "pitch_rad")
         frames = step[-1] + 1
-        stamps = np.arange(frames)
+        motion = delta[: frames - 1], cov_delta[: frames - 1]
         return RobotLog(
             name=path.resolve().name,
             space=SE2 if planar else SE3,
             measurement="range_bearing",
             robot_from_sensor=robot_from_sensor,
-            frames=assemble(stamps, delta[: frames - 1], cov_delta[: frames - 1], step, landmarks, z, cov_z),
+            frames=assemble(np.arange(frames), *motion, step, landmarks, z, diagonal(std)),
             pitch_sign=pitch_sign,
             truth=_read_truth(path, planar),
         )
-
-
-def _read_sensor(path: Path, planar: bool, hint: str) -> tuple[Array, float]:
-    """robot_from_sensor, (3,) in the plane, where the sensor's height is left out, else (7,); and the sign of pitch."""
-    entries = read_yaml(path, hint).entries(("robot_from_sensor", "positive_pitch"), optional=("std",))
-    mount = entries["robot_from_sensor"]
-    placed = mount.entries(_MOUNT, optional=())
-    values = np.array([placed[key].number() for key in _MOUNT])
-    yaw, pitch, roll = np.deg2rad(values[3:])
-    sign = _PITCH_SIGNS[entries["positive_pitch"].choice(tuple(_PITCH_SIGNS))]
-    if not planar:
-        return SE3.from_ypr(values[:3], yaw, pitch, roll), sign
-    if pitch or roll:
-        raise mount.error("expected pitch_deg and roll_deg to be 0, as the odometry is planar")
-    return SE2.normalise(np.array([yaw, values[0], values[1]])), sign
 
 
 def _require_order(table: Table, odometry: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -119,30 +129,13 @@ def _require_order(table: Table, odometry: Table) -> tuple[NDArray[np.int64], ND
     ordered = np.diff(step, prepend=0) >= 0
     if not ordered.all():
         row = int(np.argmin(ordered))
-        problem = f"time runs backwards from step {step[row - 1]} to {step[row]}, expected rows in order"
-        raise table.error(row, problem)
+        raise table.error(row, f"time runs backwards from step {step[row - 1]} to {step[row]}, expected rows in order")
     # Those without a name may be many in a step; each counts as one of its own here.
     apart = np.where(landmarks == UNNAMED, UNNAMED - 1 - np.arange(len(step)), landmarks)
     if named:
         table.require(landmarks >= UNNAMED, "landmark_id", f"{UNNAMED} or the number of a landmark")
     table.require_distinct(step, apart, "step")
     return step, landmarks
-
-
-def _measurements(table: Table, planar: bool, noise: LogNoise, path: Path) -> tuple[Array, Array]:
-    """Measurements and their covariances."""
-    applicable = ["std_range_m", "std_bearing_rad", "scale_odometry"] + ["std_pitch_rad"] * (not planar)
-    noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
-    require_ranges(table, "range_m", "yaw_rad")
-    pitch = table["pitch_rad"]
-    std = [std_column(table, "std_range_m", noise.std_range_m), std_column(table, "std_yaw_rad", noise.std_bearing_rad)]
-    if planar:
-        table.require(pitch == 0, "pitch_rad", "0, as the odometry is planar")
-        table.require(table["std_pitch_rad"] >= 0, "std_pitch_rad", "zero or positive")
-        return table.block("range_m", "yaw_rad"), diagonal(std)
-    table.require(np.abs(pitch) <= np.pi / 2, "pitch_rad", "in radians, within a quarter turn")
-    std.append(std_column(table, "std_pitch_rad", noise.std_pitch_rad))
-    return table.block("range_m", "pitch_rad"), diagonal(std)
 
 
 def _read_truth(path: Path, planar: bool) -> Truth | None:

@@ -7,7 +7,7 @@ every product that a reader forms far from overflow.
 import re
 import zlib
 from codecs import BOM_UTF8
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -25,9 +25,7 @@ LARGEST = 1e12
 LATEST_S = 4e9
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_TIME = re.compile(r"[+-]?\d{0,10}(\.\d*)?", re.ASCII)
 _PLAIN = dict.fromkeys(map(ord, "0123456789+-.eE \t,"))
-_DIGITS_OF_SECONDS = 10
 
 
 def line_error(path: Path, line: int, problem: str) -> InputError:
@@ -46,20 +44,20 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
     Raises:
         InputError: the file is missing, too large or cannot be read.
     """
-    most = MOST_BYTES if most is None else most
+    most, expected = MOST_BYTES if most is None else most, hint and f"; expected {hint}"
     try:
         status = path.stat()
         if not S_ISREG(status.st_mode):  # a pipe would be waited for, a device read without end
             kind = "a folder" if S_ISDIR(status.st_mode) else "a device or a pipe"
-            raise InputError(f"{path}: cannot be read: it is {kind}, no file{hint and '; expected ' + hint}.")
+            raise InputError(f"{path}: cannot be read: it is {kind}, no file{expected}.")
         if status.st_size > most:
-            raise InputError(f"{path}: the file is larger than {most >> 20} MiB{hint and '; expected ' + hint}.")
+            raise InputError(f"{path}: the file is larger than {most >> 20} MiB{expected}.")
         with path.open("rb") as file:
             return file.read(status.st_size)
     except InputError:
         raise
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file{hint and '; expected ' + hint}.") from None
+        raise InputError(f"{path}: no such file{expected}.") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}).") from None
 
@@ -103,6 +101,12 @@ def read_lines(path: Path, hint: str = "") -> list[str]:
         problem = "the file ends inside this line; copy it again, or end the line if it is complete"
         raise line_error(path, len(lines), problem)
     return [line.removesuffix("\r") for line in lines[:-1]]
+
+
+def numbered_lines(path: Path, hint: str = "") -> list[tuple[int, str]]:
+    """Lines of a file, stripped, with their numbers from 1, but for blank ones and comments, which start with #."""
+    numbered = ((number, line.strip()) for number, line in enumerate(read_lines(path, hint), 1))
+    return [(number, line) for number, line in numbered if line and not line.startswith("#")]
 
 
 @dataclass(frozen=True)
@@ -156,15 +160,7 @@ class Table:
 
         The decimal text is converted, not its rounded float.
         """
-        column = self.columns[0]
-        self.require(np.abs(self[column]) <= LATEST_S, column, f"within {LATEST_S:.0e} s of zero")
-        texts, stamps = [row.split(None, 1)[0] for row in self.rows], []
-        for row, text in enumerate(texts):
-            if not _TIME.fullmatch(text):
-                raise self.error(row, f"expected a time such as 1248444175.103, found {quoted(text)}")
-            stamps.append(int(Decimal(text).scaleb(9)))
-        _require_order(self.path, self.lines, texts, stamps)
-        return np.array(stamps)
+        return _stamps_ns(self.path, self.lines, [row.split(None, 1)[0] for row in self.rows], parse_time)
 
 
 def _second(values: NDArray[np.int64]) -> int | None:
@@ -176,9 +172,7 @@ def _second(values: NDArray[np.int64]) -> int | None:
 
 def read_columns(path: Path, columns: tuple[str, ...], hint: str = "") -> Table:
     """File of blank-separated columns; lines that start with # are comments."""
-    numbered = enumerate(read_lines(path, hint), 1)
-    rows = [(i, line) for i, line in numbered if not line.lstrip().startswith("#")]
-    return parse_table(path, columns, rows)
+    return parse_table(path, columns, numbered_lines(path, hint))
 
 
 def read_csv(path: Path, headers: Sequence[tuple[str, ...]], hint: str = "") -> Table:
@@ -215,8 +209,7 @@ def parse_table(
 def _parse_row(path: Path, line: int, row: str, columns: tuple[str, ...], separator: str | None) -> list[float]:
     fields = [field.strip() for field in row.split(separator)]
     if len(fields) != len(columns):
-        problem = f"expected {len(columns)} columns ({', '.join(columns)}), found {len(fields)}"
-        raise line_error(path, line, problem)
+        raise line_error(path, line, f"expected {len(columns)} columns ({', '.join(columns)}), found {len(fields)}")
     return [parse_number(path, line, *item) for item in zip(columns, fields, strict=True)]
 
 
@@ -226,82 +219,75 @@ def parse_number(path: Path, line: int, column: str, field: str) -> float:
         raise line_error(path, line, f"expected {column} to be a finite number, found {quoted(field)}")
     value = float(field)
     if not abs(value) <= LARGEST:
-        problem = f"expected {column} to be at most {LARGEST:.0e} in size, found {quoted(field)}"
-        raise line_error(path, line, problem)
+        raise line_error(path, line, f"expected {column} to be at most {LARGEST:.0e} in size, found {quoted(field)}")
     return value
 
 
 def parse_time(path: Path, line: int, text: str) -> int:
     """Time in seconds in a line, counted from 1, as nanoseconds; digits beyond these are dropped."""
-    whole = text.partition(".")[0]
-    long = whole.isdigit() and len(whole) > _DIGITS_OF_SECONDS
-    if long or abs(parse_number(path, line, "the time", text)) > LATEST_S:
+    if not (_NUMBER.fullmatch(text) and abs(float(text)) <= LATEST_S):
         problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
         raise line_error(path, line, problem)
     return int(Decimal(text).scaleb(9))
+
+
+def _parse_nanoseconds(path: Path, line: int, text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**63):
+        raise line_error(path, line, f"expected a time in whole nanoseconds, found {quoted(text)}")
+    return int(text)
+
+
+def _stamps_ns(
+    path: Path, lines: list[int], texts: list[str], parse: Callable[[Path, int, str], int]
+) -> NDArray[np.int64]:
+    """Times (n,) of lines; one before the one it follows is refused."""
+    stamps = [parse(path, line, text) for line, text in zip(lines, texts, strict=True)]
+    for row in range(1, len(stamps)):
+        if stamps[row] < stamps[row - 1]:
+            before = f"time runs backwards from {texts[row - 1]} to {texts[row]}"
+            raise line_error(path, lines[row], f"{before}, expected lines in order of time")
+    return np.array(stamps, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class StampedLines:
     """Lines of a file that begin with a time, in order of time; equal times are allowed.
 
-    Each has its number from 1, its time in `stamps_ns` (T,), and the text after it.
+    Each has its number from 1, its time in `stamps_ns` (T,), and the text after it, in which `separator` is between columns.
     """
 
     path: Path
     lines: list[int]
-    stamps_ns: np.ndarray
+    stamps_ns: NDArray[np.int64]
     rests: list[str]
+    separator: str | None
 
     def files(self, folder: Path) -> list[Path]:
         """The texts as files in a folder."""
         for line, rest in zip(self.lines, self.rests, strict=True):
             if not rest:
-                problem = "expected a time and the file of an image, found only a time"
-                raise line_error(self.path, line, problem)
+                raise line_error(self.path, line, "expected a time and the file of an image, found only a time")
         return [folder / rest for rest in self.rests]
 
-    def table(self, columns: tuple[str, ...], separator: str | None = None) -> Table:
+    def table(self, columns: tuple[str, ...]) -> Table:
         """The texts as numbers; columns beyond these are passed over."""
-        both = zip(self.lines, self.rests, strict=True)
-        cut = ((line, rest.split(separator)[: len(columns)]) for line, rest in both)
-        numbered = ((line, (separator or " ").join(fields)) for line, fields in cut)
-        return parse_table(self.path, columns, numbered, separator)
+        cut = ((self.separator or " ").join(rest.split(self.separator)[: len(columns)]) for rest in self.rests)
+        return parse_table(self.path, columns, zip(self.lines, cut, strict=True), self.separator)
 
 
-def read_stamped(path: Path, hint: str, separator: str | None = None, nanoseconds: bool = False) -> StampedLines:
+def read_stamped(path: Path, hint: str, nanoseconds: bool = False) -> StampedLines:
     """Lines of a time and something else; lines that start with # are comments.
 
     Args:
         path: the file.
         hint: what is expected to lie there, for the message.
-        separator: what ends the time, None for blanks.
-        nanoseconds: whether times are whole nanoseconds, else they are seconds, whose further digits are dropped.
+        nanoseconds: whether times are whole nanoseconds, and commas stand between columns; else they are seconds, whose
+            further digits are dropped, and blanks do.
     """
-
-    def parse(line: int, text: str) -> int:
-        if nanoseconds:
-            if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**63):
-                problem = f"expected a time in whole nanoseconds, found {quoted(text)}"
-                raise line_error(path, line, problem)
-            return int(text)
-        return parse_time(path, line, text)
-
-    numbered = [(i, line.strip()) for i, line in enumerate(read_lines(path, hint), 1)]
-    kept = [(i, line.split(separator, 1)) for i, line in numbered if line and not line.startswith("#")]
+    separator, parse = (",", _parse_nanoseconds) if nanoseconds else (None, parse_time)
+    kept = [(line, text.split(separator, 1)) for line, text in numbered_lines(path, hint)]
     if not kept:
         raise InputError(f"{path}: expected lines that begin with a time, found none.")
-    lines = [i for i, _ in kept]
-    texts = [parts[0].strip() for _, parts in kept]
-    stamps = [parse(line, text) for line, text in zip(lines, texts, strict=True)]
-    _require_order(path, lines, texts, stamps)
-    rests = [parts[1].strip() if len(parts) > 1 else "" for _, parts in kept]
-    return StampedLines(path, lines, np.array(stamps, dtype=np.int64), rests)
-
-
-def _require_order(path: Path, lines: list[int], texts: list[str], stamps: list[int]) -> None:
-    """Refuse a time before the one it follows."""
-    for row in range(1, len(stamps)):
-        if stamps[row] < stamps[row - 1]:
-            before = f"time runs backwards from {texts[row - 1]} to {texts[row]}"
-            raise line_error(path, lines[row], f"{before}, expected lines in order of time")
+    lines, texts = [line for line, _ in kept], [parts[0].strip() for _, parts in kept]
+    rests = ["".join(parts[1:]).strip() for _, parts in kept]
+    return StampedLines(path, lines, _stamps_ns(path, lines, texts, parse), rests, separator)

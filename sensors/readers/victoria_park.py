@@ -15,12 +15,10 @@ E. Nebot, J. Guivant, Victoria Park data set, Sydney.
 """
 
 import re
-from itertools import pairwise
 from pathlib import Path
 from typing import final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
@@ -33,7 +31,7 @@ from rbpf.sensors.readers.robot_log import (
     planar_to_chart,
     read_covariances,
 )
-from rbpf.sensors.readers.text import Table, line_error, parse_table, quoted, read_bytes, read_lines
+from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_bytes, read_lines
 
 _COLUMNS = {
     "ODOMETRY": ("from", "to", "dx", "dy", "dtheta", "cxx", "cxy", "cxt", "cyy", "cyt", "ctt"),
@@ -67,8 +65,16 @@ class VictoriaPark(RobotLogFormat):
             elif keyword:
                 raise line_error(path, number, f"expected ODOMETRY or LANDMARK, found {quoted(keyword)}")
         odometry, observations = (parse_table(path, _COLUMNS[name], lines[name]) for name in _COLUMNS)
-        poses = _require_chain(odometry)
-
+        # Poses (T,), along a path without gap or loop.
+        start, stop = odometry.integers("from"), odometry.integers("to")
+        if (apart := np.flatnonzero(stop[:-1] != start[1:])).size:
+            row = int(apart[0]) + 1
+            problem = f"expected odometry from pose {stop[row - 1]}, where the one before ends, found {start[row]}"
+            raise odometry.error(row, problem)
+        if start[0] in odometry.names("to"):
+            problem = f"expected a path without loops, found a return to pose {start[0]}"
+            raise odometry.error(int(np.argmax(stop == start[0])), problem)
+        poses = np.concatenate([start[:1], stop])
         # Landmarks are seen from these poses, once from each, and have numbers of their own.
         pose, landmarks = observations.integers("pose"), observations.integers("landmark")
         observations.require(np.isin(pose, poses), "pose", "a pose of the odometry")
@@ -96,16 +102,3 @@ class VictoriaPark(RobotLogFormat):
 def _graphs(path: Path) -> list[Path]:
     files = sorted(path.glob("*.txt")) if path.is_dir() else [path]
     return [file for file in files if file.is_file() and _KEYWORD.search(read_bytes(file))]
-
-
-def _require_chain(odometry: Table) -> NDArray[np.int64]:
-    """Numbers (T,) of the poses, along a path without gap or loop."""
-    start, stop = odometry.integers("from"), odometry.integers("to")
-    for row, (before, now) in enumerate(pairwise(zip(start, stop, strict=True)), 1):
-        if before[1] != now[0]:
-            problem = f"expected odometry from pose {before[1]}, where the one before ends, found {now[0]}"
-            raise odometry.error(row, problem)
-    if start[0] in odometry.names("to"):
-        row = int(np.argmax(stop == start[0]))
-        raise odometry.error(row, f"expected a path without loops, found a return to pose {start[0]}")
-    return np.concatenate([start[:1], stop])

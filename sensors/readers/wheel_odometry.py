@@ -67,8 +67,8 @@ def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
         InputError: a file is missing or not as described above.
     """
     path = Path(folder) / NAME
-    rows = read_stamped(path, KIND, ",", nanoseconds=True)
-    table = rows.table(MOTION + SIGMA, ",")
+    rows = read_stamped(path, KIND, nanoseconds=True)
+    table = rows.table(MOTION + SIGMA)
     later = np.diff(rows.stamps_ns) > 0
     if not later.all():
         raise table.error(int(np.argmin(later)) + 1, "expected a later time than on the line before")

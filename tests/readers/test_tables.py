@@ -66,8 +66,7 @@ TEXTS = [
     (b"# only\n", "expected rows of time, x, found none"),
     (b"1 2\n\xff\xfe\n", "table.dat, line 2: expected text in UTF-8"),
     (b"1.5 0\n1.499 0\n", "line 2: time runs backwards from 1.5 to 1.499"),
-    (b"1 0\n2e0 0\n", "line 2: expected a time such as 1248444175.103, found '2e0'"),
-    (b"5e9 0\n", "line 1: expected time to be within 4e+09 s of zero"),
+    (b"5e9 0\n", "line 1: expected the time in seconds, within 4e+09 of zero"),
 ]
 
 

@@ -60,20 +60,6 @@ class TestFeatureLog:
             log(frame(0, 2), replace(frame(3, 2), **wrong), frame(4, 2))
 
 
-class TestOutside:
-    def test_rows_of_frames(self):
-        z = np.array([[-0.6, 10.0], [320.0, 240.0], [639.6, 10.0], [10.0, 479.4], [-40.0, 900.0]])
-        spread = FeatureFrame(2, np.arange(5), z, np.tile(np.eye(2), (5, 1, 1)))
-        recording = log(frame(0, 3), spread, frame(3, 0))
-        np.testing.assert_array_equal(recording.outside(), [[1, 0], [1, 2], [1, 4]])
-        np.testing.assert_array_equal(recording.outside(margin_px=5.0), [[1, 0], [1, 2], [1, 3], [1, 4]])
-
-    def test_both_images_of_a_stereo_pair(self):
-        z = np.array([[20.0, 100.0, 10.0], [5.0, 100.0, -3.0], [645.0, 100.0, 630.0], [20.0, 485.0, 10.0]])
-        pairs = FeatureFrame(0, np.arange(4), z, np.tile(np.eye(3), (4, 1, 1)))
-        np.testing.assert_array_equal(log(pairs, camera=STEREO).outside(), [[0, 1], [0, 2], [0, 3]])
-
-
 class TestKnownPoints:
     good = KnownPoints(np.array([4, 2]), np.zeros((2, 3)), np.zeros((2, 3, 3)))
 

@@ -172,9 +172,9 @@ def lay_out(sequence: ImageSequence, folder: Path, count: int) -> Names:
     files = _files(sequence.source, (sequence.camera.width, sequence.camera.height))
     if files is not None:
         for side, paths in zip(prefixes, files, strict=False):
-            own = len({path.name for path in paths if path is not None}) == len([*filter(None, paths)])
+            own = len({path.name for path in paths}) == len(paths)
             for t, path in enumerate(paths[:count]):
-                if path is None or not path.is_file():
+                if not path.is_file():
                     continue
                 names[t, side] = prefixes[side] + (path.name if own else f"{t:06d}{path.suffix}")
                 link = folder / names[t, side]
@@ -189,21 +189,21 @@ def lay_out(sequence: ImageSequence, folder: Path, count: int) -> Names:
     return names
 
 
-def _files(source: Source, size: tuple[int, int]) -> list[list[Path | None]] | None:
+def _files(source: Source, size: tuple[int, int]) -> list[list[Path]] | None:
     """The files of one camera or two that hold the images as they are filtered; None where there are none."""
     rows: list[int] | None = None
     if isinstance(source, Chosen):
         rows, source = source.rows.tolist(), source.source
     if not isinstance(source, FileImages):
         return None
-    cameras: list[list[Path | None]] = [list(source.left), *([] if source.right is None else [list(source.right)])]
+    cameras = [list(source.left), *([] if source.right is None else [list(source.right)])]
     for files in cameras:
         try:
-            with Image.open(next(path for path in files if path is not None)) as first:
+            with Image.open(files[0]) as first:
                 upright = first.getexif().get(ExifTags.Base.Orientation, _UPRIGHT) == _UPRIGHT
                 # An image made smaller is no file.
                 if first.size != size or not upright:
                     return None
-        except (OSError, StopIteration):
+        except (OSError, IndexError):
             return None
     return [files if rows is None else [files[row] for row in rows] for files in cameras]

@@ -26,7 +26,7 @@ import bz2
 import logging
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -40,15 +40,8 @@ from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
-from rbpf.sensors.readers.images.decoding import (
-    Grey,
-    UnreadableImageError,
-    decode,
-    decode_ahead,
-    require_shape,
-    to_grey,
-)
-from rbpf.sensors.readers.images.poses import LONGEST, pose_of_matrix, rigid_motion_error, truth_between
+from rbpf.sensors.readers.images.decoding import Grey, decode, decode_ahead, frame_of, require_shape, to_grey
+from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
 from rbpf.sensors.readers.images.rectification import pair_stamps, rectified
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
@@ -209,33 +202,33 @@ def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | N
     """Image (H, W) of a message, which `where` names in messages; of this height and width, if they are given.
 
     Raises:
-        UnreadableImageError: it is damaged, or of an encoding that is not known.
+        InputError: it is damaged, of an encoding that is not known, or of another size.
     """
     import cv2
 
     try:
         message = bag.message(raw)
     except InputError:
-        raise UnreadableImageError(f"{where}: a message is damaged.") from None
+        raise InputError(f"{where}: a message is damaged.") from None
     if raw.type == COMPRESSED:
         return decode(where, np.asarray(message.data, np.uint8), shape)
     if message.encoding not in _LAYOUTS:
         known = ", ".join(_LAYOUTS)
-        raise UnreadableImageError(f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it.")
+        raise InputError(f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it.")
     channels, kind, conversion = _LAYOUTS[message.encoding]
     width = message.width * channels * np.dtype(kind).itemsize
     if not (message.height > 0 and 0 < width <= message.step):
-        raise UnreadableImageError(f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes.")
+        raise InputError(f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes.")
     if message.height * message.step != len(message.data):
         expected = f"expected {message.height} rows of {message.step} bytes"
-        raise UnreadableImageError(f"{where}: {expected}, found {len(message.data)} bytes.")
+        raise InputError(f"{where}: {expected}, found {len(message.data)} bytes.")
     rows = np.ascontiguousarray(message.data.reshape(message.height, message.step)[:, :width])
     pixels = rows.view(np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
     if channels > 1:
         pixels = pixels.reshape(message.height, message.width, channels)
     if conversion is not None:
         pixels = np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)))
-    return to_grey(where, pixels)
+    return require_shape(where, to_grey(where, pixels), shape)
 
 
 @dataclass(frozen=True)
@@ -310,6 +303,12 @@ def _field(message: Any, name: str) -> Array:
     return np.array(getattr(message, name if hasattr(message, name) else name.lower()), np.float64)
 
 
+def numbers_of(pose: Any) -> Array:
+    """[qx, qy, qz, qw, x, y, z] of a Pose or a Transform as it is in a message."""
+    turn, place = (pose.orientation, pose.position) if hasattr(pose, "position") else (pose.rotation, pose.translation)
+    return np.array([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z], dtype=float)
+
+
 def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -> CameraTruth:
     """The truth that a topic holds, for images at (T,) times, whose frame the poses should be those of."""
     kind = bag.topics.get(topic, "")
@@ -318,7 +317,7 @@ def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -
         found = f"found {', '.join(held)}" if held else "found none"
         raise InputError(f"{bag.path}: expected poses in the topic {topic}, {found} with poses in the bag.")
     where = f"{bag.path}, {topic}"
-    stamps, poses = list[int](), list[list[float]]()
+    stamps, poses = list[int](), list[Array]()
     for raw in bag.messages(topic):
         message = bag.message(raw)
         frame = getattr(message, "child_frame_id", "")
@@ -327,21 +326,15 @@ def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -
                 "%s: the poses of %s are those of %s and are taken as those of the camera %s",
                 bag.path, topic, frame, camera_frame,
             )  # fmt: skip
-        pose = attrgetter(_POSES[kind])(message)
-        turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
-        place = pose.position if hasattr(pose, "position") else pose.translation
         stamps.append(raw.stamp_ns)
-        poses.append([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z])
+        poses.append(numbers_of(attrgetter(_POSES[kind])(message)))
     if not poses:
         raise InputError(f"{where}: no pose can be read.")
-    stamps_ns, world_from_camera = np.array(stamps, np.int64), np.array(poses)
+    stamps_ns = np.array(stamps, np.int64)
     if (late := np.flatnonzero(np.diff(stamps_ns) < 0)).size:
         raise InputError(f"{where}: the stamp of pose {late[0] + 1} is before the one it follows.")
-    length = np.linalg.norm(world_from_camera[:, :4], axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= LONGEST) | ~np.isfinite(world_from_camera).all(axis=1))
-    if wrong.size:
-        raise InputError(f"{where}: pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.6g}, expected 1.")
-    return truth_between(bag.path, stamps_ns, SE3.normalise(world_from_camera), images_ns)
+    world_from_camera = normalised(np.array(poses), lambda row, what: InputError(f"{where}, pose {row}: {what}."))
+    return truth_between(bag.path, stamps_ns, world_from_camera, images_ns)
 
 
 @final
@@ -358,53 +351,58 @@ class RosBag(ImageFormat):
         return (path / "metadata.yaml").is_file() and any(SUFFIXES & set(file.suffixes) for file in path.iterdir())
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        topics = options.topics
-        with opened(path) as bag:
-            topic = _image_topics(bag, topics.images[:1], 1)[0]
-            if options.calibration is None:
-                used = CameraInfo.read(bag, topic).calibration
-            else:
-                used = read_calibration(options.calibration)
-            stream = ImageStream.read(bag, topic)
-            used.require_shape(stream.shape, f"{path}, {topic}")
-            truth = topics.truth and read_poses(bag, topics.truth, stream.stamps_ns, stream.frame)
-        rows = np.arange(len(stream.stamps_ns))
-        source = BagImages(path, stream.stamps_ns, stream.shape, (topic,), (rows,))
-        return ImageSequence(bag.name, used.camera, stream.stamps_ns, truth or None, None, source)
+        return self._read(path, options, 1)
 
     def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
+        return self._read(path, options, 2)
+
+    def _read(self, path: Path, options: ReadOptions, cameras: int) -> ImageSequence:
         topics = options.topics
         with opened(path) as bag:
-            names = _image_topics(bag, topics.images, 2)
-            streams = [ImageStream.read(bag, name) for name in names]
-            where = f"{path}, {' and '.join(names)}"
-            sizes = [f"{stream.shape[1]}x{stream.shape[0]}" for stream in streams]
-            if sizes[0] != sizes[1]:
-                raise InputError(f"{where}: the images have {sizes[0]} and {sizes[1]} px, expected one size.")
-            pair, baseline_m = None, None
+            names = _image_topics(bag, topics.images[:cameras], cameras)
+            # The cameras, by a file or as the bag says.
             if options.calibration is None:
-                pair = _pair_of_infos(bag, streams)
-                camera, baseline_m = pair.left.calibration.camera, pair.apart_m if pair.left.is_rectified else None
+                infos = [CameraInfo.read(bag, name) for name in names]
+                used = infos[0].calibration
             else:
-                used = read_calibration(options.calibration)
-                used.require_shape(streams[0].shape, streams[0].topic)
-                if used.baseline_m is None:
-                    expected = "expected baseline_m, the distance of the two cameras in m"
-                    raise InputError(f"{options.calibration}: {expected}.")
-                camera, baseline_m = used.camera, used.baseline_m
-            left, right, notes = pair_stamps(streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where)
-            stamps_ns = streams[0].stamps_ns[left]
+                infos, used = [], read_calibration(options.calibration)
+            streams = [ImageStream.read(bag, name) for name in names]
+            shape, where = streams[0].shape, f"{path}, {' and '.join(names)}"
+            sizes = [f"{stream.shape[1]}x{stream.shape[0]}" for stream in streams]
+            if sizes[0] != sizes[-1]:
+                raise InputError(f"{where}: the images have {sizes[0]} and {sizes[1]} px, expected one size.")
+            for name, calibration in zip(names, [info.calibration for info in infos] or [used], strict=False):
+                calibration.require_shape(shape, f"{path}, {name}")
+            rows, notes = [np.arange(len(streams[0].stamps_ns))], tuple[str, ...]()
+            if cameras == 2:
+                *rows, notes = pair_stamps(streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where)
+            stamps_ns = streams[0].stamps_ns[rows[0]]
             truth = topics.truth and read_poses(bag, topics.truth, stamps_ns, streams[0].frame)
-        source = BagImages(path, stamps_ns, streams[0].shape, tuple(names), (left, right))
-        sequence = ImageSequence(bag.name, camera, stamps_ns, truth or None, baseline_m, source, notes)
-        if pair is None or baseline_m is not None:
+        source = BagImages(path, stamps_ns, shape, tuple(names), tuple(rows))
+        sequence = ImageSequence(bag.name, used.camera, stamps_ns, truth or None, None, source, notes)
+        if cameras == 1:
             return sequence
+        if not infos:
+            if used.baseline_m is None:
+                raise InputError(f"{options.calibration}: expected baseline_m, the distance of the two cameras in m.")
+            return replace(sequence, baseline_m=used.baseline_m)
+        left, right = infos
+        if left.is_rectified != right.is_rectified:
+            both = " and ".join(names)
+            raise InputError(f"{path}: of {both} one is rectified and the other is not; give two of a kind.")
+        apart_m, where = right.shift_m - left.shift_m, right.calibration.where
+        if apart_m <= 0.0:
+            problem = f"P puts the right camera {apart_m:g} m to the right of the left one"
+            action = "exchange the topics (--image-topic LEFT,RIGHT), or calibrate the two as a pair"
+            raise InputError(f"{where}: {problem}; {action}.")
+        if left.is_rectified:
+            return replace(sequence, baseline_m=apart_m)
         # The right camera in the frame of the left one, by way of the rectified frames.
-        aside = np.array([0.0, 0.0, 0.0, 1.0, pair.apart_m, 0.0, 0.0])
-        from_left, from_right = (info.rectified_from_camera() for info in (pair.left, pair.right))
+        aside = np.array([0.0, 0.0, 0.0, 1.0, apart_m, 0.0, 0.0])
+        from_left, from_right = (info.rectified_from_camera() for info in infos)
         left_from_right = SE3.compose(SE3.inverse(from_left), SE3.compose(aside, from_right))
         note = f"{path}: the two cameras are not rectified; their images are, by the two CameraInfo."
-        return rectified(sequence, pair.right.calibration.camera, left_from_right, pair.right.calibration.where, note)
+        return rectified(sequence, right.calibration.camera, left_from_right, where, note)
 
 
 @dataclass(frozen=True)
@@ -431,7 +429,7 @@ class ImageStream:
                 if first is None:
                     try:
                         first = read_image(bag, raw, where).shape, bag.message(raw).header.frame_id
-                    except UnreadableImageError as error:
+                    except InputError as error:
                         problems.append(str(error))
         except InputError as error:
             if first is None:
@@ -473,34 +471,25 @@ class BagImages(Source):
             ]
             for stream in streams:
                 stack.callback(stream.close)
-            indices = range(start, len(self.stamps_ns))
-            with closing(decode_ahead(lambda index: self._next(streams, index), indices)) as frames:
+
+            def load(index: int) -> ImageFrame:
+                return frame_of(self.stamps_ns[index], *(partial(self._next, stream) for stream in streams))
+
+            with closing(decode_ahead(load, range(start, len(self.stamps_ns)))) as frames:
                 yield from frames
 
-    def _stream(self, bag: Bag, topic: str, rows: np.ndarray) -> Generator[tuple[Grey | None, str | None]]:
-        """Image or problem of each of some messages of a topic."""
-        wanted = iter(rows.tolist())
-        row = next(wanted, None)
+    def _stream(self, bag: Bag, topic: str, rows: np.ndarray) -> Generator[Callable[[], Grey]]:
+        """Of each of some messages of a topic the image, once it is called."""
+        wanted = frozenset(rows.tolist())
         for number, raw in enumerate(bag.messages(topic)):
-            if number == row:
-                where = f"{bag.path}, {topic}, image {number}"
-                try:
-                    yield require_shape(where, read_image(bag, raw, where, self.shape), self.shape), None
-                except UnreadableImageError as error:
-                    yield None, str(error)
-                row = next(wanted, None)
+            if number in wanted:
+                yield partial(read_image, bag, raw, f"{bag.path}, {topic}, image {number}", self.shape)
 
-    def _next(self, streams: list[Generator[tuple[Grey | None, str | None]]], index: int) -> ImageFrame:
-        images, problem = [], None
-        for stream in streams:
-            try:
-                image, wrong = next(stream, (None, f"{self.path}: the bag has changed and ends before."))
-            except InputError as error:
-                image, wrong = None, str(error)
-            images.append(image)
-            problem = problem or wrong
-        right = images[1] if len(images) > 1 else None
-        return ImageFrame(int(self.stamps_ns[index]), images[0], right, problem)
+    def _next(self, stream: Generator[Callable[[], Grey]]) -> Grey:
+        read = next(stream, None)
+        if read is None:
+            raise InputError(f"{self.path}: the bag has changed and ends before.")
+        return read()
 
 
 def _image_topics(bag: Bag, named: tuple[str, ...], count: int) -> list[str]:
@@ -514,26 +503,3 @@ def _image_topics(bag: Bag, named: tuple[str, ...], count: int) -> list[str]:
         what = "one of them with --image-topic" if count == 1 else "two of them with --image-topic LEFT,RIGHT"
         raise InputError(f"{bag.path}: {found}; name {what}." if held else f"{bag.path}: {found}.")
     return chosen
-
-
-class InfoPair(NamedTuple):
-    """The two CameraInfo of a pair, and how far the right camera is to the right of the left one."""
-
-    left: CameraInfo
-    right: CameraInfo
-    apart_m: float
-
-
-def _pair_of_infos(bag: Bag, streams: list[ImageStream]) -> InfoPair:
-    left, right = (CameraInfo.read(bag, stream.topic) for stream in streams)
-    for info, stream in ((left, streams[0]), (right, streams[1])):
-        info.calibration.require_shape(stream.shape, f"{bag.path}, {stream.topic}")
-    if left.is_rectified != right.is_rectified:
-        topics = " and ".join(stream.topic for stream in streams)
-        raise InputError(f"{bag.path}: of {topics} one is rectified and the other is not; give two of a kind.")
-    apart = right.shift_m - left.shift_m
-    if apart <= 0.0:
-        problem = f"P puts the right camera {apart:g} m to the right of the left one"
-        action = "exchange the topics (--image-topic LEFT,RIGHT), or calibrate the two as a pair"
-        raise InputError(f"{right.calibration.where}: {problem}; {action}.")
-    return InfoPair(left, right, apart)

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -24,24 +25,13 @@ Grey = NDArray[np.uint8]
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 
 
-_PNG = b"\x89PNG\r\n\x1a\n"
-
-
-class UnreadableImageError(Exception):
-    """An image that is missing or damaged; its text is the sentence for `ImageFrame.problem`."""
-
-
 def read_grey(path: Path, shape: tuple[int, int] | None = None) -> Grey:
     """Image of a file, (H, W); of this height and width, if they are given.
 
     Raises:
-        UnreadableImageError: the file is missing, is no complete image of a format that OpenCV knows, or has another size.
+        InputError: the file is missing, is no complete image of a format that OpenCV knows, or has another size.
     """
-    try:
-        data = read_bytes(path)
-    except InputError as error:
-        raise UnreadableImageError(str(error)) from None
-    return decode(path, np.frombuffer(data, dtype=np.uint8), shape)
+    return decode(path, np.frombuffer(read_bytes(path), dtype=np.uint8), shape)
 
 
 def decode(path: Path | str, data: NDArray[np.uint8], shape: tuple[int, int] | None = None) -> Grey:
@@ -50,50 +40,34 @@ def decode(path: Path | str, data: NDArray[np.uint8], shape: tuple[int, int] | N
     from PIL import Image
 
     if not data.size:
-        raise UnreadableImageError(f"{path}: the file is empty, expected an image.")
+        raise InputError(f"{path}: the file is empty, expected an image.")
     # Before anything is decoded, which makes room for all that a header claims: the pixels of a damaged one may be more than
-    # the camera has, or than Pillow takes for sane, and a part of a PNG file longer than the file.
-    damaged = UnreadableImageError(f"{path}: the file is damaged, incomplete or no image.")
-    content = data.tobytes()
+    # the camera has, or than Pillow takes for sane, and a part of a PNG file longer than the file, which `verify` sees.
+    damaged = InputError(f"{path}: the file is damaged, incomplete or no image.")
     try:
-        with Image.open(BytesIO(content)) as header:
+        with Image.open(BytesIO(data.tobytes())) as header:
             width, height = header.size
+            header.verify()
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise UnreadableImageError(f"{path}: the image claims to be larger than any camera's.") from None
+        raise InputError(f"{path}: the image claims to be larger than any camera's.") from None
     except Exception:
         raise damaged from None
     if shape is not None and width * height != shape[0] * shape[1]:  # a photo may be turned
         raise _other_size(path, (height, width), shape)
-    if not _png_fits(content):
-        raise damaged
     try:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
-        raise UnreadableImageError(f"{path}: the image cannot be decoded ({error.err}).") from None
+        raise InputError(f"{path}: the image cannot be decoded ({error.err}).") from None
     if image is None:
         raise damaged
-    grey = _to_8_bits(path, image)
-    return grey if shape is None else require_shape(path, grey, shape)
-
-
-def _png_fits(content: bytes) -> bool:
-    """Whether no part of a PNG file claims to reach beyond its end."""
-    if not content.startswith(_PNG):
-        return True
-    at = len(_PNG)
-    while at + 8 <= len(content):
-        end, kind = at + 12 + int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
-        if end > len(content) or kind == b"IEND":
-            return end <= len(content)
-        at = end
-    return True
+    return require_shape(path, _to_8_bits(path, image), shape)
 
 
 def to_grey(path: Path | str, image: np.ndarray) -> Grey:
     """Grey image (H, W) of a decoded video image (H, W), (H, W, 1) or (H, W, 3) in the order blue, green, red.
 
     Raises:
-        UnreadableImageError: it has another depth than 8 or 16 bits.
+        InputError: it has another depth than 8 or 16 bits.
     """
     import cv2
 
@@ -102,27 +76,23 @@ def to_grey(path: Path | str, image: np.ndarray) -> Grey:
     return _to_8_bits(path, image)
 
 
-def require_shape(path: Path | str, image: Grey, shape: tuple[int, int]) -> Grey:
-    """The image, if it has this height and width.
-
-    Raises:
-        UnreadableImageError: it has another size.
-    """
-    if image.shape != shape:
+def require_shape(path: Path | str, image: Grey, shape: tuple[int, int] | None) -> Grey:
+    """The image, if it has this height and width, or None is expected; else an InputError."""
+    if shape is not None and image.shape != shape:
         raise _other_size(path, image.shape[:2], shape)
     return image
 
 
-def _other_size(path: Path | str, found: tuple[int, int], shape: tuple[int, int]) -> UnreadableImageError:
+def _other_size(path: Path | str, found: tuple[int, int], shape: tuple[int, int]) -> InputError:
     expected = f"expected {shape[1]}x{shape[0]} px as in the camera file"
-    return UnreadableImageError(f"{path}: {expected}, found {found[1]}x{found[0]} px.")
+    return InputError(f"{path}: {expected}, found {found[1]}x{found[0]} px.")
 
 
 def _to_8_bits(path: Path | str, image: np.ndarray) -> Grey:
     if image.dtype == np.uint16:
         return np.rint(image * (255.0 / 65535.0)).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise UnreadableImageError(f"{path}: expected 8 or 16 bits per channel, found {image.dtype}.")
+        raise InputError(f"{path}: expected 8 or 16 bits per channel, found {image.dtype}.")
     return image
 
 
@@ -132,34 +102,33 @@ AHEAD = 4
 
 @dataclass(frozen=True)
 class FileImages(Source):
-    """One file per image of a height and width, at times (T,).
-
-    Of a second camera None stands where an image has no partner; without one `right` is None.
-    """
+    """One file per image of a height and width, at times (T,); of the right camera too where there are two."""
 
     stamps_ns: np.ndarray
     shape: tuple[int, int]
     left: Sequence[Path]
-    right: Sequence[Path | None] | None = None
+    right: Sequence[Path] | None = None
 
     def frames(self, start: int) -> Generator[ImageFrame]:
+        cameras = [self.left] if self.right is None else [self.left, self.right]
+
         def load(index: int) -> ImageFrame:
-            image, problem = self._read(self.left[index])
-            right = None
-            if self.right is not None:
-                right, other = self._read(self.right[index])
-                problem = problem or other
-            return ImageFrame(int(self.stamps_ns[index]), image, right, problem)
+            return frame_of(self.stamps_ns[index], *(partial(read_grey, files[index], self.shape) for files in cameras))
 
         return decode_ahead(load, range(start, len(self.left)))
 
-    def _read(self, path: Path | None) -> tuple[Grey | None, str | None]:
-        if path is None:
-            return None, "The second camera has no image of this time."
+
+def frame_of(stamp_ns: int, *reads: Callable[[], Grey]) -> ImageFrame:
+    """The images that one function or two return; one that raises an InputError leaves a place, and says why."""
+    images, problem = list[Grey | None](), None
+    for read in reads:
         try:
-            return read_grey(path, self.shape), None
-        except UnreadableImageError as error:
-            return None, str(error)
+            images.append(read())
+        except InputError as error:
+            images.append(None)
+            problem = problem or str(error)
+    image, right = (*images, None)[:2]
+    return ImageFrame(int(stamp_ns), image, right, problem)
 
 
 def decode_ahead(load: Callable[[int], ImageFrame], indices: Iterable[int]) -> Generator[ImageFrame]:
@@ -183,10 +152,9 @@ def first_shape(paths: Sequence[Path], where: Path) -> tuple[int, int]:
     for path in paths:
         try:
             height, width = read_grey(path).shape
-        except UnreadableImageError as error:
-            problems.append(str(error))
-        else:
             return height, width
+        except InputError as error:
+            problems.append(str(error))
     if not problems:
         raise InputError(f"{where}: expected images, found none.")
     raise InputError(f"{where}: none of {len(problems)} images can be read; the first is {problems[0]}")

@@ -15,7 +15,7 @@ M. Burri, J. Nikolic, P. Gohl, T. Schneider, J. Rehder, S. Omari, M. W. Achtelik
 vehicle datasets", IJRR 35(10), 2016.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import final
 
@@ -24,7 +24,6 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients, read_calibration
 from rbpf.sensors.readers.images.decoding import FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
@@ -51,41 +50,39 @@ class Euroc(ImageFormat):
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         mav = _mav(path)
-        camera = AslCamera.read(mav / "cam0" / "sensor.yaml", self.kind)
-        rows = read_stamped(mav / "cam0" / "data.csv", self.kind, ",", nanoseconds=True)
+        own, body_from_camera = _read_camera(mav / "cam0" / "sensor.yaml", self.kind)
+        rows = read_stamped(mav / "cam0" / "data.csv", self.kind, nanoseconds=True)
         files = rows.files(mav / "cam0" / "data")
-        used = camera.calibration
-        if options.calibration is not None:
-            used = read_calibration(options.calibration)
+        used = own if options.calibration is None else read_calibration(options.calibration)
         shape = first_shape(files, rows.path)
         used.require_shape(shape, str(mav / "cam0"))
         source = FileImages(rows.stamps_ns, shape, files)
-        return replace(_sequence(mav, camera, rows.stamps_ns, source), camera=used.camera)
+        return _sequence(mav, used.camera, body_from_camera, rows.stamps_ns, source)
 
     def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
         mav = _mav(path)
         folders = mav / "cam0", mav / "cam1"
-        left, right = (AslCamera.read(folder / "sensor.yaml", self.stereo_kind) for folder in folders)
-        left_from_right = SE3.between(left.body_from_camera, right.body_from_camera)
-        sizes = [f"{asl.calibration.camera.width}x{asl.calibration.camera.height}" for asl in (left, right)]
+        cameras = [_read_camera(folder / "sensor.yaml", self.stereo_kind) for folder in folders]
+        (left, body_from_left), (right, body_from_right) = cameras
+        left_from_right = SE3.between(body_from_left, body_from_right)
+        sizes = [f"{one.camera.width}x{one.camera.height}" for one in (left, right)]
         if sizes[0] != sizes[1]:
             both = f"cam0 has {sizes[0]} and cam1 {sizes[1]} px, expected one size"
             raise InputError(f"{mav}: {both}; scale the images of one of the two.")
         if not SE3.translation(left_from_right).any():
             problem = "T_BS puts cam1 where cam0 is, a baseline of zero; give the two cameras' own"
             raise InputError(f"{folders[1] / 'sensor.yaml'}: {problem}.")
-        listed = [read_stamped(folder / "data.csv", self.stereo_kind, ",", nanoseconds=True) for folder in folders]
+        listed = [read_stamped(folder / "data.csv", self.stereo_kind, nanoseconds=True) for folder in folders]
         where = str(mav)
         *rows, notes = pair_stamps(listed[0].stamps_ns, listed[1].stamps_ns, options.tolerance_s, where)
         files = []
         for lines, folder, chosen in zip(listed, folders, rows, strict=True):
             paths = lines.files(folder / "data")
             files.append([paths[row] for row in chosen])
-            left.calibration.require_shape(first_shape(files[-1], folder / "data.csv"), str(folder))
-        camera = left.calibration.camera
-        shape, stamps_ns = (camera.height, camera.width), listed[0].stamps_ns[rows[0]]
+            left.require_shape(first_shape(files[-1], folder / "data.csv"), str(folder))
+        shape, stamps_ns = (left.camera.height, left.camera.width), listed[0].stamps_ns[rows[0]]
         source = FileImages(stamps_ns, shape, *files)
-        sequence = replace(_sequence(mav, left, stamps_ns, source), notes=notes)
+        sequence = replace(_sequence(mav, left.camera, body_from_left, stamps_ns, source), notes=notes)
         if options.calibration is not None:
             used = read_calibration(options.calibration)
             used.require_shape(shape, sequence.name)
@@ -93,61 +90,49 @@ class Euroc(ImageFormat):
             return replace(sequence, camera=used.camera, baseline_m=baseline_m)
         note = f"{mav}: the two cameras are not rectified; their images are, by cam0 and cam1's sensor.yaml."
         file = str(folders[1] / "sensor.yaml")
-        return rectified(sequence, right.calibration.camera, left_from_right, file, note)
+        return rectified(sequence, right.camera, left_from_right, file, note)
 
 
-@dataclass(frozen=True)
-class AslCamera:
-    """A camera and where it sits, `body_from_camera` (7,), which is T_BS."""
-
-    calibration: Calibration
-    body_from_camera: Array
-
-    @classmethod
-    def read(cls, path: Path, hint: str) -> "AslCamera":
-        """Read a `sensor.yaml`; `hint` is what is expected to lie there, for messages."""
-        entries = read_yaml(path, hint).entries(_CAMERA)
-        entries["camera_model"].choice(["pinhole"])
-        model = _LENSES[entries["distortion_model"].choice(list(_LENSES))]
-        width, height = entries["resolution"].items(2)
-        fx, fy, cx, cy = entries["intrinsics"].items(4)
-        lens = coefficients(entries["distortion_coefficients"], model)
-        camera = Pinhole(
-            width.size(), height.size(), fx.positive(), fy.positive(), cx.number(), cy.number(), lens, model
-        )
-        return cls(Calibration(str(path), camera), _mount(entries["T_BS"]))
+def _read_camera(path: Path, hint: str) -> tuple[Calibration, Array]:
+    """A camera and where it sits, body_from_camera (7,), of a `sensor.yaml`; `hint` is what is expected to lie there."""
+    entries = read_yaml(path, hint).entries(_CAMERA)
+    entries["camera_model"].choice(["pinhole"])
+    model = _LENSES[entries["distortion_model"].choice(list(_LENSES))]
+    width, height = (item.size() for item in entries["resolution"].items(2))
+    fx, fy, cx, cy = entries["intrinsics"].items(4)
+    lens = coefficients(entries["distortion_coefficients"], model)
+    camera = Pinhole(width, height, fx.positive(), fy.positive(), cx.number(), cy.number(), lens, model)
+    return Calibration(str(path), camera), _mount(entries["T_BS"])
 
 
 def _mav(path: Path) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
-def _sequence(mav: Path, camera: AslCamera, stamps_ns: np.ndarray, source: Source) -> ImageSequence:
+def _sequence(
+    mav: Path, camera: Pinhole, body_from_camera: Array, stamps_ns: np.ndarray, source: Source
+) -> ImageSequence:
     """Images of one camera, with its truth where there is one."""
     folder = mav.resolve()
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    truth = _read_truth(mav, camera, stamps_ns)
-    return ImageSequence(name, camera.calibration.camera, stamps_ns, truth, None, source)
-
-
-def _read_truth(mav: Path, camera: AslCamera, images_ns: np.ndarray) -> CameraTruth | None:
-    for name in _TRUTHS:
-        file, mount = mav / name / "data.csv", mav / name / "sensor.yaml"
-        if not file.exists():
+    truth = None
+    for kind in _TRUTHS:
+        file, mount = mav / kind / "data.csv", mav / kind / "sensor.yaml"
+        if truth is not None or not file.exists():
             continue
-        rows = read_stamped(file, "poses", ",", nanoseconds=True)
-        table = rows.table(_TRUTH_COLUMNS, ",")
+        rows = read_stamped(file, "poses", nanoseconds=True)
+        table = rows.table(_TRUTH_COLUMNS)
         xyzw = np.roll(table.block("q_w", "q_z"), -1, axis=1)
-        world_from_sensor = normalised(table, np.hstack([xyzw, table.block("p_x", "p_z")]))
-        if name == _TRUTHS[0] and not mount.exists():
+        world_from_sensor = normalised(np.hstack([xyzw, table.block("p_x", "p_z")]), table.error)
+        if kind == _TRUTHS[0] and not mount.exists():
             # The estimated state is the body's by definition; where a marker sits on it is not.
             sensor_from_body = SE3.identity()
         else:
             hint = "a sensor.yaml with T_BS, the pose of the sensor on the body"
             sensor_from_body = SE3.inverse(_mount(read_yaml(mount, hint).entries(["T_BS"])["T_BS"]))
-        poses = SE3.compose(world_from_sensor, SE3.compose(sensor_from_body, camera.body_from_camera))
-        return truth_between(file, rows.stamps_ns, poses, images_ns)
-    return None
+        poses = SE3.compose(world_from_sensor, SE3.compose(sensor_from_body, body_from_camera))
+        truth = truth_between(file, rows.stamps_ns, poses, stamps_ns)
+    return ImageSequence(name, camera, stamps_ns, truth, None, source)
 
 
 def _mount(value: YamlValue) -> Array:

@@ -36,6 +36,7 @@ A camera file given replaces the recording's own.
 
 import logging
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import final
 
@@ -49,7 +50,7 @@ from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_cali
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
-from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_lines, read_stamped, read_text
+from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted, read_stamped, read_text
 
 DEFAULT_RATE_HZ = 30.0
 SCENES_RATE_HZ = 30.0
@@ -90,28 +91,18 @@ class SevenScenes(ImageFormat):
         return any(_SCENES_IMAGE.fullmatch(file.name) for file in found)
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        by_number: dict[int, Path] = {}
-        for file in sorted(path.glob("frame-*.color.*")):
-            match = _SCENES_IMAGE.fullmatch(file.name)
-            if match and file.suffix.lower() in SUFFIXES:
-                number = int(match[1])
-                if number in by_number:
-                    both = f"found {by_number[number].name} and {file.name}"
-                    raise InputError(f"{path}: {both}, expected one image of each number.")
-                by_number[number] = file
-        numbers = sorted(by_number)
-        files = [by_number[number] for number in numbers]
+        found = ((_SCENES_IMAGE.fullmatch(file.name), file) for file in path.glob("frame-*.color.*"))
+        images = sorted((int(match[1]), file) for match, file in found if match and file.suffix.lower() in SUFFIXES)
+        for (number, file), (later, other) in pairwise(images):
+            if number == later:
+                raise InputError(f"{path}: found {file.name} and {other.name}, expected one image of each number.")
         known = options.calibration is not None or (path / NAME).is_file()
         camera = find_calibration(path, options.calibration) if known else SCENES_CAMERA
-        stamps_ns = np.rint(np.array(numbers, dtype=np.int64) * (1e9 / SCENES_RATE_HZ)).astype(np.int64)
-        poses, kept = [], []
-        for stamp, file in zip(stamps_ns, files, strict=True):
-            pose_file = file.with_name(file.name.split(".")[0] + ".pose.txt")
-            pose = _scenes_pose(pose_file) if pose_file.exists() else None
-            if pose is not None:
-                poses.append(pose)
-                kept.append(stamp)
-        truth = CameraTruth(np.array(kept), np.array(poses)) if poses else None
+        numbers, files = np.array([number for number, _ in images], dtype=np.int64), [file for _, file in images]
+        stamps_ns = np.rint(numbers * (1e9 / SCENES_RATE_HZ)).astype(np.int64)
+        poses = [_scenes_pose(file.with_name(file.name.split(".")[0] + ".pose.txt")) for file in files]
+        kept = [row for row, pose in enumerate(poses) if pose is not None]
+        truth = CameraTruth(stamps_ns[kept], np.array([poses[row] for row in kept])) if kept else None
         return _sequence(path, camera, stamps_ns, files, truth)
 
 
@@ -126,28 +117,22 @@ class Photos(ImageFormat):
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         file = path / "cameras.txt"
-        numbered = [(i, line.strip()) for i, line in enumerate(read_lines(file, self.kind), 1)]
-        rows = [(i, *line.partition(" ")[::2]) for i, line in numbered if line and not line.startswith("#")]
+        rows = [(number, *line.partition(" ")[::2]) for number, line in numbered_lines(file, self.kind)]
         cameras = [(line, rest) for line, name, rest in rows if name == "K"]
         if len(cameras) != 1:
-            expected = "expected one line `K fx fy cx cy width height`"
-            raise InputError(f"{file}: {expected}, found {len(cameras)}.")
-        given = options.calibration
-        if given is None:
-            line, rest = cameras[0]
-            numbers = parse_table(file, _PHOTO_CAMERA, [(line, rest)]).values[0].tolist()
-            fx, fy, cx, cy, width, height = numbers
+            raise InputError(f"{file}: expected one line `K fx fy cx cy width height`, found {len(cameras)}.")
+        if options.calibration is None:
+            line = cameras[0][0]
+            fx, fy, cx, cy, width, height = parse_table(file, _PHOTO_CAMERA, cameras).values[0].tolist()
             if not (min(fx, fy, width, height) > 0.0 and width % 1 == 0 and height % 1 == 0):
-                expected = "expected positive fx and fy, and a whole positive width and height"
-                raise line_error(file, line, expected)
-            pinhole = Pinhole(int(width), int(height), fx, fy, cx, cy)
-            camera = Calibration(f"{file}, line {line}", pinhole)
+                raise line_error(file, line, "expected positive fx and fy, and a whole positive width and height")
+            camera = Calibration(f"{file}, line {line}", Pinhole(int(width), int(height), fx, fy, cx, cy))
         else:
-            camera = read_calibration(given)
+            camera = read_calibration(options.calibration)
         photos = [row for row in rows if row[1] != "K"]
         table = parse_table(file, _PHOTO_POSE, [(line, pose) for line, _, pose in photos])
         stamps_ns = evenly(len(photos), PHOTO_RATE_HZ)
-        truth = CameraTruth(stamps_ns, normalised(table, np.roll(table.values, 4, axis=1)))
+        truth = CameraTruth(stamps_ns, normalised(np.roll(table.values, 4, axis=1), table.error))
         files = [path / "images" / name for _, name, _ in photos]
         return _sequence(path, camera, stamps_ns, files, truth, file)
 
@@ -167,11 +152,9 @@ class Folder(ImageFormat):
             raise InputError(f"{path}: expected images in it or in its images/, found none.")
         camera, times = find_calibration(path, options.calibration), path / "times.txt"
         if times.exists():
-            rows = read_stamped(times, self.kind)
-            if len(rows.lines) != len(files):
-                expected = f"expected {len(files)} times, one per image"
-                raise InputError(f"{times}: {expected}, found {len(rows.lines)}.")
-            stamps_ns = rows.stamps_ns
+            stamps_ns = read_stamped(times, self.kind).stamps_ns
+            if len(stamps_ns) != len(files):
+                raise InputError(f"{times}: expected {len(files)} times, one per image, found {len(stamps_ns)}.")
         else:
             stamps_ns = evenly(len(files), camera.rate_hz or DEFAULT_RATE_HZ)
             if camera.rate_hz is None:
@@ -213,7 +196,9 @@ def _sequence(
 
 
 def _scenes_pose(path: Path) -> Array | None:
-    """Pose (7,) of a file; None where its numbers are not finite."""
+    """Pose (7,) of a file; None where there is none, or its numbers are not finite."""
+    if not path.exists():
+        return None
     fields = read_text(path, "a 4 x 4 matrix").split()
     try:
         matrix = np.array([float(field) for field in fields])

@@ -54,26 +54,29 @@ class Kitti(ImageFormat):
         folders = path / f"image_{left}", path / f"image_{right}"
         if stereo and not folders[1].is_dir():
             raise InputError(f"{folders[1]}: no such folder, expected the images of the right camera.")
-        projections = Projections.read(path / "calib.txt", self.kind)
+        calib = path / "calib.txt"
+        projection = Projection.read(calib, self.kind, left)
         rows = read_stamped(path / "times.txt", self.kind)
-        count = len(rows.lines)
+        count = len(rows.stamps_ns)
         # Files of the left camera, and of the right one.
         files = [_files(folder, count) for folder in (folders if stereo else folders[:1])]
         shape = first_shape(files[0], folders[0])
         if options.calibration is not None:
             used = read_calibration(options.calibration)
         else:
-            fx, fy, cx, cy = projections.intrinsics(left)
+            fx, fy, cx, cy = projection.intrinsics.tolist()
             height, width = shape
             if not (0.0 < cx < width and 0.0 < cy < height):
-                centre = f"the centre of projection ({cx:.6g}, {cy:.6g}) px"
-                problem = f"{centre} lies outside the images of {width}x{height} px"
-                raise InputError(f"{projections.path}: {problem}; give the calibration of these images.")
-            used = Calibration(str(projections.path), Pinhole(width, height, fx, fy, cx, cy))
+                problem = f"({cx:.6g}, {cy:.6g}) px lies outside the images of {width}x{height} px"
+                raise InputError(f"{calib}: the centre of projection {problem}; give the calibration of these images.")
+            used = Calibration(str(calib), Pinhole(width, height, fx, fy, cx, cy))
         used.require_shape(shape, str(path))
         if stereo and (other := first_shape(files[1], folders[1])) != shape:
             sizes = f"{shape[1]}x{shape[0]} and {other[1]}x{other[0]} px"
             raise InputError(f"{path}: the left and right images have {sizes}, expected one size.")
+        baseline_m = used.baseline_m if stereo else None
+        if stereo and baseline_m is None:
+            baseline_m = projection.baseline(Projection.read(calib, self.kind, right))
         # A sentence about each folder that does not hold an image for every time.
         held = [sum(file.exists() for file in of_camera) for of_camera in files]
         notes = tuple(
@@ -85,70 +88,51 @@ class Kitti(ImageFormat):
             name=path.resolve().name,
             camera=used.camera,
             stamps_ns=rows.stamps_ns,
-            truth=_read_truth(path, projections.first_from_camera(left), rows.stamps_ns),
-            baseline_m=used.baseline_m or projections.baseline(left, right) if stereo else None,
+            truth=_read_truth(path, projection.first_from_camera, rows.stamps_ns),
+            baseline_m=baseline_m,
             source=FileImages(rows.stamps_ns, shape, *files),
             notes=notes,
         )
 
 
 @dataclass(frozen=True)
-class Projections:
-    """The cameras' projections of `calib.txt`: (3, 4) K [I | t], and the line of each, by the camera's number."""
+class Projection:
+    """A camera in `calib.txt`, whose line `where` names."""
 
-    path: Path
-    matrices: dict[int, Array]
-    lines: dict[int, int]
+    where: str
+    intrinsics: Array  #: (4,) fx, fy, cx, cy [px].
+    first_from_camera: Array  #: (7,) pose in the frame of camera 0, to which poses refer.
 
     @classmethod
-    def read(cls, path: Path, hint: str) -> "Projections":
-        """Read the projections; other lines are passed over. `hint` is what is expected to lie there, for messages."""
-        matrices, lines = {}, {}
+    def read(cls, path: Path, hint: str, camera: int) -> "Projection":
+        """The camera of a number; other lines are passed over. `hint` is what is expected to lie there, for messages."""
         for number, line in enumerate(read_text(path, hint).splitlines(), 1):
             name, _, rest = line.partition(":")
-            if name not in ("P0", "P1", "P2", "P3"):
+            if name != f"P{camera}":
                 continue
             fields = rest.split()
             if len(fields) != 12:
                 raise line_error(path, number, f"expected {name}: and 12 numbers, found {len(fields)}")
-            values = [parse_number(path, number, name, field) for field in fields]
-            matrices[int(name[1])] = np.reshape(values, (3, 4))
-            lines[int(name[1])] = number
-        return cls(path, matrices, lines)
+            matrix = np.reshape([parse_number(path, number, name, field) for field in fields], (3, 4))
+            fx, fy, cx, cy = intrinsics = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+            pinhole = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            if not (fx > 0.0 and fy > 0.0 and np.array_equal(matrix[:, :3], pinhole)):
+                problem = f"expected {name} to be fx 0 cx . 0 fy cy . 0 0 1 . with positive fx and fy"
+                raise line_error(path, number, problem)
+            shift = -np.linalg.solve(pinhole, matrix[:, 3])
+            return cls(f"{path}, line {number}", intrinsics, np.concatenate([SE3.identity()[:4], shift]))
+        raise InputError(f"{path}: expected a line `P{camera}:` and 12 numbers, found none.")
 
-    def intrinsics(self, camera: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy [px]."""
-        matrix = self._matrix(camera)
-        fx, fy = matrix[0, 0], matrix[1, 1]
-        pinhole = np.array([[fx, 0.0, matrix[0, 2]], [0.0, fy, matrix[1, 2]], [0.0, 0.0, 1.0]])
-        if not (fx > 0.0 and fy > 0.0 and np.array_equal(matrix[:, :3], pinhole)):
-            problem = f"expected P{camera} to be fx 0 cx . 0 fy cy . 0 0 1 . with positive fx and fy"
-            raise line_error(self.path, self.lines[camera], problem)
-        return float(fx), float(fy), float(matrix[0, 2]), float(matrix[1, 2])
-
-    def first_from_camera(self, camera: int) -> Array:
-        """Pose (7,) of a camera in the frame of camera 0, to which poses refer."""
-        self.intrinsics(camera)
-        matrix = self._matrix(camera)
-        shift = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-        return np.concatenate([SE3.identity()[:4], shift])
-
-    def baseline(self, left: int, right: int) -> float:
-        """Distance [m] of the cameras of a pair."""
-        differ = np.subtract(self.intrinsics(left), self.intrinsics(right))
-        along = float((self.first_from_camera(right) - self.first_from_camera(left))[4])
+    def baseline(self, right: "Projection") -> float:
+        """Distance [m] of the right camera of a pair."""
+        along = float((right.first_from_camera - self.first_from_camera)[4])
         if along == 0.0:
-            problem = f"P{right} is at the place of P{left}, a baseline of zero; give the projections of two cameras"
-            raise line_error(self.path, self.lines[right], problem)
-        if np.abs(differ).max() > ALIGNED_PX or along <= 0.0:
-            problem = f"expected P{right} to be P{left} shifted to the right, as of a rectified pair"
-            raise line_error(self.path, self.lines[right], problem)
+            problem = "it is at the place of the left camera, a baseline of zero; give the projections of two cameras"
+            raise InputError(f"{right.where}: {problem}.")
+        if np.abs(self.intrinsics - right.intrinsics).max() > ALIGNED_PX or along <= 0.0:
+            problem = "expected the left camera's projection shifted to the right, as of a rectified pair"
+            raise InputError(f"{right.where}: {problem}.")
         return along
-
-    def _matrix(self, camera: int) -> Array:
-        if camera not in self.matrices:
-            raise InputError(f"{self.path}: expected a line `P{camera}:` and 12 numbers, found none.")
-        return self.matrices[camera]
 
 
 def _files(folder: Path, count: int) -> list[Path]:

@@ -1,5 +1,6 @@
 """Poses as files write them, matrices or quaternions, and the ground truth that they make."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers.text import Table, read_stamped
+from rbpf.sensors.readers.text import read_stamped
 
 SKEWED = 0.02
 """How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more."""
@@ -30,12 +31,12 @@ def pose_of_matrix(matrix: Array) -> Array:
     return SE3.normalise(SE3.from_matrix(matrix))
 
 
-def normalised(table: Table, world_from_body: Array) -> Array:
-    """Poses (T, 7) of a table with their quaternions scaled to length 1."""
+def normalised(world_from_body: Array, error: Callable[[int, str], InputError]) -> Array:
+    """Poses (T, 7) with their quaternions scaled to length 1; `error` says where a row is that has none."""
     length = np.linalg.norm(world_from_body[:, :4], axis=1)
-    if (wrong := np.flatnonzero(np.abs(length - 1.0) > LONGEST)).size:
-        problem = f"expected a quaternion of length 1, found one of length {length[wrong[0]]:.6g}"
-        raise table.error(int(wrong[0]), problem)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= LONGEST) | ~np.isfinite(world_from_body).all(axis=1))
+    if wrong.size:
+        raise error(int(wrong[0]), f"expected a quaternion of length 1, found one of length {length[wrong[0]]:.6g}")
     return SE3.normalise(world_from_body)
 
 
@@ -54,5 +55,5 @@ def read_tum_truth(path: Path, images_ns: np.ndarray) -> CameraTruth | None:
         return None
     rows = read_stamped(path, "poses")
     table = rows.table(("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    poses = normalised(table, np.roll(table.values, 4, axis=1))
+    poses = normalised(np.roll(table.values, 4, axis=1), table.error)
     return truth_between(path, rows.stamps_ns, poses, images_ns)

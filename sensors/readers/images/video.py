@@ -18,20 +18,13 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.readers.images.calibration import find_calibration, read_calibration
-from rbpf.sensors.readers.images.decoding import (
-    Grey,
-    UnreadableImageError,
-    decode_ahead,
-    read_grey,
-    require_shape,
-    to_grey,
-)
+from rbpf.sensors.readers.images.decoding import Grey, decode_ahead, frame_of, read_grey, require_shape, to_grey
 from rbpf.sensors.readers.images.folders import DEFAULT_RATE_HZ, evenly, list_images
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
@@ -53,14 +46,13 @@ class Video(ImageFormat):
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         calibration = find_calibration(path.parent, options.calibration)
-        found = read_header(path)
-        stamps_ns, camera = found.stamps_ns, calibration.camera
+        camera, (stamps_ns, shape, quarters) = calibration.camera, read_header(path)
         if calibration.rate_hz is not None:
             stamps_ns = evenly(len(stamps_ns), calibration.rate_hz)
-        if found.quarters % 2 and found.shape == (camera.width, camera.height) != found.shape[::-1]:
-            calibration = replace(calibration, camera=camera.turned(found.quarters))
-        calibration.require_shape(found.shape, str(path))
-        source = VideoImages(path, stamps_ns, found.shape)
+        if quarters % 2 and shape == (camera.width, camera.height) != shape[::-1]:
+            calibration = replace(calibration, camera=camera.turned(quarters))
+        calibration.require_shape(shape, str(path))
+        source = VideoImages(path, stamps_ns, shape)
         return ImageSequence(path.stem, calibration.camera, stamps_ns, None, None, source)
 
 
@@ -85,31 +77,22 @@ class VideoImages(Source):
                         return
 
     def _next(self, capture: Any, index: int) -> ImageFrame:
-        stamp = int(self.stamps_ns[index])
-        there, image = capture.read()
-        if not there:
-            kept = f"the video ends after {index} of {len(self.stamps_ns)} images; those are kept"
-            return ImageFrame(stamp, None, problem=f"{self.path}: {kept}.")
-        try:
-            return ImageFrame(stamp, require_shape(self.path, to_grey(self.path, image), self.shape))
-        except UnreadableImageError as error:
-            return ImageFrame(stamp, None, problem=str(error))
+        def read() -> Grey:
+            there, image = capture.read()
+            if not there:
+                kept = f"the video ends after {index} of {len(self.stamps_ns)} images; those are kept"
+                raise InputError(f"{self.path}: {kept}.")
+            return require_shape(self.path, to_grey(self.path, image), self.shape)
+
+        return frame_of(self.stamps_ns[index], read)
 
 
-class Header(NamedTuple):
+def read_header(path: Path) -> tuple[np.ndarray, tuple[int, int], int]:
     """What a video says of itself.
 
-    Times (T,) int64 ns of its images, from 0; height and width of the first; quarters of a turn, clockwise, by which the
-    stored images are turned.
-    """
-
-    stamps_ns: np.ndarray
-    shape: tuple[int, int]
-    quarters: int
-
-
-def read_header(path: Path) -> Header:
-    """The times, size and direction of a video's images.
+    Returns:
+        Times (T,) int64 ns of its images, from 0; height and width of the first; quarters of a turn, clockwise, by which the
+        stored images are turned.
 
     Raises:
         InputError: it cannot be opened, or no image of it can be decoded.
@@ -130,10 +113,10 @@ def read_header(path: Path) -> Header:
     own_ns = np.rint(np.nan_to_num(np.array(times_ms) - times_ms[0]) * 1e6).astype(np.int64)
     even_ns = evenly(own_ns.size, rate_hz)
     if (np.diff(own_ns) > 0).all() and np.abs(own_ns - even_ns).max() > _ROUNDING_NS:
-        return Header(own_ns, shape, quarters)
+        return own_ns, shape, quarters
     # A header may announce what it likes; no image takes less than a byte.
     count = int(announced) if 0 < announced <= path.stat().st_size else own_ns.size
-    return Header(evenly(count, rate_hz), shape, quarters)
+    return evenly(count, rate_hz), shape, quarters
 
 
 @contextmanager
@@ -173,26 +156,24 @@ def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[tuple[str, G
     files = [] if video else list_images(path)
     if not (video or files):
         raise InputError(f"{path}: expected images in it or in its images/, found none")
-    count = len(read_header(path).stamps_ns) if video else len(files)
+    count = len(read_header(path)[0]) if video else len(files)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-    return len(chosen), _of_video(path, set(chosen.tolist())) if video else _of_files([files[k] for k in chosen])
 
+    def images() -> Iterator[tuple[str, Grey]]:
+        for file in [] if video else [files[k] for k in chosen]:
+            with suppress(InputError):
+                yield file.name, read_grey(file)
+        if video:
+            with opened(path) as capture:
+                for index in range(int(chosen[-1]) + 1):
+                    if not capture.grab():
+                        return
+                    if index in chosen:
+                        there, image = capture.retrieve()
+                        if there:
+                            yield f"image {index}", to_grey(path, image)
 
-def _of_files(files: list[Path]) -> Iterator[tuple[str, Grey]]:
-    for file in files:
-        with suppress(UnreadableImageError):
-            yield file.name, read_grey(file)
-
-
-def _of_video(path: Path, chosen: set[int]) -> Iterator[tuple[str, Grey]]:
-    with opened(path) as capture:
-        for index in range(max(chosen) + 1):
-            if not capture.grab():
-                return
-            if index in chosen:
-                there, image = capture.retrieve()
-                if there:
-                    yield f"image {index}", to_grey(path, image)
+    return len(chosen), images()
 
 
 def camera_number(path: Path) -> int | None:

@@ -349,8 +349,8 @@ def test_truth_from_every_message_that_holds_a_pose(tmp_path, kind, message):
     ("stamps", "pose", "problem"),
     [
         ((1, 2, 0), (0, 0, 0, 1, 0, 0, 0), "the stamp of pose 2 is before the one it follows"),
-        ((1,), (0, 0, 0, 2, 0, 0, 0), "pose 0 has a quaternion of length 2, expected 1"),
-        ((1,), (0, 0, 0, np.nan, 0, 0, 0), "pose 0 has a quaternion of length nan"),
+        ((1,), (0, 0, 0, 2, 0, 0, 0), "pose 0: expected a quaternion of length 1, found one of length 2"),
+        ((1,), (0, 0, 0, np.nan, 0, 0, 0), "pose 0: expected a quaternion of length 1, found one of length nan"),
         ((10**12,), (0, 0, 0, 1, 0, 0, 0), "which is another clock"),
     ],
 )

@@ -150,6 +150,6 @@ def test_a_failure_of_the_decoder_is_a_lost_frame(tmp_path):
     write_images(tmp_path, ["0.png"])
     with (
         mock.patch.object(cv2, "imdecode", side_effect=cv2.error("too many pixels")),
-        pytest.raises(decoding.UnreadableImageError, match=r"0.png: the image cannot be decoded"),
+        pytest.raises(InputError, match=r"0.png: the image cannot be decoded"),
     ):
         decoding.read_grey(tmp_path / "0.png")
