@@ -26,8 +26,7 @@ known_map.npz            the points with what they look like, for --map; see `rb
 and of the laser's
 
 grid.npz                 log-odds of the cells of the particle of highest weight, see `rbpf.maps.grid.Picture`
-grid.pgm, grid.yaml      the same as ROS's map_server and its successors read it: one byte per cell, the highest y in the first
-                         row, 0 where something is, 254 where beams have passed, 205 where nothing is known
+grid.pgm, grid.yaml      the same as ROS's map_server and its successors read it
 """
 
 import json
@@ -64,7 +63,7 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-"""Bytes of grid.pgm."""
+"""Bytes of grid.pgm: where something is, where beams have passed, where nothing is known."""
 
 STILL = 0.01
 """A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth."""
@@ -176,7 +175,7 @@ def write_map(out: Path, found: MapEstimate) -> None:
 
 
 def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
-    """grid.pgm and grid.yaml of what grid.npz holds."""
+    """grid.pgm and grid.yaml of what grid.npz holds: one byte per cell, the highest y in the first row."""
     log_odds, (x, y) = grid["log_odds"], grid["corner"].tolist()
     cells = np.select([log_odds > 0.0, log_odds < 0.0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
     height, width = cells.shape
