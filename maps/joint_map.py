@@ -45,7 +45,6 @@ from rbpf.core.models import (
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
-from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
 from rbpf.maps.joint_columns import JointColumns, Kind, Table
 from rbpf.maps.joint_rows import (
     Group,
@@ -60,6 +59,7 @@ from rbpf.maps.joint_rows import (
     whitened,
 )
 from rbpf.maps.point import Point
+from rbpf.maps.rows import checked_new_ids, expected, first_records, linearised, projected
 from rbpf.maps.submaps import SubMap, SubMaps, by_frame
 
 LARGEST = 6000

@@ -27,11 +27,24 @@ from rbpf.core.particles import Information, Particles, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import gather, project
 from rbpf.lie import LieGroup
-from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
-from rbpf.maps.layout import Layout
 from rbpf.maps.point import Point
-from rbpf.maps.rows import BOTH, MAP, STATE, Plan, RowEngine, by_use, fused_kernel, make_plan, require_apart
-from rbpf.maps.store import ALL, SharedStore
+from rbpf.maps.rows import (
+    BOTH,
+    MAP,
+    STATE,
+    Plan,
+    RowEngine,
+    by_use,
+    checked_new_ids,
+    expected,
+    first_records,
+    fused_kernel,
+    linearised,
+    make_plan,
+    projected,
+    require_apart,
+)
+from rbpf.maps.store import ALL, Layout, SharedStore
 
 
 @final
@@ -163,10 +176,6 @@ class LandmarkMap(Map):
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
         records = self.read(ids, slice(particle, particle + 1))
-        if records.log_weights is not None:
-            mean, const = records.mean[0], None if records.const is None else records.const[0]
-            nu, jac = linearise(model, self.space, z, state[None], mean, const)
-            return nu, jac, records
         nu, by_state, by_landmark = linearised(
             model, self.space, z, state[None], records.mean, records.const, self.compiled
         )

@@ -19,6 +19,7 @@ from rbpf.core.linearisation import linearise
 from rbpf.core.models import (
     NEW,
     NULL,
+    Belief,
     FusedKernel,
     Likelihood,
     LogDensities,
@@ -29,11 +30,10 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import refine, update
+from rbpf.kernels.landmarks import linearise_all, refine, update
 from rbpf.kernels.signature import run_driver
 from rbpf.lie import LieGroup
-from rbpf.maps.layout import Layout
-from rbpf.maps.store import SharedStore
+from rbpf.maps.store import Layout, SharedStore
 
 STATE = frozenset({Part.STATE})
 MAP = frozenset({Part.LANDMARK})
@@ -125,19 +125,11 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
 
 def _are_simple(named: Sequence[np.ndarray], kinds: Kinds, plain: np.ndarray) -> bool:
     """Whether all particles agree, no landmark is observed twice and each group's have one plain parametrisation."""
-    seen = set[int]()
-    for ids in named:
-        if ids.ndim != 1:
-            return False
-        landmarks = [landmark for landmark in ids.tolist() if landmark >= 0]
-        before = len(seen)
-        seen.update(landmarks)
-        if len(seen) < before + len(landmarks):
-            return False
-        of = kinds(np.array(landmarks, dtype=np.int64))
-        if of.size and not (plain[of[0]] and (of == of[0]).all()):
-            return False
-    return True
+    landmarks = [ids[ids >= 0] for ids in named]
+    seen = np.concatenate([np.zeros(0, dtype=np.int64), *landmarks])
+    if any(ids.ndim != 1 for ids in named) or np.unique(seen).size < seen.size:
+        return False
+    return all(plain[of].all() and np.unique(of).size <= 1 for of in map(kinds, landmarks))
 
 
 def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
@@ -159,16 +151,10 @@ def _rows(number: int, ids: np.ndarray) -> list[Row]:
     if ids.ndim == 1:
         return [Row(number, k, landmark, None) for k, landmark in enumerate(ids.tolist()) if landmark >= 0]
     rows = []
-    for k in range(ids.shape[1]):
-        column = ids[:, k]
-        first = int(column[0])
-        if (column == first).all():
-            if first >= 0:
-                rows.append(Row(number, k, first, None))
-            continue
-        rows.extend(
-            Row(number, k, int(landmark), column == landmark) for landmark in np.unique(column) if landmark >= 0
-        )
+    for k, column in enumerate(ids.T):
+        for landmark in np.unique(column[column >= 0]):
+            mask = column == landmark
+            rows.append(Row(number, k, int(landmark), None if mask.all() else mask))
     return rows
 
 
@@ -195,8 +181,6 @@ def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
-_BY_LANDMARK = frozenset({Part.LANDMARK})
-"""All that an update differentiates by: the state has been sampled."""
 PAIRS_AT_ONCE = 8192
 """Particle-observation pairs that NumPy takes at once, so that what it works on stays in the second-level cache."""
 
@@ -315,7 +299,7 @@ class RowEngine:
         means, covs = [], []
         for part in _spans(state.shape[0], ks.size):
             mean, cov, const = _taken(records, part)
-            nu, jac = linearise(group.model, self.space, group.z[ks], state[part, None], mean, const, by=_BY_LANDMARK)
+            nu, jac = linearise(group.model, self.space, group.z[ks], state[part, None], mean, const, by=MAP)
             assert jac.landmark is not None
             mask = None if batch.mask is None else batch.mask[part][:, rows]
             mean, cov, log_terms = linearisation.updated(
@@ -384,7 +368,7 @@ class RowEngine:
         assert records.log_weights is not None
         mean, cov = records.mean[:, 0], records.cov[:, 0]
         at = state[:, None, :]
-        nu, jac = linearise(group.model, self.space, group.z[row.k], at, mean, records.const, by=_BY_LANDMARK)
+        nu, jac = linearise(group.model, self.space, group.z[row.k], at, mean, records.const, by=MAP)
         assert jac.landmark is not None
         mask = None if row.mask is None else np.repeat(row.mask[:, None], mean.shape[1], axis=1)
         likelihood = group.likelihood or GAUSSIAN
@@ -419,3 +403,74 @@ def _taken(records: Records, part: slice) -> tuple[np.ndarray, np.ndarray, np.nd
 
 def _likelihood(group: Observations) -> Likelihood:
     return group.likelihood or GAUSSIAN
+
+
+# What every map does alike: numbers for new landmarks, and what the particles expect to measure of the ones they hold.
+
+
+def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
+    prior, state = belief.prior, belief.state[:, None, :]
+    predicted = model.predict(state, records.mean, records.const)
+    _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
+    assert jac.state is not None and jac.landmark is not None
+    moved = jac.state @ prior.spread(prior.mean)[:, None]
+    within = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
+    return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
+
+
+def projected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """The moments (K, p), (K, p, p) of all particles' expectations together, see `Belief.project`."""
+    predicted, within = expected(model, records, belief)
+    # Relative to the particle of highest weight, so that angles need not be wrapped.
+    mode = predicted[belief.mode]
+    mean, cov = gaussian.mixture_moments(belief.weights, model.residual(predicted, mode), within)
+    return mode + mean, cov
+
+
+def checked_new_ids(
+    ids: np.ndarray | None, count: int, next_id: int, holds: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Numbers (K,) of `count` new landmarks, from `next_id` on where none are given.
+
+    Raises InputError: not new, not whole.
+    """
+    if ids is None:
+        return np.arange(next_id, next_id + count)
+    ids = np.asarray(ids)
+    if ids.shape != (count,) or ids.dtype.kind not in "iu" or (ids < 0).any():
+        raise InputError(f"ids of {count} new landmarks must be as many whole numbers from 0 up, got {ids}")
+    numbers, times = np.unique(ids, return_counts=True)
+    taken = numbers[holds(numbers) | (times > 1)]
+    if taken.size:
+        raise InputError(f"a new landmark needs an id of its own: {taken[0]} is in use")
+    return ids.astype(np.int64)
+
+
+def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state: np.ndarray) -> Records:
+    """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
+    name = type(model).__name__
+    return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))
+
+
+def linearised(
+    model: ObservationModel,
+    space: LieGroup,
+    z: np.ndarray,
+    state: np.ndarray,
+    mean: np.ndarray,
+    const: np.ndarray | None,
+    compiled: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ν (N, K, p), ∂z/∂state (N, K, p, d), ∂z/∂landmark (N, K, p, D) of landmarks (N, K, D) at states (N, E)."""
+    (n, k, dim), p = mean.shape, z.shape[1]
+    kernel = fused_kernel(model) if compiled else None
+    if kernel is None:
+        nu, jac = linearise(model, space, z, state[:, None], mean, const)
+        assert jac.state is not None and jac.landmark is not None
+        return nu, jac.state, jac.landmark
+    held = np.empty((n, k, 0)) if const is None else np.broadcast_to(const, (n, *const.shape[1:]))
+    nu, by_state, by_landmark = np.empty((n, k, p)), np.empty((n, k, p, space.dim)), np.empty((n, k, p, dim))
+    arrays = (np.require(array, np.float64, ["C", "W"]) for array in (state, mean, held, z))
+    linearise_all(kernel.function.address, kernel.params, *arrays, nu, by_state, by_landmark)
+    return nu, by_state, by_landmark

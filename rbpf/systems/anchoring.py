@@ -20,13 +20,15 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import elements, integers, numbers, read, read_one
 from rbpf.core.filter import Filter, StepReport
+from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
-from rbpf.core.linearisation import information, innovation_covariance, linearise
-from rbpf.core.models import Landmark, Likelihood, LineariseAt, NewLandmarks, ObservationModel, Records
+from rbpf.core.linearisation import innovation_covariance, linearise
+from rbpf.core.models import NULL, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Records
 from rbpf.core.particles import Estimate, Information, Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
+from rbpf.maps.landmark_map import LandmarkMap
 
 _MOST_OF_ALL = 0.999
 """A landmark that owes more than this fraction of its information to the first frame says nothing about the start."""
@@ -115,16 +117,19 @@ class StartAnchor:
         backwards = np.repeat((space.adjoint(second.delta) @ second.factor)[None], n, axis=0)
         prior = Prior(space, base, np.zeros((1, space.dim)), backwards)
         # The first frame's measurements of landmarks that are still held, which must be known from elsewhere too.
-        landmark_map, groups = self._filter.belief().map, []
+        rest, groups = LandmarkMap(space, compiled=False), list[Observations]()
+        rest.begin(n, Lineage(n))
         for ids, first in self._seen:
-            held = landmark_map.holds(ids)
-            if held.any():
-                records = landmark_map.read(ids[held])
-                present = ~np.isneginf(landmark_map.log_odds(ids[held]))
-                groups.append(self._without_first_frame(records, first.model, first.z[held], first.cov[held], present))
-        proposed = self._proposal.propose(
-            prior, _linearised_first_frame(prior, groups, self._likelihood), self._filter.rng
-        )
+            held = ids[self._filter.belief().map.holds(ids)]
+            if held.size:
+                groups.append(self._without_first_frame(rest, held, first, np.isin(ids, held)))
+
+        def linearise_at(increment: np.ndarray) -> Information:
+            total = rest.information(prior.at(increment), groups, prior)
+            charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
+            return charted.shifted(np.broadcast_to(increment - prior.mean, (n, space.dim)))
+
+        proposed = self._proposal.propose(prior, linearise_at, self._filter.rng)
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
         # A square factor (N, d, d), also of noise of lower rank.
         factor = prior.factor @ proposed.root
@@ -171,10 +176,12 @@ class StartAnchor:
             lineage.take_up(self._latest[0])
 
     def _without_first_frame(
-        self, records: Records, model: ObservationModel, z: np.ndarray, cov_z: np.ndarray, present: np.ndarray
-    ) -> "_Group":
-        """Takes the first frame's information out of the landmarks again: a Kalman update with −R."""
-        space, n = self._filter.space, self._filter.n
+        self, rest: LandmarkMap, ids: np.ndarray, first: NewLandmarks, rows: np.ndarray
+    ) -> Observations:
+        """Adds landmarks (K,) without the first frame's information, by a Kalman update with −R; its rows, to be used anew."""
+        space, n, landmark_map = self._filter.space, self._filter.n, self._filter.belief().map
+        model, z, cov_z = first.model, first.z[rows], first.cov[rows]
+        records, present = landmark_map.read(ids), ~np.isneginf(landmark_map.log_odds(ids))
         start = np.repeat(self._start[None, None], n, axis=0)
         nu, jac = linearise(model, space, z, start, records.mean, records.const)
         assert jac.landmark is not None
@@ -187,7 +194,8 @@ class StartAnchor:
         gain = records.cov @ np.swapaxes(jac.landmark, -1, -2) @ gaussian.inverse(left)
         mean = records.mean - np.einsum("nkdp,nkp->nkd", gain, nu)
         cov = gaussian.symmetrise(records.cov + gain @ jac.landmark @ records.cov)
-        return _Group(Records(mean, cov, records.const), model, z, cov_z, use)
+        added = rest.add_records(Records(mean, cov, records.const), landmark_map.landmark_of(int(ids[0])))
+        return Observations(z, cov_z, model, self._likelihood, ids=np.where(use, added, NULL))
 
 
 class _FirstMotion(NamedTuple):
@@ -197,32 +205,3 @@ class _FirstMotion(NamedTuple):
     state: np.ndarray
     delta: np.ndarray
     factor: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Group:
-    """First observations z (K, p) of landmarks known from elsewhere, and in which particles (N, K)."""
-
-    records: Records
-    model: ObservationModel
-    z: np.ndarray
-    cov_z: np.ndarray
-    use: np.ndarray
-
-
-def _linearised_first_frame(prior: Prior, groups: list[_Group], likelihood: Likelihood) -> LineariseAt:
-    space = prior.space
-
-    def linearise_at(increment: np.ndarray) -> Information:
-        state = prior.at(increment)
-        total = Information.zeros(state.shape[0], space.dim)
-        for group in groups:
-            records = group.records
-            nu, jac = linearise(group.model, space, group.z, state[:, None], records.mean, records.const)
-            assert jac.state is not None and jac.landmark is not None
-            cov = innovation_covariance(jac.landmark, records.cov, group.cov_z)
-            total.add(information(nu, jac.state, cov, likelihood, prior, group.use))
-        charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
-        return charted.shifted(np.broadcast_to(increment - prior.mean, (state.shape[0], space.dim)))
-
-    return linearise_at

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
-from rbpf.maps.layout import Layout
+from rbpf.maps.store import Layout
 
 
 class Free(Landmark):

@@ -12,7 +12,6 @@ from rbpf.runs.run import Run
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import Pair
-from rbpf.systems.stereo.recovery import relocalise_globally
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import TrackingState
 from tests.systems.plane_sequences import texture
@@ -95,8 +94,7 @@ def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> Pair[Stereo
 
 
 def located(slam: StereoSlam, shown: Pair[StereoFeatures]):
-    rng, landmarks = np.random.default_rng(0), slam.front_end.landmarks
-    return relocalise_globally(landmarks, shown, slam.filter.belief(), VoConfig(), rng)
+    return slam.front_end.landmarks.relocalised(shown, slam.filter.belief(), VoConfig())
 
 
 def test_anywhere_in_the_map(settled):

@@ -16,6 +16,7 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
+from rbpf.maps.rows import BOTH, MAP, STATE
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
@@ -30,9 +31,6 @@ MIN_SCALED = 3
 WIDENED = 3.0
 """Times the standard deviation that the prior of depth has, which a young ray's image is given along its line on top: the
 same prior comes again in every frame, so that in a frame it counts a tenth."""
-
-_STATE, _MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
-_BOTH = _STATE | _MAP
 
 GroupView = ConstellationView | MembersView
 """Measurements of several known points at once."""
@@ -129,20 +127,20 @@ class InverseDepthRays(UnknownDepth):
                 return []
             return [Observations(z[rows], noise[rows], model, ids=ids[rows], updates=updates)]
 
-        depth, young = group(self.model, measured, _MAP), ~has_line
+        depth, young = group(self.model, measured, MAP), ~has_line
         if self.config.pose_update == "off":
             return depth
         if self.config.pose_update == "marginal":
-            depth = group(self.model, measured, _BOTH)
+            depth = group(self.model, measured, BOTH)
             if not scaled:
-                return depth + group(self.model, ~measured, _STATE)
+                return depth + group(self.model, ~measured, STATE)
             young, has_line = young & ~measured, has_line & ~measured
         widened = cov + WIDENED**2 * by_depth[:, :, None] * by_depth[:, None, :]
-        return depth + group(self.model, young, _STATE, widened) + group(self.epipolar, has_line, _STATE)
+        return depth + group(self.model, young, STATE, widened) + group(self.epipolar, has_line, STATE)
 
     def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
         """Whose inverse depth is known to `promote_std_ratio` in `promote_weight` of the particles' weight."""
-        updated = [group.ids for group in observed if group.model is self.model and group.updates != _STATE]
+        updated = [group.ids for group in observed if group.model is self.model and group.updates != STATE]
         if not updated:
             return np.zeros(0, dtype=np.int64)
         ids = np.concatenate([each for each in updated if each is not None])
@@ -208,7 +206,7 @@ class FeatureSensor(Sensor):
         unknown = belief.map.are(ids[rows], self.unknown_depth.landmark)
         if (~unknown).any():
             k = rows[~unknown]
-            updates = _STATE if self.fixed else _BOTH
+            updates = STATE if self.fixed else BOTH
             groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], updates=updates))
         if unknown.any():
             k = rows[unknown]

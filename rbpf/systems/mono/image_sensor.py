@@ -11,6 +11,7 @@ from rbpf.core.checkpoint import grey, integers, read, read_one, truths
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.rows import MAP
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
@@ -28,7 +29,6 @@ MIN_CONTRAST = 10
 MAX_REPEATS = 5
 """Times that an image may come again: drivers repeat single images when the camera is late."""
 
-_MAP = frozenset({Part.LANDMARK})
 _SCREEN = {"last": grey("", ""), "repeats": integers(least=0), "was_unusable": truths()}
 
 
@@ -196,7 +196,7 @@ class ImageSensor(Sensor):
         if trusted.all():
             return list(self.features.observe(used, belief))
         of_trusted, others = (self.features.observe(used.take(rows), belief) for rows in (trusted, ~trusted))
-        only_map = [replace(group, updates=_MAP) for group in others if Part.LANDMARK in group.updates]
+        only_map = [replace(group, updates=MAP) for group in others if Part.LANDMARK in group.updates]
         return [*of_trusted, *only_map]
 
     def new_landmarks(

@@ -19,12 +19,13 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import integers, numbers, read
-from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Part, Sensor
+from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
+from rbpf.maps.rows import MAP
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo
@@ -36,8 +37,6 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.system import MAP_IDS
-
-_MAP = frozenset({Part.LANDMARK})
 
 SEEN_AGAIN = 2
 """Observations of a landmark that stands still: one that moves is not where it was seen first."""
@@ -169,6 +168,36 @@ class Landmarks(Sensor, ABC, Generic[F]):
         features, (mean, cov) = pair.features.take(rows), self.expected(belief, ids[rows])
         z = pair.features.z[pair.for_map]
         return log_support(features.z - mean, features.cov + cov, z, self.rig)
+
+    def relocalised(self, pair: Pair[F], belief: Belief, config: VoConfig) -> tuple[np.ndarray, int] | None:
+        """Where in its whole map a stereo camera is, by what its features look like: without a prediction.
+
+        Appearance alone mistakes some features, so that the matches must agree on one place. The consensus is that of
+        visual odometry; the map takes the place of the earlier pair, as a camera would see it that stands far enough back
+        to have all matched landmarks before it.
+
+        Returns:
+            world_from_camera (7,) in the world of the heaviest particle, and the number of landmarks that agree; None where
+            too few do.
+        """
+        ids = self.match_globally(pair)
+        rows = np.flatnonzero(np.isin(ids, self.seen_again()))
+        if rows.size < config.min_matches:
+            return None
+        features, records = pair.features.take(rows), belief.read_mode(ids[rows])
+        place, cov = records.mean[0], records.cov[0]
+        middle = np.median(place, axis=0)
+        far = np.linalg.norm(place - middle, axis=1).max()
+        world_from_view = SE3.identity()
+        world_from_view[4:] = middle - [0.0, 0.0, 2.0 * far]
+        local = SE3.inverse_transform(world_from_view, place)
+        slope = self.rig.jacobian(local)
+        cov_seen = symmetrise(slope @ cov @ slope.mT) + TINY * np.eye(3)
+        matches = Matches.checked(self.rig, self.rig.project(local), features.z, cov_seen, features.cov)
+        found = estimate_motion(matches, belief.rng, config=config)
+        if not found.found:
+            return None
+        return SE3.compose(world_from_view, found.previous_camera_from_camera), int(found.inliers.sum())
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
@@ -377,7 +406,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         # A candidate is updated, and does not weigh; what is no landmark is a null correspondence for all.
         for chosen, options in (
             (weighs | ~known, {"log_clutter": self.likelihood.log_outlier()}),
-            (known & ~weighs, {"updates": _MAP}),
+            (known & ~weighs, {"updates": MAP}),
         ):
             if (self.ids[chosen] >= 0).any():
                 part: dict[str, Any] = {"ids": self.ids[chosen], **options}

@@ -37,7 +37,6 @@ from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd
 from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
 from rbpf.systems.stereo.odometry import DeadReckoning
-from rbpf.systems.stereo.recovery import motion_for_update
 from rbpf.systems.stereo.tracks import tracked_features
 from rbpf.systems.system import (
     DIAGNOSTICS,
@@ -231,7 +230,7 @@ class StereoSlam(System):
             for_map[motion.rows[1][motion.moving]] = False
             view = replace(pair, for_map=for_map, uncertain=uncertain)
             if uncertain:
-                control, message = motion_for_update(self.filter, landmarks, view, at, config)
+                control, message = self._found_again(view, at)
                 messages += filter(None, (message,))
             if control is not None:
                 begun = time.perf_counter()
@@ -428,6 +427,34 @@ class StereoSlam(System):
             noise[rows[1][motion.inliers]] = later @ used.cov_now
         at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity, cross=cross, noise=noise)
         return _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
+
+    def _found_again(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
+        """By what the particles are moved at a pair after a motion that was only assumed, and in words why.
+
+        The distribution of an assumed motion is a Gaussian, which can wait: as long as the map says nothing about where the
+        camera has come, it grows with every pair, and no particle is drawn from it: None. Drawn at once, a few hundred
+        particles would be decimetres apart, none of them within millimetres of the right place, and landmarks started then
+        would be so, too. A map that has not got so far that it could say where the camera is, is not waited for.
+
+        A place that is found far from where the camera was assumed to go takes the place of the assumed mean: something has
+        deceived the odometry. Its covariance stays, and leaves the rest to each particle's own map.
+        """
+        landmarks, motion, least = self.front_end.landmarks, at.since_update, self.config.map.min_agreeing
+        if landmarks.seen_again().size < least:
+            return motion, ""
+        after = f"after {at.assumed} pair{'s'[: at.assumed > 1]} whose motion was only assumed"
+        belief = self.filter.expect(motion, view.stamp_ns)
+        count = int((landmarks.associate(view, belief) != NULL).sum())
+        if count < least:
+            place = landmarks.relocalised(view, belief, self.config.odometry.estimate)
+            if place is not None:
+                count, heaviest = place[1], self.filter.particles.state[belief.mode]
+                motion = Odometry(SE3.between(heaviest, place[0]), motion.cov)
+        if count >= least:
+            return motion, f"the camera is found again by {count} landmarks of the map, {after}"
+        if at.waiting >= self.config.recovery.patience:
+            return motion, f"the camera is not found again in the map, which goes on from here, {after}"
+        return None, ""
 
     def _proposed(self, view: Pair[Any], moved: Odometry) -> tuple[Pair[Any], Odometry, Proposal | None]:
         """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
