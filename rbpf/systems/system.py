@@ -178,11 +178,8 @@ class System(ABC):
         """
         kept = frames if self.config.lag is None else min(frames, self.config.lag)
         if self.filter.consolidation is None:
-            state, what = (
-                self.filter.particles.state,
-                f"the paths of {self.filter.n} particles over {kept} {self.frame_word}s",
-            )
-            require_memory(float(kept * state.nbytes), f"{what} (lag keeps fewer)")
+            what = f"the paths of {self.filter.n} particles over {kept} {self.frame_word}s (lag keeps fewer)"
+            require_memory(float(kept * self.filter.particles.state.nbytes), what)
             self.recorded = True
             self.filter.history.lag = self.lag
 
