@@ -79,12 +79,12 @@ class KnownMap:
         places = np.concatenate([self.positions, self.views[:, 4:]])
         return 0.5 * float(np.linalg.norm(np.ptp(places, axis=0)))
 
-    def require_camera(self, camera: Pinhole, what: str) -> None:
+    def require_camera(self, camera: Pinhole) -> None:
         """Refuses, by an InputError, another camera than the map's: size, focal length or kind of lens differ."""
         mine = self.camera
         if mine.distortion_model != camera.distortion_model:
             raise InputError(
-                f"the map was made through a lens with {mine.distortion_model} distortion, {what} has "
+                f"the map was made through a lens with {mine.distortion_model} distortion, the recording has "
                 f"{camera.distortion_model} distortion: correct its calibration, or map with it"
             )
         same = (mine.width, mine.height) == (camera.width, camera.height)
@@ -92,7 +92,7 @@ class KnownMap:
         if not same or np.abs(ratio - 1.0).max() > FOCAL_FRACTION:
             raise InputError(
                 f"the map was made with images of {mine.width}x{mine.height} px, focal length {mine.fx:.0f} px; "
-                f"{what} has {camera.width}x{camera.height} px and {camera.fx:.0f} px: scale its images, or map with it"
+                f"the recording has {camera.width}x{camera.height} px and {camera.fx:.0f} px: scale its images, or map with it"
             )
 
 

@@ -143,7 +143,7 @@ class MonoSlam(System):
             self._start = KnownStart.from_pixels(camera, known, config.search.noise_px)
             points = self._start.points
         if known_map is not None:
-            known_map.require_camera(camera, "the recording")
+            known_map.require_camera(camera)
             points = known_map.points
         self.known_points = points
         """Points that were known beforehand, under the names that features have; None where there are none."""

@@ -132,13 +132,13 @@ class Landmarks(Sensor, ABC, Generic[F]):
     def seen_again(self) -> np.ndarray:
         """(M,) landmarks that were found again where the map has them: these stand still, and tell a place."""
 
-    @abstractmethod
     def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where landmarks (k,) will be measured: (k, 3) and covariance (k, 3, 3) without the measurements' noise."""
+        return belief.project(self.model, ids)
 
-    @abstractmethod
     def kinds(self) -> np.ndarray:
-        """(K,) `FeatureKind` of each feature of the pair that the filter took last."""
+        """(K,) `FeatureKind` of each feature of the pair that the filter took last; by default all are landmarks."""
+        return np.full(self.ids.size, FeatureKind.LANDMARK)
 
     def confirmed_static(self) -> np.ndarray:
         """Rows of features of that pair that are where the map has them: they stand still. By default none is known."""
@@ -599,12 +599,6 @@ class NamedLandmarks(Landmarks[NamedPixels]):
 
     def seen_again(self) -> np.ndarray:
         return self._held[self._observations >= SEEN_AGAIN]
-
-    def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return belief.project(self.model, ids)
-
-    def kinds(self) -> np.ndarray:
-        return np.full(self.ids.size, FeatureKind.LANDMARK)
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"names/held": self._held, "names/observations": self._observations}
