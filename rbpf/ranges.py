@@ -10,7 +10,7 @@ Every number has a range: where none is declared, no number is infinite or large
 
 import math
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -51,7 +51,7 @@ class Range:
 class Formerly:
     """Of a field that had another name: `load_settings` refuses that name with today's."""
 
-    name: str
+    name: str = field(repr=False)  # Sphinx, shown it in an annotation, looks for something that has this name
 
 
 ANY = Range()
