@@ -8,6 +8,7 @@ import pytest
 from examples.studies.point_worlds import STEREO, DeskWorld, Measuring, simulate_features
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
+from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -15,6 +16,7 @@ from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.runs.recordings import filter_features as run
 from rbpf.runs.run import Run
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
@@ -94,6 +96,40 @@ def test_how_rays_are_used():
     assert epipolar[2] == marginal[2] == {(EpipolarRay, state)}
     # Without known points the prior of depth holds the scale: the marginal, where it counts.
     assert groups_of("marginal", without_known(LOG))[1] == {(CameraRay, state)}
+
+
+def still_log(seed: int, frames: int) -> FeatureLog:
+    """A camera at rest sees four known points and 25 others, with 0.3 px of noise."""
+    rng, camera = np.random.default_rng(seed), Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
+    corners = np.array([[-0.4, -0.3, 2.0], [0.4, -0.3, 2.0], [0.4, 0.3, 2.0], [-0.4, 0.3, 2.0]])
+    px = rng.uniform([20.0, 20.0], [620.0, 460.0], (25, 2))
+    z = np.concatenate([camera.project(corners), px])
+    cov = np.tile(0.09 * np.eye(2), (29, 1, 1))
+    seen = [
+        FeatureFrame(int(t * 1e9 / 30), np.arange(29), z + rng.normal(0.0, 0.3, z.shape), cov) for t in range(frames)
+    ]
+    known_points = KnownPoints(np.arange(4), corners, np.tile(1e-6 * np.eye(3), (4, 1, 1)))
+    return FeatureLog("still", camera, seen, known_points)
+
+
+@pytest.mark.parametrize("displaced_px", [0.0, 2.0], ids=["at rest", "seen to move"])
+@pytest.mark.parametrize("heaviest", [0, 60, 199])
+def test_the_density_of_rays_is_continuous_in_the_state(displaced_px, heaviest):
+    """Log p along a sideways displacement of 5 mm in steps of 25 µm, wherever on it the heaviest particle is."""
+    log, n = still_log(0, 3), 200
+    system = run(log, MonoConfig(particles=n, max_new_per_frame=30)).system
+    belief = system.filter.belief()
+    states = np.repeat(belief.state[:1], n, axis=0)
+    states[:, :7] = SE3.retract(SE3.identity(), np.linspace(2.5e-5, 5e-3, n)[:, None] * np.eye(6)[3])
+    log_weights = np.where(np.arange(n) == heaviest, 0.0, -50.0)
+    swept = replace(belief, prior=Prior.exactly(belief.prior.space, states), log_weights=log_weights)
+    frame = replace(log.frames[-1], z=log.frames[-1].z + np.array([displaced_px, 0.0]))
+    groups = [group for group in system.features.observe(frame, swept) if isinstance(group.model, CameraRay)]
+    assert {type(group.model) for group in groups} == {EpipolarRay if heaviest else CameraRay}
+    found = swept.map.information(states, groups, swept.prior)
+    steps = np.diff(found.log_factor - 0.5 * (found.quad + found.log_det))
+    # A line leaves open how far along it the camera has moved.
+    assert np.abs(np.diff(steps)).max() < 0.1 and (np.abs(steps).max() > 1e-6) == (heaviest == 0)
 
 
 @every_setting
