@@ -8,14 +8,17 @@ of 1,000 particles, resampled systematically where the effective sample size fal
 
 import inspect
 import time
+import warnings
 from collections.abc import Callable
 
 import numpy as np
-import particles
-from particles import collectors, distributions, state_space_models
-
 from examples.stochastic_volatility import BETA, PHI, SIGMA, LogVariance, Returns, exact, on_a_grid, simulate
 from rbpf import Euclidean, Filter, LikelihoodSensor, MotionModel, PriorProposal, Transition
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # of escapes in its docstrings, told where they are compiled
+    import particles
+    from particles import collectors, distributions, state_space_models
 
 PARTICLES, SEEDS, STEPS = 1000, 20, 100
 
