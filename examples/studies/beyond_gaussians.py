@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
+
 from examples.stochastic_volatility import BETA, PHI, SIGMA, LogVariance, Returns, exact, on_a_grid, simulate
 from rbpf import Euclidean, Filter, LikelihoodSensor, MotionModel, PriorProposal, Transition
 
