@@ -52,7 +52,7 @@ def test_a_whole_log_is_the_plain_solution(log):
     batch = adjusted(log, rough(log))
     np.testing.assert_array_equal(batch.steps, np.arange(FRAMES))
     plain = solve_features(log, robust=HUBER, marginals=False)
-    assert np.abs(SE3.local(plain.world_from_camera, batch.estimate.world_from_body)).max() < 1e-4
+    assert np.abs(SE3.local(plain.world_from_body, batch.estimate.world_from_body)).max() < 1e-4
     error = batch.estimate.trajectory.positions - SE3.translation(known(log.truth).world_from_camera)
     assert np.sqrt(np.square(error).sum(axis=1).mean()) < 0.02
 
