@@ -190,7 +190,7 @@ def associations(
     log_unit: np.ndarray,
     bound: float,
 ) -> list[Association]:
-    """The most probable explanations of a frame, best first.
+    """The most probable explanations of a frame, best first, Mathematics (association-search).
 
     Searches the measurements one by one, those with the fewest candidates first. An explanation of some is a Kalman filter of
     what is expected of the landmarks, by which the next one is judged: what fits together is found together (as the joint

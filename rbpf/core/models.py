@@ -46,6 +46,7 @@ Covariances = Float[np.ndarray, "*#batch p p"]
 Ids = Int[np.ndarray, " K"]
 Z = Float[np.ndarray, "K p"]
 CovZ = Float[np.ndarray, "K p p"]
+Moments = tuple[Float[np.ndarray, "*K D"], Float[np.ndarray, "*K d d"]]
 """K landmarks or measurements of one step, and the measurements' covariances."""
 
 NULL = -1
@@ -490,7 +491,7 @@ class Conditional(ABC):
         """
         raise InputError(f"{type(self).__name__} cannot take in what the particles differ by: resample them")
 
-    def moments(self, particles: Particles, of: Part | Ids) -> tuple[np.ndarray, np.ndarray]:
+    def moments(self, particles: Particles, of: Part | Ids) -> Moments:
         """See `Belief.moments`; of a part that it supplies, or of landmarks. Raises InputError: it does not say."""
         raise InputError(f"{type(self).__name__} does not say mean and covariance of {of}: override moments")
 
@@ -644,7 +645,7 @@ class Belief:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)
 
-    def moments(self, of: Part | Sequence[int] | Ids) -> tuple[np.ndarray, np.ndarray]:
+    def moments(self, of: Part | Sequence[int] | Ids) -> Moments:
         """Mean and covariance over all particles, within + between, of what is named.
 
         Landmarks (K,) of any kind, mixtures too, are points in the world, (K, D) and (K, D, D), in the order named; a map's

@@ -209,7 +209,10 @@ def test_a_run_is_written_over_only_where_that_is_asked_for(began, log, tmp_path
 
 
 def test_only_runs_of_one_camera_are_recalibrated(began, tmp_path, capsys):
-    for folder, words in ((tmp_path, "expected the folder of a finished run"), (began, "no run of one camera")):
+    for folder, words in (
+        (tmp_path, "expected the folder that a finished `rbpf run` left"),
+        (began, "no run of one camera"),
+    ):
         assert main(["recalibrate", str(folder), "--out", str(tmp_path / "out")]) == 2
         assert words in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
