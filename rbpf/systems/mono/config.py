@@ -52,8 +52,8 @@ class InverseDepthConfig(Ranged):
     #: parallax says more of the error of the sampled pose than of depth, and the prior of ρ, which does not change as
     #: long as depth is not measured, would count anew in every frame.
     depth_parallax_px: Annotated[Positive, Formerly("least_px")] = 10.0
-    #: likewise, from where on there is an epipolar line. Before, the 2-D marginal counts, with a prior of ρ so wide
-    #: that it hardly does. More holds a camera at rest better, and follows what moves by itself.
+    #: likewise, from where on what moves in the image has an epipolar line. Before, the 2-D marginal counts, with a prior
+    #: of ρ so wide that it hardly does; of what is seen where it was started, with the prior as it is.
     epipolar_parallax_px: Annotated[Positive, Formerly("line_px")] = 0.3
 
 

@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import Belief, Landmark, NewLandmarks, Observations, Part, Records, Sensor
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -29,8 +30,10 @@ MIN_SCALED = 3
 """Points that must be seen for the scale to be theirs: so many determine the camera's pose."""
 
 WIDENED = 3.0
-"""Times the standard deviation that the prior of depth has, which a young ray's image is given along its line on top: the
-same prior comes again in every frame, so that in a frame it counts a tenth."""
+"""Times the standard deviation that the prior of depth has, which a young ray that moves in the image is given along its
+line on top: the same prior comes again in every frame, so that in a frame it counts a tenth."""
+STILL_CHI2 = 4.0
+"""Squared displacement in the image over the noise of both places, up to which a ray is seen where it was started."""
 
 GroupView = ConstellationView | MembersView
 """Measurements of several known points at once."""
@@ -113,12 +116,15 @@ class InverseDepthRays(UnknownDepth):
         """
         # Depth is measured where it moves the image in the particle of highest weight, E06 §5.1, last paragraph.
         state, mode = belief.state[belief.mode], belief.mode
-        _, jac, _ = belief.map.innovations(self.model, np.zeros((ids.size, 2)), ids, state, mode)
+        _, jac, records = belief.map.innovations(self.model, z, ids, state, mode)
         assert jac.landmark is not None
+        # What is still seen where it was started has no line: that its image stays says that the camera does.
+        displacement = z - self.camera.project(np.insert(records.mean[0, :, :2], 2, 1.0, axis=1))
+        still = squared_mahalanobis(displacement, 2.0 * cov) < STILL_CHI2
         by_depth = self.config.std_per_m * jac.landmark[..., 2]
         squared = np.square(by_depth).sum(axis=-1)
         measured = squared >= self.config.depth_parallax_px**2
-        has_line = squared >= self.config.epipolar_parallax_px**2
+        has_line = ~still & (squared >= self.config.epipolar_parallax_px**2)
 
         def group(
             model: CameraRay, rows: np.ndarray, updates: frozenset[Part], noise: np.ndarray = cov
@@ -135,7 +141,8 @@ class InverseDepthRays(UnknownDepth):
             if not scaled:
                 return depth + group(self.model, ~measured, STATE)
             young, has_line = young & ~measured, has_line & ~measured
-        widened = cov + WIDENED**2 * by_depth[:, :, None] * by_depth[:, None, :]
+        along = np.where(still, 0.0, WIDENED)[:, None] * by_depth
+        widened = cov + along[:, :, None] * along[:, None, :]
         return depth + group(self.model, young, STATE, widened) + group(self.epipolar, has_line, STATE)
 
     def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
