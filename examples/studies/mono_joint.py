@@ -70,7 +70,7 @@ class JointRays(UnknownDepth):
         return model if self.true is None else TrueDepth(model.rho, self.true)
 
     def observations(
-        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
+        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
     ) -> list[Observations]:
         return [Observations(z, cov, self.model, ids=ids)]
 

@@ -53,7 +53,7 @@ class InverseDepthConfig(Ranged):
     #: long as depth is not measured, would count anew in every frame.
     depth_parallax_px: Annotated[Positive, Formerly("least_px")] = 10.0
     #: likewise, from where on what moves in the image has an epipolar line. Before, the 2-D marginal counts, with a prior
-    #: of ρ so wide that it hardly does; of what is seen where it was started, with the prior as it is.
+    #: of ρ so wide that it hardly does; with the prior as it is, where known points are seen, of what has not moved.
     epipolar_parallax_px: Annotated[Positive, Formerly("line_px")] = 0.3
 
 

@@ -51,11 +51,12 @@ class UnknownDepth(ABC):
 
     @abstractmethod
     def observations(
-        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
+        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
     ) -> list[Observations]:
         """What features (K,) of this parametrisation at z (K, 2) px, cov (K, 2, 2) px², say of the pose and of themselves.
 
-        `scaled` is whether points are seen that hold the scale, which else the prior of depth does.
+        `scaled` is whether points are seen that hold the scale, which else the prior of depth does; `held` whether known ones
+        are among them.
         """
 
     @abstractmethod
@@ -107,7 +108,7 @@ class InverseDepthRays(UnknownDepth):
         return CameraRay(self.camera, (middle, max(fraction * middle, float(rho.std()))))
 
     def observations(
-        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
+        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
     ) -> list[Observations]:
         """Epipolar constraint, 2-D marginal, or an update of depth alone, as `InverseDepthConfig.pose_update` says.
 
@@ -118,9 +119,10 @@ class InverseDepthRays(UnknownDepth):
         state, mode = belief.state[belief.mode], belief.mode
         _, jac, records = belief.map.innovations(self.model, z, ids, state, mode)
         assert jac.landmark is not None
-        # What is still seen where it was started has no line: that its image stays says that the camera does.
+        # What is still seen where it was started has no line: that its image stays says that the camera does. But the prior
+        # of depth then comes anew in every frame, which only known points outweigh.
         displacement = z - self.camera.project(np.insert(records.mean[0, :, :2], 2, 1.0, axis=1))
-        still = squared_mahalanobis(displacement, 2.0 * cov) < STILL_CHI2
+        still = held & (squared_mahalanobis(displacement, 2.0 * cov) < STILL_CHI2)
         by_depth = self.config.std_per_m * jac.landmark[..., 2]
         squared = np.square(by_depth).sum(axis=-1)
         measured = squared >= self.config.depth_parallax_px**2
@@ -202,7 +204,8 @@ class FeatureSensor(Sensor):
         # All members of the constellation that are seen are one measurement of it.
         members, ids = self.members(frame.landmarks), self._ids(belief, frame.landmarks)
         rows = np.flatnonzero((members >= 0) & inside)
-        if rows.size:
+        held = rows.size > 0
+        if held:
             landmark, view = self._view(belief, members[rows])
             cov = np.zeros((1, view.dim, view.dim))
             for k, row in enumerate(rows.tolist()):
@@ -218,7 +221,7 @@ class FeatureSensor(Sensor):
         if unknown.any():
             k = rows[unknown]
             scaled = sum(group.z.size for group in groups) >= 2 * MIN_SCALED
-            groups += self.unknown_depth.observations(belief, frame.z[k], frame.cov_z[k], ids[k], scaled)
+            groups += self.unknown_depth.observations(belief, frame.z[k], frame.cov_z[k], ids[k], scaled, held)
         return groups
 
     def new_landmarks(
