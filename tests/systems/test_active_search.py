@@ -144,13 +144,15 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     recording = open_images(tmp_path / "desk")
     known = read_known_points(tmp_path / "desk" / "known_points.csv")
     damaged = cover_view(1 / 3, 60, 60)(recording)
-    off, stamps = {}, recording.stamps_ns
-    credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0), seed=2)
-    for name, config in (("credulous", credulous), ("usual", MonoConfig(seed=2))):
-        run = filter_opened(open_mono(damaged, config, known))
-        off[name] = ate(Trajectory(stamps, run.log.poses), Trajectory(stamps, run.truth.poses)).rmse
-    assert off["usual"] < 0.03
-    assert off["credulous"] > 2.0 * off["usual"]
+    off: dict[str, list[float]] = {"credulous": [], "usual": []}
+    stamps = recording.stamps_ns
+    # Runs differ from seed to seed by more than the two kinds do: their means over six.
+    for name, search in (("credulous", SearchConfig(trusted_fraction=0.0)), ("usual", SearchConfig())):
+        for seed in range(6):
+            run = filter_opened(open_mono(damaged, MonoConfig(search=search, seed=seed), known))
+            off[name].append(ate(Trajectory(stamps, run.log.poses), Trajectory(stamps, run.truth.poses)).rmse)
+    assert np.mean(off["usual"]) < 0.02 and np.median(off["usual"]) < 0.015
+    assert np.mean(off["credulous"]) > 2.0 * np.mean(off["usual"])
 
 
 def test_what_is_often_missed_only_updates_the_map():
