@@ -242,14 +242,13 @@ class JointMap(Map):
         self.origin, self.clones, mean, self.cov = self._consolidated(particles)
         self.mean = np.repeat(mean[None], self.n, axis=0)
         if self.old is not None and self.submap is not None:
-            ids, present = self._held.table.ids, self._finished(self.origin, mean, self.cov)
+            ids = self._held.table.ids
             # As many as tell a pose in space; with fewer the sub-map waits for more.
             if not self._in_step and (ids.size >= self.submap or self.old.returned(ids).sum() >= 3):
-                self.old.join(present)
+                self.old.join(self._finished(self.origin, mean, self.cov))
                 self._begin_submap()
-                present = self._finished(self.origin, self.mean[0], self.cov)
             if self.old.maps:
-                self._frame = self.old.end(present)
+                self._frame = self.old.end(self._finished(self.origin, self.mean[0], self.cov))
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
 
     def estimate(self, particles: Particles) -> Estimate:
@@ -265,7 +264,7 @@ class JointMap(Map):
         if self.old is None or not self.old.maps:
             return self.ids, *self.in_world(particles)
         if not self.ids.size:
-            return self.old.landmarks()
+            return self.old.copied().landmarks()
         origin, _, mean, cov = self._consolidated(particles)
         return self.old.with_one_more(self._finished(origin, mean, cov)).landmarks()
 

@@ -170,6 +170,8 @@ class LandmarkMap(Map):
             if not weights.any():
                 weights = particles.weights * np.isfinite(self.log_odds(np.array([landmark_id]))[:, 0])
             moments.append(gaussian.mixture_moments(weights / weights.sum(), records.mean[:, 0], records.cov[:, 0]))
+        if not moments:
+            return np.zeros((0, 0)), np.zeros((0, 0, 0))
         return np.array([mean for mean, _ in moments]), np.array([cov for _, cov in moments])
 
     def innovations(

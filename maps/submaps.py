@@ -110,10 +110,15 @@ class SubMaps:
 
     def with_one_more(self, finished: SubMap) -> "SubMaps":
         """As if the present sub-map ended here."""
+        other = self.copied()
+        other._take(finished)
+        return other
+
+    def copied(self) -> "SubMaps":
+        """What is told of all of them is solved for in a copy: to be asked changes nothing."""
         other = SubMaps(self.space, self.dim, self.most)
         other.maps, other.starts, other._last = list(self.maps), list(self.starts), dict(self._last)
         other.near, other.points, other.cov = self.near, self.points, self.cov
-        other._take(finished)
         return other
 
     def landmarks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -46,7 +46,7 @@ Covariances = Float[np.ndarray, "*#batch p p"]
 Ids = Int[np.ndarray, " K"]
 Z = Float[np.ndarray, "K p"]
 CovZ = Float[np.ndarray, "K p p"]
-Moments = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
+Moments = tuple[Float[np.ndarray, "*K D"], Float[np.ndarray, "*K d d"]]
 """K landmarks or measurements of one step, and the measurements' covariances."""
 
 NULL = -1

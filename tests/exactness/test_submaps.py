@@ -80,7 +80,9 @@ def test_joined_they_say_what_one_gaussian_says(submap):
     filter_ = Filter(Walk(), NamedLandmarkSensor(Relative(), Point(2)), joint, **options)
     for reading in readings:
         filter_.step(reading)
+    before = joint.arrays()
     ids, places, covs = joint.landmarks(filter_.particles)
+    np.testing.assert_equal(joint.arrays(), before)  # to be asked changes nothing
     order = np.argsort(ids)
     assert len(joint.old.maps) == {4: 14, 7: 5, 100: 0}[submap]
     np.testing.assert_array_equal(ids[order], np.arange(ids.size))
