@@ -51,7 +51,7 @@ class Range:
 class Formerly:
     """Of a field that had another name: `load_settings` refuses that name with today's."""
 
-    name: str = field(repr=False)  # Sphinx, shown it in an annotation, looks for something that has this name
+    name: str = field(repr=False)  # not in the annotation, where Sphinx would take it for a reference
 
 
 ANY = Range()
