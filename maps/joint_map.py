@@ -49,13 +49,17 @@ from rbpf.maps.joint_columns import JointColumns, Kind, Table
 from rbpf.maps.joint_rows import (
     Group,
     Rows,
+    apart,
     beyond_gaussian,
     checked_ids,
     diagonal_blocks,
     log_det,
     log_odds_of,
     multiplied,
+    plus_gram,
     spread_of,
+    through,
+    turned,
     whitened,
 )
 from rbpf.maps.point import Point
@@ -216,9 +220,9 @@ class JointMap(Map):
         nu = whitened(chol, rows.nu[:, inside, None])[..., 0]
         total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(chol))
         total += beyond_gaussian(rows, inside, chol, nu)
-        slope = multiplied(rows.by_marginal[inside], self.cov[rows.columns])
+        slope = through(rows.slopes, self.cov[rows.columns])[inside]
         half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        moves, cov = multiplied(nu, half), self.cov - multiplied(half.T, half)
+        moves, cov = multiplied(nu, half), plus_gram(self.cov, half, -1.0)
         fixed = rows.considered
         if fixed.size:
             # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
@@ -328,11 +332,11 @@ class JointMap(Map):
         before = weighted_mean(self.mean, weights)
         moved = self.mean.copy()
         moved[:, :d] = space.local(origin, world)
-        slopes = [(np.arange(d), self._turn(particles))]
+        blocks = [(np.arange(d)[None], self._turn(particles)[None])]
         for kind in self._held.by_kind():
             if not kind.landmark.anchored:
                 moved[:, kind.columns] = kind.landmark.seen_from(space, state[:, None], self.mean[:, kind.columns])[0]
-                slopes.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
+                blocks.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
         clones = self.clones
         if len(clones):
             # Mathematics (clone), with K' what the mean of the particles sees.
@@ -341,17 +345,9 @@ class JointMap(Map):
             moved[:, at] = space.local(clones, space.between(state[:, None], self._poses(self.mean, at, self.clones)))
         mean = weighted_mean(moved, weights)
         if len(clones):
-            slopes.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
+            blocks.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
         mean[:d] = 0.0  # the mean of all worlds is the origin
-
-        def turned(rows: np.ndarray) -> np.ndarray:
-            out = rows.copy()
-            for columns, slope in slopes:
-                out[columns] = slope @ rows[columns]
-            return out
-
-        cov = turned(turned(self.cov).T) + spread_of(moved, weights)
-        return origin, clones, mean, gaussian.symmetrise(cov)
+        return origin, clones, mean, plus_gram(turned(self.cov, blocks), apart(moved, weights))
 
     def _turn(self, particles: Particles) -> np.ndarray:
         """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
@@ -372,7 +368,7 @@ class JointMap(Map):
         if increment is None or self._gain is None:
             return rows
         slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
-        return rows._replace(by_state=rows.by_state + rows.by_marginal @ slope)
+        return rows._replace(by_state=rows.by_state + through(rows.slopes, slope))
 
     def _foreseen(self, groups: Sequence[Observations], belief: Belief) -> tuple[np.ndarray, np.ndarray, list[Group]]:
         """Mean (R,) and covariance (R, R) of the innovations under all particles, and whose rows they are."""
@@ -385,10 +381,10 @@ class JointMap(Map):
 
     def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
         """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
-        d, n = self.space.dim, mean.shape[1]
+        d = self.space.dim
         nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
-        by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
-        considered, used, parts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], list[Group]()
+        noises, log_factor, parts = list[np.ndarray](), 0.0, list[Group]()
+        considered, read = [np.zeros(0, dtype=np.int64)], list[tuple[np.ndarray, np.ndarray]]()
         for group in groups:
             model, z, noise, ids = group.model, group.z, group.cov, checked_ids(group)
             log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
@@ -416,43 +412,41 @@ class JointMap(Map):
                 nu, *found = linearised(model, self.space, z, state, landmarks, anchors, True)
                 jac = Jacobians(*found)
             count, p = z.shape
-            block = np.zeros((count, p, n))
+            # What each observation reads of the Gaussian, and by what slope.
+            used = list[tuple[np.ndarray, np.ndarray]]()
             if kind is not None and jac.landmark is not None:
                 slope = jac.landmark.mean(axis=0)
-                np.put_along_axis(block, np.repeat(kind.columns[:, None], p, axis=1), slope, axis=2)
-                used.append(kind.columns.ravel())
+                used.append((kind.columns, slope))
                 considered.append(kind.columns[kind.landmark.considered(slope, diagonal_blocks(cov, kind.columns))])
             if kind is not None and anchors is not None and jac.state is not None:
                 # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
                 turn = self.space.adjoint(self.space.between(state[:, None], anchors))
                 turn = turn @ self.space.right_jacobian(mean[:, kind.clones])
-                by_clone = -(jac.state @ turn).mean(axis=0)
-                np.put_along_axis(block, np.repeat(kind.clones[:, None], p, axis=1), by_clone, axis=2)
-                used.append(kind.clones.ravel())
+                used.append((kind.clones, -(jac.state @ turn).mean(axis=0)))
             if jac.substate is not None:
-                block[..., d : self._first] = jac.substate.mean(axis=0)
-                used.append(np.arange(d, self._first))
+                used.append((np.tile(np.arange(d, self._first), (count, 1)), jac.substate.mean(axis=0)))
             if in_world and jac.state is not None:
                 # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
                 turn = self.space.adjoint(self.space.inverse(state)) @ self.space.right_jacobian(mean[:, :d])
-                block[..., :d] = (jac.state @ turn[:, None]).mean(axis=0)
-                used.append(np.arange(d))
+                used.append((np.tile(np.arange(d), (count, 1)), (jac.state @ turn[:, None]).mean(axis=0)))
+            none = np.zeros((count, 0), dtype=np.int64), np.zeros((count, p, 0))
+            at, slopes = zip(none, *used, strict=True)
+            read.append((np.concatenate(at, axis=1), np.concatenate(slopes, axis=2)))
             by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
             nus.append(np.broadcast_to(nu, (self.n, count, p)).reshape(self.n, -1))
             by_states.append(np.broadcast_to(by_state, (self.n, count, p, d)).reshape(self.n, -1, d))
-            by_marginal.append(block.reshape(-1, n))
             first = sum(len(each) for each in noises)
             parts.append(Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
             noises.extend(noise)
-        columns = np.unique(np.concatenate(used))
-        slope = np.concatenate(by_marginal)[:, columns]
-        innovation = gaussian.symmetrise(multiplied(multiplied(slope, cov[np.ix_(columns, columns)]), slope.T))
+        columns = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(at.ravel() for at, _ in read)]))
+        sparse = [(np.searchsorted(columns, at), slope) for at, slope in read]
+        innovation = gaussian.symmetrise(through(sparse, through(sparse, cov[np.ix_(columns, columns)]).T))
         end = 0
         for noise in noises:
             rows = slice(end, end := end + noise.shape[0])
             innovation[rows, rows] += noise
         nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
-        return Rows(nu, by_state, slope, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
+        return Rows(nu, by_state, sparse, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
 
     def _poses(self, mean: np.ndarray, columns: np.ndarray, clones: np.ndarray) -> np.ndarray:
         """Clones (…, K, E) in the frame, of means (…, n), by their columns (K, d) and origins (K, E)."""
@@ -579,7 +573,8 @@ class JointMap(Map):
         used = np.isin(np.arange(len(self.clones)), self._held.table.clone)
         kept = np.ones(self.mean.shape[1], dtype=bool)
         kept[np.concatenate([*gone, self._held.clone_columns(np.flatnonzero(~used)).ravel()])] = False
-        self.mean, self.cov = self.mean[:, kept], self.cov[np.ix_(kept, kept)]
+        at = np.flatnonzero(kept)
+        self.mean, self.cov = self.mean[:, kept], self.cov.take(at, axis=0).take(at, axis=1)
         place, number = np.cumsum(kept) - 1, np.append(np.cumsum(used) - 1, -1)
         self.clones, self._held.clone_first = self.clones[used], place[self._held.clone_first[used]]
         table = self._held.table

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dsyrk
 
 from rbpf import gaussian
 from rbpf.core.models import Likelihood, Observations, Part
 from rbpf.core.particles import weighted_mean
 from rbpf.errors import InputError
-from rbpf.kernels.dense import product
+from rbpf.kernels.dense import add_gram, congruent, mirror, product
 
 QUICK = 30_000_000
 """Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
@@ -30,12 +31,13 @@ class Group(NamedTuple):
 class Rows(NamedTuple):
     """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S (R, R).
 
-    `considered` are columns that the rows count with, but do not change.
+    J is sparse: an observation reads few columns, see `through`. `considered` are columns that the rows count with, but do
+    not change.
     """
 
     nu: np.ndarray
     by_state: np.ndarray
-    by_marginal: np.ndarray
+    slopes: list[tuple[np.ndarray, np.ndarray]]
     columns: np.ndarray
     cov: np.ndarray
     groups: list[Group]
@@ -48,6 +50,13 @@ class Rows(NamedTuple):
             return np.arange(self.nu.shape[1])
         found = [(-odds, *rows) for _, *part in self.groups for rows, odds in zip(*part, strict=True) if odds >= 0.0]
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
+
+
+def through(slopes: list[tuple[np.ndarray, np.ndarray]], matrix: np.ndarray) -> np.ndarray:
+    """J (R, c) times (…, c, m): of each group which of the c an observation reads (K, q), and by what slope (K, p, q)."""
+    *many, _, m = matrix.shape
+    parts = [(slope @ matrix[..., at, :]).reshape(*many, slope.shape[0] * slope.shape[1], m) for at, slope in slopes]
+    return np.concatenate([np.zeros((*many, 0, m)), *parts], axis=-2)
 
 
 def checked_ids(group: Observations) -> np.ndarray | None:
@@ -156,8 +165,33 @@ def multiplied(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.asarray(product(np.ascontiguousarray(left), np.ascontiguousarray(right)))
 
 
+def plus_gram(cov: np.ndarray, rows: np.ndarray, sign: float = 1.0) -> np.ndarray:
+    """Cov (n, n) ± rowsᵀ rows, of rows (k, n); exactly symmetric, and of cov the lower triangle counts."""
+    if rows.size * len(cov) > QUICK:
+        out = dsyrk(sign, rows.T, beta=1.0, c=cov.T).T  # of the transposed, the upper triangle
+    else:
+        out = cov.copy()
+        add_gram(out, np.ascontiguousarray(rows), sign)
+    mirror(out)
+    return np.asarray(out)
+
+
+def turned(cov: np.ndarray, blocks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The lower triangle of T P Tᵀ; T is the identity but for blocks (K, m, m) on its diagonal, in rows (K, m) one by one."""
+    first = np.concatenate([rows[:, 0] for rows, _ in blocks])
+    size = np.concatenate([np.full(len(rows), rows.shape[1]) for rows, _ in blocks])
+    padded, done = np.zeros((first.size, int(size.max()), int(size.max()))), 0
+    for rows, each in blocks:
+        padded[done : (done := done + len(rows)), : rows.shape[1], : rows.shape[1]] = each
+    return np.asarray(congruent(cov, first, size, padded))
+
+
 def spread_of(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Covariance (k, k) that weighted values (N, k) are a sample of: Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
-    offset = np.sqrt(weights)[:, None] * (values - weighted_mean(values, weights))
+    return plus_gram(np.zeros((values.shape[1],) * 2), apart(values, weights))
+
+
+def apart(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """A factor (N, k) of `spread_of`, which is factorᵀ factor."""
     left = 1.0 - float(np.square(weights).sum())
-    return multiplied(offset.T, offset) / left if left > 0.0 else np.zeros((values.shape[1],) * 2)
+    return np.sqrt(weights / left if left > 0.0 else 0.0 * weights)[:, None] * (values - weighted_mean(values, weights))

@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices: Cholesky's factor in its lower triangle, what is solved by it, and products."""
+"""Linear algebra: Cholesky's factor of a small matrix, what is solved by it, products, and what stays symmetric."""
 
 import math
 
@@ -57,4 +57,54 @@ def product(left, right):
         for k in range(whole, count):
             for j in range(right.shape[1]):
                 out[i, j] += left[i, k] * right[k, j]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def add_gram(matrix, rows, sign):
+    """Adds ± rowsᵀ rows, of rows (k, n), to the lower triangle of (n, n)."""
+    for k in range(rows.shape[0]):
+        for i in range(matrix.shape[0]):
+            factor = sign * rows[k, i]
+            for j in range(i + 1):
+                matrix[i, j] += factor * rows[k, j]
+
+
+@njit(cache=True, error_model="numpy")
+def mirror(matrix):
+    """Replaces what is above the diagonal by what is below it; by tiles, which stay in the cache."""
+    n, tile = matrix.shape[0], 32
+    for above in range(0, n, tile):
+        for left in range(0, above + 1, tile):
+            for i in range(above, min(above + tile, n)):
+                for j in range(left, min(left + tile, i)):
+                    matrix[j, i] = matrix[i, j]
+
+
+@njit(cache=True, error_model="numpy")
+def congruent(matrix, first, size, blocks):
+    """The lower triangle of T P Tᵀ (n, n), of a symmetric P; T is the identity but for K blocks on its diagonal.
+
+    They are the first `size` (K,) rows and columns of `blocks` (K, m, m), from rows `first` (K,) on; none overlaps another.
+    """
+    out, part = matrix.copy(), np.empty(blocks.shape[1])
+    for k in range(first.size):
+        for a in range(size[k]):
+            row = out[first[k] + a, : first[k] + size[k]]  # what is right of it is not read
+            row[:] = 0.0
+            for b in range(size[k]):
+                weight = blocks[k, a, b]
+                for j in range(row.size):
+                    row[j] += weight * matrix[first[k] + b, j]
+    for i in range(len(out)):
+        row = out[i]
+        for k in range(first.size):
+            if first[k] > i:
+                continue
+            for a in range(size[k]):
+                part[a] = 0.0
+                for b in range(size[k]):
+                    part[a] += blocks[k, a, b] * row[first[k] + b]
+            for a in range(size[k]):
+                row[first[k] + a] = part[a]
     return out

@@ -14,6 +14,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.joint_map import JointMap
+from rbpf.maps.joint_rows import through
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.camera import Pinhole
@@ -159,7 +160,7 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
 
     rows = joint._rows(particles.state, joint.mean, joint.cov, groups)
     by_mean = np.zeros((10, joint.mean.shape[1]))
-    by_mean[:, rows.columns] = rows.by_marginal
+    by_mean[:, rows.columns] = through(rows.slopes, np.eye(rows.columns.size))
     np.testing.assert_allclose(by_mean, numeric(measured, joint.mean[0]), atol=1e-4)
     by_state = numeric(lambda xi: measured(joint.mean[0], SE3.retract(particles.state, xi)), np.zeros(6))
     np.testing.assert_allclose(rows.by_state[0], by_state, atol=1e-4)
