@@ -268,7 +268,7 @@ class JointMap(Map):
         if self.old is None or not self.old.maps:
             return self.ids, *self.in_world(particles)
         if not self.ids.size:
-            return self.old.copied().landmarks()
+            return self.old.landmarks()
         origin, _, mean, cov = self._consolidated(particles)
         return self.old.with_one_more(self._finished(origin, mean, cov)).landmarks()
 

@@ -18,6 +18,7 @@ from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
+from rbpf.kernels.sparse import filled, selected_inverse
 from rbpf.lie import Euclidean, SE2Group, SE3Group, skew
 
 CLOSE_ENOUGH = 1e-6
@@ -25,8 +26,6 @@ CLOSE_ENOUGH = 1e-6
 ITERATIONS = 20
 EXACT = 1e-5
 """Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
-AT_ONCE = 512
-"""Columns of the inverse that are solved for together."""
 
 
 class SubMap(NamedTuple):
@@ -39,6 +38,18 @@ class SubMap(NamedTuple):
     ids: np.ndarray
     points: np.ndarray
     cov: np.ndarray
+
+
+class _Tied(NamedTuple):
+    """Start, landmarks about it, new end and landmarks: their mean, and covariance before they are one, less halfᵀ half after.
+
+    `mine` are the landmarks about the start that the new map has, too.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    half: np.ndarray
+    mine: np.ndarray
 
 
 def by_turn(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
@@ -55,10 +66,46 @@ def by_frame(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.n
     return np.concatenate([by_turn(space, points), moved], axis=-1)
 
 
-def _unit_columns(size: int, rows: np.ndarray) -> np.ndarray:
-    columns = np.zeros((size, rows.size))
-    columns[rows, np.arange(rows.size)] = 1.0
-    return columns
+class _Factor(NamedTuple):
+    """What a sub-map says of starts and landmarks in `columns` (c,): a residual (r,), its information and slope (r, c).
+
+    `own` (r,) are the columns of the sub-map's Gaussian that it is of.
+    """
+
+    own: np.ndarray
+    columns: np.ndarray
+    info: np.ndarray
+    residual: np.ndarray
+    slope: np.ndarray
+
+
+class _Solution(NamedTuple):
+    """Landmarks (M,) in the world (M, D) and all starts, the information (n, n) of both, and what solves with it."""
+
+    ids: np.ndarray
+    world: np.ndarray
+    starts: np.ndarray
+    factors: list[_Factor]
+    information: sparse.csc_matrix
+    solver: SuperLU
+
+    def covariance(self) -> sparse.csr_matrix:
+        """The entries of the inverse that belong together in a factor, and more, at the work of factoring."""
+        n, turned = self.solver.shape[0], self.solver.perm_c
+        if not np.array_equal(turned, self.solver.perm_r):
+            raise InputError("the sub-maps leave a start or a landmark undetermined")
+        entries = self.information.tocoo()
+        above = sparse.coo_matrix((np.ones(entries.nnz), (turned[entries.row], turned[entries.col])), (n, n))
+        starts, rows = filled(*(lambda low: (low.indptr, low.indices))(sparse.tril(above, format="csc")))
+        columns = np.repeat(np.arange(n), np.diff(starts))
+        pattern = sparse.csc_matrix((np.arange(1.0, rows.size + 1.0), rows, starts), (n, n))
+        lower = np.zeros(rows.size)
+        held = self.solver.L.tocoo()
+        lower[np.asarray(pattern[held.row, held.col], dtype=np.int64).ravel() - 1] = held.data
+        found = selected_inverse(starts, rows, lower, self.solver.U.diagonal())
+        back = np.argsort(turned)
+        half = sparse.csr_matrix((found, (back[rows], back[columns])), (n, n))
+        return half + half.T - sparse.diags_array(half.diagonal(), format="csr")
 
 
 @final
@@ -101,12 +148,20 @@ class SubMaps:
         loop = bool(self.returned(finished.ids).any())
         self._take(finished)
         if loop:
-            self._solve(self._shared())
+            self.solve()
 
     def end(self, present: SubMap) -> Estimate:
         """World_from_end of the present sub-map, by it and what is known about its start."""
-        ends, _, _, cov = self._joined(present)
-        return Estimate(ends[1], cov[: self.space.dim, : self.space.dim])
+        space, d = self.space, self.space.dim
+        x, cov, half, _ = self._tied(present)
+        first = d + self.dim * self.near.size
+        ends = np.append(np.arange(d), first + np.arange(d))
+        end = space.retract(present.end, x[ends[d:]])
+        by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
+        turn = np.concatenate([by_start, space.right_jacobian(x[ends[d:]])], axis=1)
+        own = cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
+        mean = space.compose(space.retract(self.start, x[:d]), end)
+        return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
 
     def with_one_more(self, finished: SubMap) -> "SubMaps":
         """As if the present sub-map ended here."""
@@ -122,89 +177,109 @@ class SubMaps:
         return other
 
     def landmarks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Names (M,), places in the world (M, D) and their covariances (M, D, D), by all sub-maps together."""
-        ids = np.array(list(self._last), dtype=np.int64)
-        world, factor = self._solve(ids)
-        first, size, dim = factor.shape[0] - ids.size * self.dim, factor.shape[0], self.dim
-        covs = np.empty((ids.size, dim, dim))
-        together = max(AT_ONCE // dim, 1)
-        for begin in range(0, ids.size, together):
-            count = min(together, ids.size - begin)
-            rows = first + begin * dim + np.arange(count * dim)
-            found = factor.solve(_unit_columns(size, rows))[rows]
-            blocks = found.reshape(count, dim, count, dim)
-            covs[begin : begin + count] = blocks[np.arange(count), :, np.arange(count)]
-        return ids, world, gaussian.symmetrise(covs)
+        """Names (M,), places in the world (M, D) and their covariances (M, D, D), by all sub-maps together.
 
-    def _take(self, finished: SubMap) -> None:
-        ends, self.near, self.points, self.cov = self._joined(finished)
-        self.starts[-1:] = list(ends)
-        self._hold(finished)
-
-    def _joined(self, new: SubMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-        """Its start and end in the world; and `near`, `points` and `cov` about its end.
-
-        One Kalman update by what is shared, without noise, of the Gaussians about start and end; then seen from the end.
+        Starts and what several sub-maps hold are solved for; the others follow from their own sub-map, given these.
         """
         space, d, dim = self.space, self.space.dim, self.dim
-        k, m = self.near.size, new.ids.size
+        solution = self._solve(self._shared(alone=True))
+        joint, end_of = solution.covariance(), solution.starts[1:]
+        names, places, covs = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+        for number, (each, factor) in enumerate(zip(self.maps, solution.factors, strict=True)):
+            # Of the landmarks that this sub-map is the last to hold, given those solved for, with its start and end.
+            mine = np.flatnonzero([self._last[name][0] == number for name in each.ids.tolist()])
+            if not mine.size:
+                continue
+            theirs = d + dim * mine[:, None] + np.arange(dim)
+            gain = each.cov[np.ix_(theirs.ravel(), factor.own)] @ factor.info
+            cross = each.cov[np.ix_(factor.own, theirs.ravel())]
+            rest = each.cov[theirs[:, :, None], theirs[:, None]]
+            rest = rest - np.einsum("mik,kmj->mij", gain.reshape(mine.size, dim, -1), cross.reshape(-1, mine.size, dim))
+            seen = each.points[mine] + (gain @ factor.residual).reshape(-1, dim)
+            by_all = (gain @ factor.slope).reshape(mine.size, dim, -1)
+            by_all[:, :, d : 2 * d] += by_frame(space, seen)
+            free = factor.columns >= 0
+            columns, by_all = factor.columns[free], by_all[:, :, free]
+            within = joint[columns[:, None], columns].toarray()
+            spread = (by_all.reshape(-1, columns.size) @ within).reshape(by_all.shape) @ np.swapaxes(by_all, 1, 2)
+            turn = space.rotation(end_of[number])
+            names.append(each.ids[mine])
+            places.append(space.transform(end_of[number], seen))
+            covs.append(turn @ (rest + spread) @ turn.T)
+        return np.concatenate(names), np.concatenate(places), gaussian.symmetrise(np.concatenate(covs))
+
+    def _tied(self, new: SubMap) -> _Tied:
+        """One Kalman update by what is shared, without noise, of the Gaussians about the last start and the new end."""
+        space, d, dim = self.space, self.space.dim, self.dim
         _, mine, its = np.intersect1d(self.near, new.ids, assume_unique=True, return_indices=True)
-        first, second = d + dim * k, d + dim * m
-        size = first + second
+        first = d + dim * self.near.size
+        size = first + d + dim * new.ids.size
         cov = np.zeros((size, size))
         cov[:first, :first], cov[first:, first:] = self.cov, new.cov
         prior = np.concatenate([np.zeros(d), self.points.ravel(), np.zeros(d), new.points.ravel()])
-        x = prior
         of_mine = d + dim * mine[:, None] + np.arange(dim)
         of_its = first + d + dim * its[:, None] + np.arange(dim)
-        turned = slice(first, first + d)
+        x, half, turned = prior, np.zeros((0, size)), slice(first, first + d)
         for _ in range(ITERATIONS if mine.size else 0):
             # 0 = l − E Exp(ε) l′ for each landmark l that is l′ in the new one, which ends at E Exp(ε).
             end, seen = space.retract(new.end, x[turned]), x[of_its]
             rotation = space.rotation(end)
-            blocks = np.zeros((mine.size, dim, size))
-            np.put_along_axis(blocks, np.repeat(of_mine[:, None], dim, axis=1), np.eye(dim)[None], axis=2)
-            np.put_along_axis(blocks, np.repeat(of_its[:, None], dim, axis=1), -rotation[None], axis=2)
-            blocks[:, :, turned] = -rotation @ by_frame(space, seen) @ space.right_jacobian(x[turned])
-            slope = blocks.reshape(-1, size)
-            off = (x[of_mine] - space.transform(end, seen)).ravel()
-            chol = gaussian.cholesky(gaussian.symmetrise(slope @ cov @ slope.T))
-            half = gaussian.solve_lower_matrix(chol, slope @ cov)
-            moved = prior - half.T @ gaussian.solve_lower(chol, off + slope @ (prior - x))
+            by_turned = rotation @ by_frame(space, seen) @ space.right_jacobian(x[turned])
+
+            def moved_by(
+                columns: np.ndarray, rotation: np.ndarray = rotation, by: np.ndarray = by_turned
+            ) -> np.ndarray:
+                off = columns[of_mine] - rotation @ columns[of_its] - by @ columns[turned]
+                return off.reshape(-1, columns.shape[1])
+
+            slope = moved_by(cov)
+            chol = gaussian.cholesky(gaussian.symmetrise(moved_by(slope.T)))
+            half = gaussian.solve_lower_matrix(chol, slope)
+            off = (x[of_mine] - space.transform(end, seen)).ravel() + moved_by((prior - x)[:, None])[:, 0]
+            moved = prior - half.T @ gaussian.solve_lower(chol, off)
             step, x = np.abs(moved - x).max(), moved
             if step < CLOSE_ENOUGH:
                 break
-        if mine.size:
-            cov = cov - half.T @ half
-        # About the new end: it, the new map's landmarks, and the old ones that it has not, as far as there is room.
+        return _Tied(x, cov, half, mine)
+
+    def _take(self, new: SubMap) -> None:
+        """About its end: it, its landmarks, and the old ones that it has not, as far as there is room."""
+        space, d, dim = self.space, self.space.dim, self.dim
+        x, cov, half, mine = self._tied(new)
+        first, size = d + dim * self.near.size, len(x)
+        second, turned = size - first, slice(first, first + d)
         end = space.retract(new.end, x[turned])
         start = space.retract(self.start, x[:d])
-        others = np.setdiff1d(np.arange(k), mine)
-        seen = space.inverse_transform(end, x[d:first].reshape(k, dim)[others])
-        kept = np.sort(np.argsort(np.linalg.norm(seen, axis=1), kind="stable")[: max(self.most - m, 0)])
+        others = np.setdiff1d(np.arange(self.near.size), mine)
+        seen = space.inverse_transform(end, x[d:first].reshape(-1, dim)[others])
+        kept = np.sort(np.argsort(np.linalg.norm(seen, axis=1), kind="stable")[: max(self.most - new.ids.size, 0)])
         others, seen = others[kept], seen[kept]
         by_end = space.right_jacobian(x[turned])
         turn = np.zeros((second + dim * others.size, size))
         turn[:d, :d] = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
         turn[:d, turned] = by_end
-        turn[d:second, first + d :] = np.eye(dim * m)
+        turn[d:second, first + d :] = np.eye(second - d)
         theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
         turn[second:, theirs] = np.kron(np.eye(others.size), space.rotation(end).T)
         turn[second:, turned] = (-by_frame(space, seen) @ by_end).reshape(-1, d)
-        near, points = np.append(new.ids, self.near[others]), np.concatenate([x[first + d :].reshape(m, dim), seen])
-        return (start, space.compose(start, end)), near, points, gaussian.symmetrise(turn @ cov @ turn.T)
+        self.near = np.append(new.ids, self.near[others])
+        self.points = np.concatenate([x[first + d :].reshape(-1, dim), seen])
+        self.cov = gaussian.symmetrise(turn @ (cov - half.T @ half) @ turn.T)
+        self.starts[-1:] = [start, space.compose(start, end)]
+        self._hold(new)
 
     def _hold(self, new: SubMap) -> None:
         self._last |= {landmark: (len(self.maps), row) for row, landmark in enumerate(new.ids.tolist())}
         self.maps.append(new)
 
-    def _shared(self) -> np.ndarray:
-        """Landmarks that several sub-maps hold, those of the last one, and those nearest to its end."""
+    def _shared(self, alone: bool = False) -> np.ndarray:
+        """Landmarks that several sub-maps hold; if not they `alone`, those of the last one and nearest to its end, too."""
         ids, times = np.unique(np.concatenate([each.ids for each in self.maps]), return_counts=True)
-        room = max(self.most - self.maps[-1].ids.size, 0)
-        far = np.linalg.norm(self.space.inverse_transform(self.start, self._guess(ids)), axis=1)
-        wanted = np.isin(ids, self.maps[-1].ids) | (times > 1)
-        wanted[np.argsort(far, kind="stable")[:room]] = True
+        wanted = times > 1
+        if not alone:
+            wanted |= np.isin(ids, self.maps[-1].ids)
+            far = np.linalg.norm(self.space.inverse_transform(self.start, self._guess(ids)), axis=1)
+            wanted[np.argsort(far, kind="stable")[: max(self.most - self.maps[-1].ids.size, 0)]] = True
         return ids[wanted]
 
     def _guess(self, ids: np.ndarray) -> np.ndarray:
@@ -213,14 +288,14 @@ class SubMaps:
         ends = np.array([self.starts[number + 1] for number in held[:, 0]])
         return self.space.transform(ends, np.array([self.maps[number].points[row] for number, row in held]))
 
-    def _solve(self, ids: np.ndarray) -> tuple[np.ndarray, SuperLU]:
+    def _solve(self, ids: np.ndarray) -> _Solution:
         """Gauss-Newton over all starts and some landmarks; the others of a sub-map are left out of its factor."""
         space, d, dim = self.space, self.space.dim, self.dim
         world, starts = self._guess(ids), np.array(self.starts)
         place = {landmark: row for row, landmark in enumerate(ids.tolist())}
         first = d * len(self.maps)
         size = first + dim * ids.size
-        factors = []
+        parts = []
         for number, each in enumerate(self.maps):
             rows = np.array(
                 [row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64
@@ -231,13 +306,13 @@ class SubMaps:
             cov = each.cov[np.ix_(own, own)]
             if np.diagonal(cov)[:d].min() < EXACT**2:
                 cov[:d, :d] += EXACT**2 * np.eye(d)
-            factors.append((rows, at, columns, gaussian.inverse(cov)))
-        where = np.concatenate([np.repeat(columns, columns.size) for *_, columns, _ in factors])
-        across = np.concatenate([np.tile(columns, columns.size) for *_, columns, _ in factors])
+            parts.append((rows, at, own, columns, gaussian.inverse(cov)))
+        where = np.concatenate([np.repeat(columns, columns.size) for *_, columns, _ in parts])
+        across = np.concatenate([np.tile(columns, columns.size) for *_, columns, _ in parts])
         free = (where >= 0) & (across >= 0)  # the first start is where the world is
         for _ in range(ITERATIONS):
-            entries, gradient = [], np.zeros(size + d)
-            for number, (rows, at, columns, info) in enumerate(factors):
+            factors, entries, gradient = list[_Factor](), list[np.ndarray](), np.zeros(size + d)
+            for number, (rows, at, own, columns, info) in enumerate(parts):
                 each = self.maps[number]
                 begin, end = starts[number], starts[number + 1]
                 between = space.between(begin, end)
@@ -252,29 +327,32 @@ class SubMaps:
                 half = slope.T @ info
                 entries.append((half @ slope).ravel())
                 gradient[columns] += half @ residual  # columns below zero fall behind the end
+                factors.append(_Factor(own, columns, info, residual, slope))
             information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
-            factor = splu(
+            solver = splu(
                 information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
             )
-            step = -factor.solve(gradient[:size])
+            step = -solver.solve(gradient[:size])
             starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
             world += step[first:].reshape(-1, dim)
             if np.abs(step).max() < CLOSE_ENOUGH:
                 break
-        self.starts = list(starts)
-        self._settle(ids, world, factor)
-        return world, factor
+        return _Solution(ids, world, starts, factors, information, solver)
 
-    def _settle(self, ids: np.ndarray, world: np.ndarray, factor: SuperLU) -> None:
-        """What a solution says about the last start and the landmarks about it."""
+    def solve(self) -> None:
+        """All of them together, linearised anew: the starts, and what is known about the last one."""
         space, d, dim = self.space, self.space.dim, self.dim
+        ids, world, starts, _, _, solver = self._solve(self._shared())
+        self.starts = list(starts)
         seen = space.inverse_transform(self.start, world)
         last = np.isin(ids, self.maps[-1].ids)
         order = np.argsort(np.where(last, -1.0, np.linalg.norm(seen, axis=1)), kind="stable")
         kept = order[: max(self.most, int(last.sum()))]
-        first = factor.shape[0] - ids.size * dim
+        first = d * len(self.maps)
         columns = np.append(first - d + np.arange(d), first + dim * kept[:, None] + np.arange(dim))
-        cov = factor.solve(_unit_columns(factor.shape[0], columns))[columns]
+        unit = np.zeros((first + world.size, columns.size))
+        unit[columns, np.arange(columns.size)] = 1.0
+        cov = solver.solve(unit)[columns]
         turn = np.zeros(cov.shape)
         turn[:d, :d] = np.eye(d)
         turn[d:, :d] = -by_frame(space, seen[kept]).reshape(-1, d)

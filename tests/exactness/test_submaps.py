@@ -15,7 +15,6 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.maps.submaps import SubMap, SubMaps
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
-from rbpf.sensors.readers import RobotLog
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.exactness.models import Relative
 from tests.exactness.slam import NOISE, STEP, Q, Walk
@@ -127,12 +126,17 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
         maps.join(each)
     assert maps.near.size < RING  # nothing has returned: no solution of all was needed
     start, near, points, cov = maps.start, maps.near, maps.points, maps.cov
-    maps.landmarks()
+    maps.solve()
     np.testing.assert_allclose(space.local(start, maps.start), 0.0, atol=1e-7)
     mine, its = (np.argsort(ids) for ids in (near, maps.near[np.isin(maps.near, near)]))
     np.testing.assert_allclose(points[mine], maps.points[np.isin(maps.near, near)][its], atol=1e-7)
     d = space.dim
     np.testing.assert_allclose(cov[:d, :d], maps.cov[:d, :d], rtol=1e-3, atol=1e-12)
+    # What is told of every landmark: that of all in one system of equations, whose inverse is dense.
+    ids, _, covs = maps.landmarks()
+    at = d * len(maps.maps) + maps.dim * np.arange(ids.size)[:, None] + np.arange(maps.dim)
+    dense = np.linalg.inv(maps._solve(ids).information.toarray())
+    np.testing.assert_allclose(covs, dense[at[:, :, None], at[:, None]], rtol=1e-4, atol=1e-6 * dense.max())
 
 
 @pytest.mark.parametrize("space", [SE2, SE3])
@@ -155,13 +159,9 @@ def test_the_place_after_a_loop_is_as_uncertain_as_told(space):
         assert abs(np.mean(found) - 1.0) < 3.0 * np.std(found) / np.sqrt(len(found)) + 0.05
 
 
-def loop() -> RobotLog:
-    return simulated_log(RobotWorld(260, 60, radius_m=8.0, laps=1.2, extent_m=11.0, max_range_m=5.0), 0)
-
-
 @pytest.mark.slow
 def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
-    log = loop()
+    log = simulated_log(RobotWorld(260, 60, radius_m=8.0, laps=1.2, extent_m=11.0, max_range_m=5.0), 0)
     config = RangeBearingConfig(particles=50, submap=20)
     system, whole = (RangeBearingSlam.of_log(log, replace(config, submap=n)) for n in (20, None))
     errors, sizes = [], []
