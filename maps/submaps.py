@@ -6,12 +6,14 @@ where it ends, and its landmarks. What they say together is sparse (S. Huang, Z.
 submap joining filter"). While the robot explores, the last end and the landmarks about it are enough to go on with: one
 Gaussian, to which a finished sub-map is joined at a cost that does not grow (J. Tardós, J. Neira, P. Newman and J. Leonard
 2002). When landmarks return that are not among those, all sub-maps are solved for, linearised anew, Mathematics (submaps).
+Sub-maps of the same place become one, so that there are as many as the ground takes, and not the time.
 """
 
 from typing import NamedTuple, final
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import SuperLU, splu
 
 from rbpf import gaussian
@@ -26,6 +28,8 @@ CLOSE_ENOUGH = 1e-6
 ITERATIONS = 20
 EXACT = 1e-5
 """Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
+FIRM = 6
+"""Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
 
 
 class SubMap(NamedTuple):
@@ -38,6 +42,7 @@ class SubMap(NamedTuple):
     ids: np.ndarray
     points: np.ndarray
     cov: np.ndarray
+    tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
 
 
 class _Tied(NamedTuple):
@@ -64,6 +69,19 @@ def by_frame(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.n
     """∂(Exp(ε) l)/∂ε (M, D, d) at ε = 0."""
     moved = np.broadcast_to(np.eye(points.shape[-1]), (*points.shape, points.shape[-1]))
     return np.concatenate([by_turn(space, points), moved], axis=-1)
+
+
+def _inverse(cov: np.ndarray) -> np.ndarray:
+    """As `gaussian.inverse`, of one large matrix, by LAPACK."""
+    half = solve_triangular(gaussian.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False)
+    return np.asarray(half.T @ half)
+
+
+def _information(cov: np.ndarray, d: int) -> np.ndarray:
+    """The inverse; the first d of what it is of may be known exactly."""
+    if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
+        cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
+    return _inverse(cov)
 
 
 class _Factor(NamedTuple):
@@ -119,7 +137,7 @@ class SubMaps:
 
     Attributes:
         maps: the finished ones.
-        starts: world_from_start (E,) of each, and last that of the present one.
+        starts: the world's origin, and world_from_end (E,) of each; the last one is where the present one starts.
         near: (K,) landmarks about the last start.
         points: (K, D) where they are, as seen from it.
         cov: (d + KD, d + KD) of the last start, in its right chart, and of `points`.
@@ -146,9 +164,12 @@ class SubMaps:
     def join(self, finished: SubMap) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end."""
         loop = bool(self.returned(finished.ids).any())
+        before = [self._last[name][0] for name in finished.ids.tolist() if name in self._last]
         self._take(finished)
         if loop:
             self.solve()
+        if min(before, default=len(self.maps)) < len(self.maps) - 2:
+            self._fuse()
 
     def end(self, present: SubMap) -> Estimate:
         """World_from_end of the present sub-map, by it and what is known about its start."""
@@ -234,9 +255,9 @@ class SubMaps:
 
             slope = moved_by(cov)
             chol = gaussian.cholesky(gaussian.symmetrise(moved_by(slope.T)))
-            half = gaussian.solve_lower_matrix(chol, slope)
+            half = solve_triangular(chol, slope, lower=True, check_finite=False)
             off = (x[of_mine] - space.transform(end, seen)).ravel() + moved_by((prior - x)[:, None])[:, 0]
-            moved = prior - half.T @ gaussian.solve_lower(chol, off)
+            moved = prior - half.T @ solve_triangular(chol, off, lower=True, check_finite=False)
             step, x = np.abs(moved - x).max(), moved
             if step < CLOSE_ENOUGH:
                 break
@@ -272,6 +293,69 @@ class SubMaps:
         self._last |= {landmark: (len(self.maps), row) for row, landmark in enumerate(new.ids.tolist())}
         self.maps.append(new)
 
+    def _fuse(self) -> None:
+        """Older sub-maps of the same place go into the last one: who goes round the same places has no more of them.
+
+        Given up is how an older one hangs on the one before it and the one behind on it, but for the landmarks that they
+        share: as much as one step of the odometry each. Nothing is where there are too few of these, and never the first one.
+        """
+        for number in range(len(self.maps) - 3, 0, -1):
+            old, new = self.maps[number], self.maps[-1]
+            common = int(np.isin(old.ids, new.ids).sum())
+            if (
+                common < max(FIRM, 0.5 * min(old.ids.size, new.ids.size))
+                or old.ids.size + new.ids.size - common > self.most
+            ):
+                continue
+            # The neighbours in time that are tied to the old one and will not be any more.
+            beside = [self.maps[number - 1]] if old.tied else []
+            beside += [each for each in [self.maps[number + 1]] if each.tied]
+            both = np.union1d(old.ids, new.ids)
+            if any(np.isin(each.ids, both).sum() < FIRM for each in beside):
+                continue
+            self.maps[-1] = self._fused(new, old, self.space.between(self.start, self.starts[number + 1]))
+            del self.maps[number], self.starts[number + 1]
+            self.maps[number] = self.maps[number]._replace(tied=False)
+            held, self.maps, self._last = self.maps, [], {}
+            for each in held:
+                self._hold(each)
+
+    def _fused(self, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
+        """What two say of their landmarks, as seen from the end of the new one; the old one ends `between` from there.
+
+        Gauss-Newton over how the old one lies, and the new one's end and all landmarks. Where the old one began is left out.
+        """
+        space, d, dim = self.space, self.space.dim, self.dim
+        ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
+        row_of = {landmark: row for row, landmark in enumerate(ids.tolist())}
+        rows = np.array([row_of[landmark] for landmark in old.ids.tolist()])
+        points = np.empty((ids.size, dim))
+        points[rows] = space.transform(between, old.points)
+        points[: new.ids.size] = new.points
+        moved, prior = np.zeros(d), np.append(np.zeros(d), new.points)
+        infos = _information(new.cov, d), _inverse(old.cov[d:, d:])
+        own, theirs = slice(d, d + prior.size), (2 * d + dim * rows[:, None] + np.arange(dim)).ravel()
+        for _ in range(ITERATIONS):
+            seen = space.inverse_transform(between, points[rows])
+            slope = np.zeros((seen.size, 2 * d + points.size))
+            slope[:, :d] = -by_frame(space, seen).reshape(-1, d)
+            slope[:, theirs] = np.kron(np.eye(rows.size), space.rotation(between).T)
+            half = slope.T @ infos[1]
+            info, gradient = half @ slope, half @ (seen - old.points).ravel()
+            info[own, own] += infos[0]
+            gradient[own] += infos[0] @ (np.append(moved, points[: new.ids.size]) - prior)
+            cov = _inverse(gaussian.symmetrise(info))
+            step = -cov @ gradient
+            between, moved = space.retract(between, step[:d]), moved + step[d : 2 * d]
+            points += step[2 * d :].reshape(-1, dim)
+            if np.abs(step).max() < CLOSE_ENOUGH:
+                break
+        cov = cov[d:, d:]
+        turn = space.right_jacobian(moved)
+        cov[:d] = turn @ cov[:d]
+        cov[:, :d] = cov[:, :d] @ turn.T
+        return SubMap(space.retract(new.end, moved), ids, points, gaussian.symmetrise(cov))
+
     def _shared(self, alone: bool = False) -> np.ndarray:
         """Landmarks that several sub-maps hold; if not they `alone`, those of the last one and nearest to its end, too."""
         ids, times = np.unique(np.concatenate([each.ids for each in self.maps]), return_counts=True)
@@ -304,9 +388,12 @@ class SubMaps:
             at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
             cov = each.cov[np.ix_(own, own)]
-            if np.diagonal(cov)[:d].min() < EXACT**2:
-                cov[:d, :d] += EXACT**2 * np.eye(d)
-            parts.append((rows, at, own, columns, gaussian.inverse(cov)))
+            if each.tied:
+                info = _information(cov, d)
+            else:
+                info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
+                info[d:, d:] = _inverse(cov[d:, d:])
+            parts.append((rows, at, own, columns, info))
         where = np.concatenate([np.repeat(columns, columns.size) for *_, columns, _ in parts])
         across = np.concatenate([np.tile(columns, columns.size) for *_, columns, _ in parts])
         free = (where >= 0) & (across >= 0)  # the first start is where the world is
@@ -368,6 +455,7 @@ class SubMaps:
             "points": np.concatenate([np.zeros((0, self.dim)), *(each.points for each in self.maps)]),
             "covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in self.maps)]),
             "ends": np.array([each.end for each in self.maps]).reshape(-1, self.space.size),
+            "tied": np.array([each.tied for each in self.maps], dtype=np.int64),
             "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
         }  # fmt: skip
         return {f"submaps/{name}": array for name, array in named.items()}
@@ -378,6 +466,7 @@ class SubMaps:
             "counts": checkpoint.integers("maps", least=0), "ids": checkpoint.integers("landmarks", least=0),
             "points": checkpoint.numbers("landmarks", self.dim), "covs": checkpoint.numbers("entries"),
             "ends": checkpoint.elements(self.space, "maps"), "starts": checkpoint.elements(self.space, "starts"),
+            "tied": checkpoint.integers("maps", least=0, below=2),
             "near": checkpoint.integers("near", least=0), "near_points": checkpoint.numbers("near", self.dim),
             "near_cov": checkpoint.numbers("size", "size"),
         }  # fmt: skip
@@ -393,10 +482,12 @@ class SubMaps:
         ):
             raise InputError("the arrays submaps/starts and submaps/near_cov do not fit the sub-maps")
         self.maps, self._last = [], {}
-        for end, names, places, cov, size in zip(found["ends"], ids, points, covs, sizes, strict=True):
+        for end, names, places, cov, size, tied in zip(
+            found["ends"], ids, points, covs, sizes, found["tied"].tolist(), strict=True
+        ):
             if np.unique(names).size < names.size:
                 raise InputError("the array submaps/ids names a landmark twice in a sub-map")
-            self._hold(SubMap(end, names, places, cov.reshape(size, size)))
+            self._hold(SubMap(end, names, places, cov.reshape(size, size), bool(tied)))
         if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
             raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
         self.starts, self.near = list(found["starts"]), found["near"]

@@ -19,7 +19,7 @@ from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.exactness.models import Relative
 from tests.exactness.slam import NOISE, STEP, Q, Walk
 
-RING = 40
+RING = 80
 
 
 class Reading:
@@ -91,12 +91,12 @@ def test_joined_they_say_what_one_gaussian_says(submap):
         np.testing.assert_allclose(own, cov[at, at], rtol=1e-6)
 
 
-def ring(space, seed: int, size: float = 0.05) -> tuple[list[SubMap], np.ndarray, np.ndarray]:
-    """Ten sub-maps of one and a half rounds past landmarks on a ring, their true ends (11, E) and landmarks."""
+def ring(space, seed: int, size: float = 0.05, count: int = 14) -> tuple[list[SubMap], np.ndarray, np.ndarray]:
+    """Sub-maps past landmarks on a ring, nine to a round, their true ends (count + 1, E) and landmarks."""
     rng = np.random.default_rng(seed)
     dim = 2 if space is SE2 else 3
-    turns = np.linspace(0.0, 3.0 * np.pi, 11)
-    tangents = np.zeros((11, space.dim))
+    turns = 0.22 * np.pi * np.arange(count + 1)
+    tangents = np.zeros((count + 1, space.dim))
     tangents[:, 0 if space is SE2 else 2] = turns
     ends = space.compose(space.exp(tangents), space.exp(np.eye(space.dim)[-dim] * 8.0))
     angles = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)
@@ -107,7 +107,7 @@ def ring(space, seed: int, size: float = 0.05) -> tuple[list[SubMap], np.ndarray
     ends = space.between(ends[0], ends)
     found = []
     for begin, end in pairwise(ends):
-        ids = np.flatnonzero(np.linalg.norm(space.inverse_transform(end, landmarks), axis=1) < 5.0)
+        ids = np.flatnonzero(np.linalg.norm(space.inverse_transform(end, landmarks), axis=1) < 6.0)
         n = space.dim + dim * ids.size
         factor = size * (rng.normal(size=(n, n)) / np.sqrt(n) + 0.5 * np.eye(n))
         error = factor @ rng.normal(size=n)
@@ -131,7 +131,7 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
     mine, its = (np.argsort(ids) for ids in (near, maps.near[np.isin(maps.near, near)]))
     np.testing.assert_allclose(points[mine], maps.points[np.isin(maps.near, near)][its], atol=1e-7)
     d = space.dim
-    np.testing.assert_allclose(cov[:d, :d], maps.cov[:d, :d], rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(cov[:d, :d], maps.cov[:d, :d], rtol=1e-3, atol=1e-4 * cov.max())
     # What is told of every landmark: that of all in one system of equations, whose inverse is dense.
     ids, _, covs = maps.landmarks()
     at = d * len(maps.maps) + maps.dim * np.arange(ids.size)[:, None] + np.arange(maps.dim)
@@ -139,18 +139,19 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
     np.testing.assert_allclose(covs, dense[at[:, :, None], at[:, None]], rtol=1e-4, atol=1e-6 * dense.max())
 
 
-@pytest.mark.parametrize("space", [SE2, SE3])
-def test_the_place_after_a_loop_is_as_uncertain_as_told(space):
-    """NEES per degree of freedom of the last start and the landmarks about it, over the runs."""
+@pytest.mark.parametrize(
+    ("space", "count", "most"), [(SE2, 14, 10), (SE3, 14, 10), pytest.param(SE2, 30, 50, marks=pytest.mark.slow)]
+)
+def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most):
+    """NEES per degree of freedom of the last start and the landmarks about it, over the runs; going round holds no more."""
     pose, near = [], []
     for seed in range(20):
-        finished, ends, landmarks = ring(space, seed)
-        maps = SubMaps(space, landmarks.shape[1], 10)
-        closed = 0
+        finished, ends, landmarks = ring(space, seed, count=count)
+        maps, closed = SubMaps(space, landmarks.shape[1], most), 0
         for each in finished:
             closed += bool(maps.returned(each.ids).any())
             maps.join(each)
-        assert closed
+        assert closed and len(maps.maps) <= 14
         error, d = space.local(maps.start, ends[-1]), space.dim
         pose.append(error @ np.linalg.solve(maps.cov[:d, :d], error) / d)
         error = (maps.points - space.inverse_transform(ends[-1], landmarks[maps.near])).ravel()
@@ -202,7 +203,7 @@ def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
         np.testing.assert_array_equal(mine, theirs)
     for name, wrong in {
         "counts": lambda a: a + 1, "ends": lambda a: a[1:], "starts": lambda a: a[1:], "near": lambda a: a + 1000,
-        "ids": lambda a: np.zeros_like(a), "near_cov": lambda a: a[1:, 1:], "covs": lambda a: a[1:],
+        "ids": lambda a: np.zeros_like(a), "near_cov": lambda a: a[1:, 1:], "covs": lambda a: a[1:], "tied": lambda a: a + 2,
     }.items():  # fmt: skip
         damaged = {key: wrong(array) if key.endswith("/" + name) else array for key, array in maps.arrays().items()}
         with pytest.raises(InputError, match="submaps/"):
