@@ -127,6 +127,28 @@ class JointMap(Map):
         self._frame: Estimate | None = None  # where there are finished sub-maps, what they and this one say of F
         self._begin_submap()
 
+    def begin_at(
+        self, world: np.ndarray, substate: tuple[np.ndarray, np.ndarray], ids: np.ndarray, cov: np.ndarray
+    ) -> None:
+        """Places a map that was filled by `add_records` with what particles had sampled so far.
+
+        Args:
+            world: (N, E) world_from_frame of each particle's own frame, where its state and landmarks are.
+            substate: means (N, m) and covariance (m, m).
+            ids: (K,) points that are correlated with each other and with the frame's place.
+            cov: (N, d + K D, …) of that place, in its right chart, and of these points.
+        """
+        d = self.space.dim
+        self.origin = self.space.mean(world, np.full(self.n, 1.0 / self.n))
+        self.mean[:, :d] = offset = self.space.local(self.origin, world)
+        self.mean[:, d : self._first], self.cov[d : self._first, d : self._first] = substate
+        chart = np.tile(np.eye(cov.shape[1]), (self.n, 1, 1))
+        chart[:, :d, :d] = self.space.right_jacobian_inverse(offset)
+        columns = [] if not ids.size else self._held.of_one_kind(ids).columns.ravel().tolist()
+        columns = np.array([*range(d), *columns])
+        moved = (chart @ cov @ np.swapaxes(chart, 1, 2)).mean(axis=0)
+        self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(moved)
+
     def _begin_submap(self) -> None:
         """At the robot, with no landmark."""
         d, n = self.space.dim, self.n

@@ -3,7 +3,7 @@
 R. Douc, O. Cappé, E. Moulines 2005. Ancestors come in ascending order, so that what is gathered by them is read forwards.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -92,6 +92,8 @@ class Consolidation:
 
     window: int = 5  #: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
     threshold: float = 0.5  #: fraction of N below which the effective sample size calls for it earlier.
+    #: not now: while it is not known where the robot is, its frame must not move there.
+    held: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.window < 1 or not 0.0 <= self.threshold <= 1.0:
@@ -102,4 +104,4 @@ class Consolidation:
     def is_due(self, age: int, weights: np.ndarray) -> bool:
         """After `age` steps, with weights (N,)."""
         enough = self.threshold * weights.size * (1.0 - _ROUNDING)
-        return age >= self.window or effective_sample_size(weights) < enough
+        return not self.held and (age >= self.window or effective_sample_size(weights) < enough)

@@ -125,7 +125,7 @@ class ActiveSearch:
 
     def run(self, image: np.ndarray, belief: Belief) -> SearchResult:
         """Looks for features in an image (H, W) uint8; what is found agrees with one motion of the camera."""
-        pose = belief.state[belief.mode][:7]
+        pose = self.features.pose(belief)
         started = time.perf_counter()
         rows, in_view = self.choose(pose)
         seconds_choosing = time.perf_counter() - started

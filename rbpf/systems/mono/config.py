@@ -164,6 +164,13 @@ class MonoConfig(Ranged):
     #: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world whose
     #: place each particle samples in the first frame (E06).
     known: Literal["frame", "points"] = "frame"
+    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles, E06); or, as soon as
+    #: depths are known, one Gaussian of all landmarks, velocity and frame, given the last few frames (joint): an
+    #: uncertainty that stays true. It needs velocity.mode=marginal; in a map that is only to be found there is none.
+    map: Literal["particles", "joint"] = "particles"
+    #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
+    #: below the threshold of resampling, which does not take place.
+    window: Count = 5
     #: landmarks started in one frame at most.
     max_new_per_frame: Annotated[CountOrNone, Formerly("births_per_frame")] = 1000
     #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.

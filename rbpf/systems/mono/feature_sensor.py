@@ -191,8 +191,18 @@ class FeatureSensor(Sensor):
         self.unknown_depth = unknown_depth
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
-        self.group = group
+        self.joint = False
+        """Whether the map is a joint one, in which nothing is updated without the state."""
         self.point = CameraPoint(camera)
+        self._take_group(group)
+
+    def become_joint(self, unknown_depth: UnknownDepth) -> None:
+        """From now on the map is a joint one, which holds the known points one by one."""
+        self.unknown_depth, self.joint = unknown_depth, True
+        self._take_group(None)
+
+    def _take_group(self, group: KnownPoints | None) -> None:
+        self.group = group
         names = np.zeros(0, dtype=np.int64) if group is None else group.names
         self._order = np.argsort(names)
         self._member_names = names[self._order]
@@ -262,6 +272,11 @@ class FeatureSensor(Sensor):
             covs.append(_diagonal_blocks(cov, chosen.size))
         return np.concatenate(which), np.concatenate(nus), np.concatenate(jacs), np.concatenate(covs)
 
+    def pose(self, belief: Belief) -> np.ndarray:
+        """(7,) world_from_camera of the heaviest particle, in its world."""
+        mode = slice(belief.mode, belief.mode + 1)
+        return belief.map.world(belief.state[mode, :7], mode)[0]
+
     def positions(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where features (K,) are in the heaviest particle's world: which of them, homogeneous points (k, 4)."""
         which, places = self.positions_in(belief, names, slice(belief.mode, belief.mode + 1))
@@ -280,7 +295,7 @@ class FeatureSensor(Sensor):
             else:
                 x, w = model.world_point(records.mean, records.const)
                 out.append(np.concatenate([x, w], axis=-1))
-        return np.concatenate(which), np.concatenate(out, axis=1)
+        return np.concatenate(which), self._in_world(belief, np.concatenate(out, axis=1), particles)
 
     def depth_known(self, belief: Belief, names: np.ndarray, std_ratio: float) -> np.ndarray:
         """Whether the heaviest particle knows the depth of features (K,) to this fraction of it, (K,) bool."""
@@ -291,19 +306,33 @@ class FeatureSensor(Sensor):
                 out[chosen] = self.unknown_depth.depth_std_ratio(belief.read_mode(ids))[0] <= std_ratio
         return out
 
-    def extents(self, belief: Belief, names: np.ndarray, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """Of those features (K,) whose depth is not known: which, and where they may be (k, 2, 4), see `UnknownDepth`."""
+    def extents(
+        self, belief: Belief, names: np.ndarray, sigmas: float, min_weight: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of those features (K,) whose depth is not known: which, and where they may be (k, 2, 4): `UnknownDepth.extent`."""
         ids = self._ids(belief, names)
         held = np.flatnonzero(ids >= 0)
         unknown = held[belief.map.are(ids[held], self.unknown_depth.landmark)]
         if not unknown.size:
             return unknown, np.zeros((0, 2, 4))
-        return unknown, self.unknown_depth.extent(belief.read_mode(ids[unknown]), sigmas)[0]
+        mode = slice(belief.mode, belief.mode + 1)
+        ends = self.unknown_depth.extent(belief.read(ids[unknown], mode), sigmas, min_weight)
+        return unknown, self._in_world(belief, ends.reshape(1, -1, 4), mode).reshape(-1, 2, 4)
 
     def remove(self, belief: Belief, names: np.ndarray) -> None:
         """Drops features from all particles."""
         ids = self._ids(belief, names)
         belief.map.remove(ids[ids >= 0])
+
+    def _in_world(self, belief: Belief, position: np.ndarray, particles: slice) -> np.ndarray:
+        """Homogeneous points (n, k, 4) of some particles' frames, where states are, in their worlds."""
+        identity = SE3.identity((len(position),))
+        world = belief.map.world(identity, particles)
+        if world is identity:
+            return position
+        x, w = position[..., :3], position[..., 3:]
+        origin = SE3.translation(world)[:, None]
+        return np.concatenate([SE3.transform(world[:, None], x) + (w - 1.0) * origin, w], axis=-1)
 
     def members(self, names: np.ndarray) -> np.ndarray:
         """Number of features (K,) among the points of the constellation, −1 of others."""

@@ -191,11 +191,13 @@ class ImageSensor(Sensor):
         return [] if is_placed else self.observations(frame.used, belief)
 
     def observations(self, used: FeatureFrame, belief: Belief) -> list[Observations]:
-        """Of what was found; features that are not trusted only update the map."""
+        """Of what was found; features that are not trusted only update the map, and a joint map not at all."""
         trusted = self.table.trusted(used.landmarks, self.config.trusted_fraction)
         if trusted.all():
             return list(self.features.observe(used, belief))
         of_trusted, others = (self.features.observe(used.take(rows), belief) for rows in (trusted, ~trusted))
+        if self.features.joint:
+            return list(of_trusted)
         only_map = [replace(group, updates=MAP) for group in others if Part.LANDMARK in group.updates]
         return [*of_trusted, *only_map]
 
@@ -214,7 +216,7 @@ class ImageSensor(Sensor):
                 table.alive[failing] = False
                 failing = failing[table.member[failing] < 0]
         self.place(belief, frame.used.landmarks)
-        pose = belief.state[belief.mode][:7]
+        pose = self.features.pose(belief)
         if frame.image is not None and not self.bad_frames:
             self._keep_appearances(frame.image, frame.used, pose)
             frame.started = self._started(frame, frame.image, pose)
@@ -239,6 +241,16 @@ class ImageSensor(Sensor):
         table.first_pose[rows] = table.last_pose[rows] = path[started]
         table.last_patch[rows] = table.first_patch[rows]  # later appearances are from the old path
         self.place(belief, rows[held & table.alive[rows]])
+
+    def move(self, new_from_old: np.ndarray) -> None:
+        """The world is another one (7,): where features are and were seen from."""
+        table = self.table
+        table.first_pose[:], table.last_pose[:] = (
+            SE3.compose(new_from_old, poses) for poses in (table.first_pose, table.last_pose)
+        )
+        x, w = table.position[:, :3], table.position[:, 3:]
+        table.position[:, :3] = SE3.transform(new_from_old, x) + (w - 1.0) * SE3.translation(new_from_old)
+        table.member[:] = -1
 
     def place(self, belief: Belief, rows: np.ndarray) -> None:
         """Remembers where in the heaviest particle's world features are now."""

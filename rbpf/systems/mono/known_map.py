@@ -17,6 +17,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import MIN_RHO
+from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.calibration import spread_rows
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
@@ -155,6 +156,13 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
     """
     belief, unknown_depth = filter_.belief(), features.unknown_depth
     landmark_map, weights, mode = belief.map, belief.weights, belief.mode
+    if isinstance(landmark_map, JointMap):
+        names, means, covs = landmark_map.landmarks(filter_.particles)
+        spans, order = np.full((names.size, 2, 3), np.nan), np.argsort(names)
+        which, ends = features.extents(belief, names, RAY_SIGMAS, MIN_RHO)
+        spans[which] = ends[..., :3] / ends[..., 3:]
+        columns = {"ray": np.isfinite(spans[order]).all(axis=(1, 2)).astype(int)}
+        return MapEstimate(names[order], means[order], covs[order], columns, spans[order])
     if world is None:
         n = weights.size
         world = Anchored(np.tile(SE3.identity(), (n, 1)), np.zeros((n, 6, 6)))

@@ -125,7 +125,9 @@ class TrackingLoss:
     def trust(self, filter_: Filter, image: np.ndarray | None) -> None:
         """Takes the particles as they are after a step for the last trusted ones, with the image that they were found in."""
         assert filter_.stamp_ns is not None
-        self._particles, self.stamp_ns = filter_.particles, filter_.stamp_ns
+        particles = filter_.particles
+        state = filter_.belief().map.world(particles.state[:, :7])
+        self._particles, self.stamp_ns = Particles(state, particles.log_weights), filter_.stamp_ns
         self._image, self._view = image, None
         self.never_found = False
 
@@ -134,7 +136,7 @@ class TrackingLoss:
         """The last trusted pose world_from_camera (7,) in the particles' world, and its covariance (6, 6)."""
         if self._particles is not None:
             # Averaged only when it is needed: tracking has no time for it.
-            poses, log_weights = self._particles.state[:, :7], self._particles.log_weights
+            poses, log_weights = self._particles.state, self._particles.log_weights
             estimate = mixture_estimate(Prior.exactly(SE3, poses), None, log_weights)
             self._trusted, self._particles = (estimate.mean, estimate.cov), None
             self._mode = poses[log_weights.argmax()].copy()

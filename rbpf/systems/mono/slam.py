@@ -11,6 +11,7 @@ search inside, what is reported, and, as long as depths are unknown, the batch a
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -22,6 +23,7 @@ from rbpf.core.particles import mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
@@ -36,6 +38,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
+from rbpf.systems.mono.joint import JointRays, hand_over, is_joint, is_time, joint_filter
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
@@ -155,6 +158,13 @@ class MonoSlam(System):
         self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
         self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
         self.filter = self._new_filter(self.sensor)
+        self.joint: JointMap | None = None
+        """One Gaussian of the whole map; None as long as every particle has a map of its own."""
+        self._becomes_joint = config.map == "joint" and not is_fixed
+        if self._becomes_joint and not isinstance(rays, InverseDepthRays):
+            raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
+        if self._becomes_joint and config.velocity.mode != "marginal":
+            raise InputError(f"a joint map holds the velocity: set velocity.mode=marginal, not {config.velocity.mode}")
         self.screen = ImageScreen(camera)
         if known_map is not None:
             self._add_points(known_map.points)
@@ -237,6 +247,10 @@ class MonoSlam(System):
                 prior, self.attempt = self.loss.prior(self.filter, measured.image)
                 measured.recognised = self.attempt is not None and self.attempt.certain
 
+        if prior is not None and self.joint is not None:  # its states are in a frame of its own
+            world = self.joint.world(SE3.identity((self.filter.n,)))
+            prior = replace(prior, mean=SE3.between(world, prior.mean))
+
         # 4. The filter's step: active search, proposal, weights, samples, landmarks; see `ImageSensor`.
         report = self.report = self.filter.step(measured, prior, stamp_ns)
         if isinstance(measured, Measurement):
@@ -246,7 +260,10 @@ class MonoSlam(System):
 
         # 5. What is reported.
         world = world_of(self.filter)
-        if world is None:  # the refined mixture's
+        if self.joint is not None:
+            estimate = self.joint.estimate(self.filter.particles)
+            pose, cov = estimate.mean, estimate.cov
+        elif world is None:  # the refined mixture's
             pose, cov = report.estimate.mean[:7], report.estimate.cov[:6, :6]
         else:  # the samples', each with its own uncertain world: before sampling the pose and its place are correlated
             particles = self.filter.particles
@@ -274,7 +291,16 @@ class MonoSlam(System):
                     self.loss.trust(self.filter, measured.image)
             messages = [words, *messages] if words is not None else messages
 
-        # 7. How it stands.
+        # 7. Once depths are known: one Gaussian, if there is to be one. It stays where it is while the camera is lost.
+        if self._becomes_joint and self.joint is None and self.start.over and not sensor.bad_frames:
+            seen = measured.used if isinstance(measured, Measurement) else measured
+            if is_time(self.filter.belief(), self.features, seen):
+                self._become_joint()
+                if isinstance(measured, Measurement):
+                    self.loss.trust(self.filter, measured.image)
+        self._hold_frame()
+
+        # 8. How it stands.
         if sensor.lost and not was_lost:
             messages.append(LOST)
         is_found = was_lost and not sensor.lost
@@ -305,14 +331,17 @@ class MonoSlam(System):
 
     def particle_poses(self) -> np.ndarray:
         """(N, 7) world_from_camera of the particles as they are now, in the reported world."""
-        poses, world = self.filter.particles.state[:, :7], world_of(self.filter)
+        poses, world = self.filter.belief().map.world(self.filter.particles.state[:, :7]), world_of(self.filter)
         return poses if world is None else SE3.between(world.mean, poses)
 
     def particle_paths(self) -> np.ndarray:
         """(T, N, 7) world_from_camera of the particles along their ancestors, in the reported world; with a lag, the last.
 
-        Where there are known points, each particle's path is reported from its own mean of their world's place.
+        Where there are known points, each particle's path is reported from its own mean of their world's place. Particles of
+        a joint map have none: it has them as they are now.
         """
+        if self.joint is not None:
+            return self.particle_poses()[None]
         paths, world = self.filter.history.paths()[..., :7], world_of(self.filter)
         return paths if world is None else SE3.between(world.mean, paths)
 
@@ -351,7 +380,7 @@ class MonoSlam(System):
     def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
         """The particles' paths; and, of images, the map as a place to be found in, unless the run was localised."""
         posterior = {
-            "stamps_ns": self.filter.history.stamps_ns,
+            "stamps_ns": self.filter.history.stamps_ns if self.joint is None else np.array([self.filter.stamp_ns]),
             "world_from_camera": self.particle_paths(),
             "log_weights": self.filter.particles.log_weights,
         }
@@ -382,10 +411,18 @@ class MonoSlam(System):
             arrays |= part.arrays()
         return arrays
 
+    def load(self, path: Path | str) -> dict[str, np.ndarray]:
+        """As `System.load`; what is saved after the map became a joint one has another filter."""
+        if self._becomes_joint and self.joint is None and is_joint(Path(path)):
+            rays = self._joint_rays()
+            self._use_joint(joint_filter(self.config, rays, self.sensor, self.filter.rng), rays)
+        return super().load(path)
+
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         for part in (self.sensor, self.screen, self.loss, self.start):
             part.restore(arrays)
+        self._hold_frame()
         table, landmark_map = self.sensor.table, self.filter.belief().map
         own = np.flatnonzero(table.alive & (table.member < 0))
         if not landmark_map.holds(own).all():
@@ -410,6 +447,31 @@ class MonoSlam(System):
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
         return Filter(motion, sensor, parts, proposal, resampling, config.particles, rng, lag=self.lag)
+
+    def _become_joint(self) -> None:
+        """Takes what the particles hold into one Gaussian; its world is that of the known points, where there are some."""
+        belief, world = self.filter.belief(), world_of(self.filter)
+        rays = self._joint_rays()
+        new = joint_filter(self.config, rays, self.sensor, self.filter.rng)
+        hand_over(self.filter, self.features, rays, new)
+        if world is not None:
+            self.sensor.move(SE3.inverse(world.mean[belief.mode]))
+        self._use_joint(new, rays)
+
+    def _joint_rays(self) -> JointRays:
+        assert isinstance(self.features.unknown_depth, InverseDepthRays)
+        return JointRays(self.features.unknown_depth)
+
+    def _use_joint(self, filter_: Filter, rays: JointRays) -> None:
+        joint = filter_.belief().map
+        assert isinstance(joint, JointMap)
+        self.filter, self.joint = filter_, joint
+        self.features.become_joint(rays)
+
+    def _hold_frame(self) -> None:
+        """A joint map's frame stays where it is while the camera is lost."""
+        if self.filter.consolidation is not None:
+            self.filter.consolidation = replace(self.filter.consolidation, held=self.sensor.lost)
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
@@ -486,7 +548,7 @@ class MonoSlam(System):
             seen = {"features": measured.landmarks, "px": measured.z, "cov_px": measured.cov_z}
             return self._nothing() | nowhere | seen
         belief, table, search = self.filter.belief(), self.sensor.table, measured.search
-        rows, found, pose = search.features, search.found, belief.state[belief.mode][:7]
+        rows, found, pose = search.features, search.found, self.features.pose(belief)
         position = table.position[rows].copy()
         if world is not None:
             position[:, :3] = directions(position, world.mean[belief.mode])
