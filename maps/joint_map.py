@@ -144,8 +144,8 @@ class JointMap(Map):
         self.mean[:, d : self._first], self.cov[d : self._first, d : self._first] = substate
         chart = np.tile(np.eye(cov.shape[1]), (self.n, 1, 1))
         chart[:, :d, :d] = self.space.right_jacobian_inverse(offset)
-        columns = [] if not ids.size else self._held.of_one_kind(ids).columns.ravel().tolist()
-        columns = np.array([*range(d), *columns])
+        points = self._held.of_one_kind(ids).columns.ravel().tolist() if ids.size else []
+        columns = np.array([*range(d), *points])
         moved = (chart @ cov @ np.swapaxes(chart, 1, 2)).mean(axis=0)
         self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(moved)
 
@@ -258,7 +258,7 @@ class JointMap(Map):
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
-        self.mean = self.mean[ancestors]
+        self.n, self.mean = ancestors.size, self.mean[ancestors]
         if self._gain is not None:
             self._predicted = self._predicted[ancestors]
             self._increment_mean = take(self._increment_mean, ancestors)
@@ -603,7 +603,11 @@ class JointMap(Map):
         self._held.hold(table._replace(first=place[table.first], clone=number[table.clone]))
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
-        """Turns anchored landmarks into points of the frame, to first order: with all that they are correlated with."""
+        """Turns anchored landmarks into points of the frame: with all that they are correlated with, to first order.
+
+        Their mean is that of the landmark's own transform: the mean of 1/q is not 1/q̄, and what is promoted as soon as it may
+        be would all come too near.
+        """
         ids = np.asarray(ids, dtype=np.int64)
         if not ids.size:
             return
@@ -614,7 +618,7 @@ class JointMap(Map):
             or kind.landmark.dim != self.point.dim
         ):
             raise InputError(f"a joint map turns what is anchored into Point({self.point.dim})")
-        points, slopes = self._points(kind, self.mean, self.clones)
+        points, slopes = kind.landmark.promote(self.read(ids)).mean, self._points(kind, self.mean, self.clones)[1]
         slope, columns = slopes.mean(axis=0), np.concatenate([kind.columns, kind.clones], axis=1)
         # P' = T P Tᵀ, where T has the slope in the rows of each landmark.
         for _ in range(2):

@@ -171,6 +171,12 @@ class MonoConfig(Ranged):
     #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
     #: below the threshold of resampling, which does not take place.
     window: Count = 5
+    #: of a joint map: how many particles begin, with maps of their own …
+    starting_particles: Count = 250
+    #: … until half of the depths in view were known in so many frames in a row.
+    settled_frames: Count = 30
+    #: of a joint map: landmarks held, at most; of those not looked for the ones that were found least often are dropped.
+    active: Count = 300
     #: landmarks started in one frame at most.
     max_new_per_frame: Annotated[CountOrNone, Formerly("births_per_frame")] = 1000
     #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.

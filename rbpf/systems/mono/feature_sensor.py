@@ -191,14 +191,14 @@ class FeatureSensor(Sensor):
         self.unknown_depth = unknown_depth
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
-        self.joint = False
-        """Whether the map is a joint one, in which nothing is updated without the state."""
+        self.most: int | None = None
+        """Landmarks that a joint map may hold, in which nothing is updated without the state; None where it is none."""
         self.point = CameraPoint(camera)
         self._take_group(group)
 
-    def become_joint(self, unknown_depth: UnknownDepth) -> None:
-        """From now on the map is a joint one, which holds the known points one by one."""
-        self.unknown_depth, self.joint = unknown_depth, True
+    def become_joint(self, unknown_depth: UnknownDepth, most: int) -> None:
+        """From now on the map is a joint one, which holds the known points one by one, and `most` landmarks in all."""
+        self.unknown_depth, self.most = unknown_depth, most
         self._take_group(None)
 
     def _take_group(self, group: KnownPoints | None) -> None:

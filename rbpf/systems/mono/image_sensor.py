@@ -196,7 +196,7 @@ class ImageSensor(Sensor):
         if trusted.all():
             return list(self.features.observe(used, belief))
         of_trusted, others = (self.features.observe(used.take(rows), belief) for rows in (trusted, ~trusted))
-        if self.features.joint:
+        if self.features.most is not None:
             return list(of_trusted)
         only_map = [replace(group, updates=MAP) for group in others if Part.LANDMARK in group.updates]
         return [*of_trusted, *only_map]
@@ -226,6 +226,8 @@ class ImageSensor(Sensor):
             const = None if records.const is None else records.const[0]
             x, w = self.features.unknown_depth.model.world_point(records.mean[0], const)
             self.table.position[group.ids] = np.concatenate([x, w], axis=-1)
+        if self.features.most is not None:
+            failing = np.append(failing, self._beyond(belief, self.features.most - frame.started.landmarks.size, rows))
         self.features.remove(belief, failing)
         frame.seconds_new_landmarks = time.perf_counter() - started
         return new_landmarks
@@ -285,6 +287,15 @@ class ImageSensor(Sensor):
         found = found[radius <= config.max_radius_px]
         fraction = config.lost_fraction if recognised else config.recovered_fraction
         return bool(found.sum() < max(least, fraction * found.size))
+
+    def _beyond(self, belief: Belief, most: int, looked_for: np.ndarray) -> np.ndarray:
+        """Features (K,) that are more than the map may hold: of those not looked for, the ones that were found least often."""
+        held = np.setdiff1d(belief.map.ids, looked_for)
+        held = held[self.table.alive[held]]
+        count = max(belief.map.ids.size - most, 0)
+        dropped = held[np.argsort(self.table.found[held], kind="stable")[:count]]
+        self.table.alive[dropped] = False
+        return dropped
 
     def _keep_appearances(self, image: np.ndarray, used: FeatureFrame, pose: np.ndarray) -> None:
         """Renews the last appearance of the features that look different by now.

@@ -37,7 +37,7 @@ LEAST_PARALLAX_PX = 3.0
 JOINT = "joint/mean"
 """In the checkpoint of a filter on a joint map."""
 KNOWN_FRACTION = 0.5
-"""Of the features in view: when the depths of so many are known, the map becomes a joint one."""
+"""Of the features in view: so many depths are known when the map becomes a joint one."""
 
 
 @final
@@ -75,9 +75,8 @@ class JointRays(UnknownDepth):
         return self.own.extent(records, sigmas, min_weight)
 
 
-def is_time(belief: Belief, features: FeatureSensor, seen: FeatureFrame) -> bool:
-    """Whether the depths of enough of what a frame has shown are known."""
-    ratio = features.unknown_depth.landmark.ready_ratio
+def are_known(belief: Belief, features: FeatureSensor, seen: FeatureFrame, ratio: float) -> bool:
+    """Whether the depths of enough of what a frame has shown are known, to a fraction of them."""
     return seen.landmarks.size > 0 and features.depth_known(belief, seen.landmarks, ratio).mean() >= KNOWN_FRACTION
 
 
@@ -105,8 +104,9 @@ def hand_over(old: Filter, features: FeatureSensor, rays: JointRays, new: Filter
     """
     own, joint = old.belief().map, new.belief().map
     assert isinstance(joint, JointMap)
-    n, particles = new.n, old.particles
+    n, particles = old.n, old.particles
     chosen = Systematic().ancestors(particles.weights, old.rng)
+    joint.begin(n, new.lineage)
     ids, group = own.ids, features.group
     names = np.zeros(0, dtype=np.int64) if group is None else group.names
 
@@ -137,7 +137,9 @@ def hand_over(old: Filter, features: FeatureSensor, rays: JointRays, new: Filter
         cov = turn @ cov @ np.swapaxes(turn, 1, 2)
     joint.begin_at(world, (means, covs), names, cov)
     new.steps, new.stamp_ns = old.steps, old.stamp_ns
-    new.particles = new.marginals.consolidate(Particles(particles.state[chosen], uniform_log_weights(n)))
+    here = joint.consolidate(Particles(particles.state[chosen], uniform_log_weights(n)))
+    joint.resample(np.arange(new.n))  # they are all alike now
+    new.particles = Particles(here.state[: new.n], uniform_log_weights(new.n))
 
 
 def _of(records: Records, chosen: np.ndarray) -> Records:

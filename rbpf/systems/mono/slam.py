@@ -16,6 +16,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Conditional, MotionModel, Records, Sensor
@@ -38,7 +39,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
-from rbpf.systems.mono.joint import JointRays, hand_over, is_joint, is_time, joint_filter
+from rbpf.systems.mono.joint import JointRays, are_known, hand_over, is_joint, joint_filter
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
@@ -154,13 +155,17 @@ class MonoSlam(System):
 
         rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
         is_fixed = known_map is not None
+        self._becomes_joint = config.map == "joint" and not is_fixed
+        if self._becomes_joint:
+            config = replace(config, particles=max(config.particles, config.starting_particles))
+        self._begins_with = config
         self.features = FeatureSensor(camera, rays, config.max_new_per_frame, group, is_fixed)
         self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
         self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
         self.filter = self._new_filter(self.sensor)
         self.joint: JointMap | None = None
         """One Gaussian of the whole map; None as long as every particle has a map of its own."""
-        self._becomes_joint = config.map == "joint" and not is_fixed
+        self._settled = 0  # frames in a row in which depths were known
         if self._becomes_joint and not isinstance(rays, InverseDepthRays):
             raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
         if self._becomes_joint and config.velocity.mode != "marginal":
@@ -248,8 +253,8 @@ class MonoSlam(System):
                 measured.recognised = self.attempt is not None and self.attempt.certain
 
         if prior is not None and self.joint is not None:  # its states are in a frame of its own
-            world = self.joint.world(SE3.identity((self.filter.n,)))
-            prior = replace(prior, mean=SE3.between(world, prior.mean))
+            frame_of_states = self.joint.world(SE3.identity((self.filter.n,)))
+            prior = replace(prior, mean=SE3.between(frame_of_states, prior.mean))
 
         # 4. The filter's step: active search, proposal, weights, samples, landmarks; see `ImageSensor`.
         report = self.report = self.filter.step(measured, prior, stamp_ns)
@@ -294,7 +299,9 @@ class MonoSlam(System):
         # 7. Once depths are known: one Gaussian, if there is to be one. It stays where it is while the camera is lost.
         if self._becomes_joint and self.joint is None and self.start.over and not sensor.bad_frames:
             seen = measured.used if isinstance(measured, Measurement) else measured
-            if is_time(self.filter.belief(), self.features, seen):
+            known = are_known(self.filter.belief(), self.features, seen, self.config.inverse_depth.promote_std_ratio)
+            self._settled = self._settled + 1 if known else 0
+            if self._settled >= self.config.settled_frames:
                 self._become_joint()
                 if isinstance(measured, Measurement):
                     self.loss.trust(self.filter, measured.image)
@@ -409,7 +416,7 @@ class MonoSlam(System):
         arrays: dict[str, np.ndarray] = {}
         for part in (self.sensor, self.screen, self.loss, self.start):
             arrays |= part.arrays()
-        return arrays
+        return arrays | ({"mono/settled": np.array(self._settled)} if self._becomes_joint else {})
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
         """As `System.load`; what is saved after the map became a joint one has another filter."""
@@ -422,6 +429,8 @@ class MonoSlam(System):
         """The inverse of `arrays`."""
         for part in (self.sensor, self.screen, self.loss, self.start):
             part.restore(arrays)
+        if self._becomes_joint:
+            self._settled = int(read_one(arrays, "mono/settled", integers(least=0)))
         self._hold_frame()
         table, landmark_map = self.sensor.table, self.filter.belief().map
         own = np.flatnonzero(table.alive & (table.member < 0))
@@ -432,7 +441,7 @@ class MonoSlam(System):
 
     def _new_filter(self, sensor: Sensor) -> Filter:
         """A filter with an empty map; the parametrisations are named in it, so that a checkpoint can be read back."""
-        config, velocity = self.config, self.config.velocity
+        config, velocity = self._begins_with, self.config.velocity
         motion: MotionModel = MarginalVelocity(velocity.walk_std())
         if velocity.mode != "marginal":
             motion = SampledVelocity(velocity.walk_std(), velocity.mode, velocity.start_std())
@@ -466,7 +475,7 @@ class MonoSlam(System):
         joint = filter_.belief().map
         assert isinstance(joint, JointMap)
         self.filter, self.joint = filter_, joint
-        self.features.become_joint(rays)
+        self.features.become_joint(rays, self.config.active)
 
     def _hold_frame(self) -> None:
         """A joint map's frame stays where it is while the camera is lost."""
@@ -475,7 +484,7 @@ class MonoSlam(System):
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
-        known, config = self.known, self.config
+        known, config = self.known, self._begins_with
         if self.known_map is not None:
             return measured, None
         if known is None:
@@ -512,7 +521,7 @@ class MonoSlam(System):
 
     def _add_points(self, known: KnownPoints) -> None:
         """They enter the map once, with their σ, and are ordinary landmarks from then on."""
-        landmark_map, n = self.filter.belief().map, self.config.particles
+        landmark_map, n = self.filter.belief().map, self.filter.n
         mean = np.broadcast_to(known.positions, (n, *known.positions.shape))
         cov = np.broadcast_to(known.cov, (n, *known.cov.shape))
         landmark_map.add_records(Records(mean, cov), Point(3), ids=known.names)
