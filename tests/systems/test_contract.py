@@ -54,6 +54,7 @@ class Case:
     frames: Callable[[], list]
     after: tuple[int, ...]
     states: set[TrackingState] = field(default_factory=set)
+    joint: bool | None = None  #: whether it ends with a joint map; None where that is not asked.
 
 
 def unnamed(**options) -> RangeBearingSlam:
@@ -72,6 +73,19 @@ RESUMED = {
     "separate points": Case(lambda: mono(KNOWN, known="points"), lambda: list(sequence(8).frames()), (0, 3, 6)),
     "nothing known": Case(mono, lambda: list(sequence(12).frames()), (0, 4, 6, 8, 10), {TrackingState.INITIALISING}),
     "lost": Case(lambda: mono(KNOWN), lambda: list(sequence(18, blinking).frames()), (1, 4, 8, 10, 12, 14, 16), LOST),
+    "known points, joint map": Case(
+        lambda: mono(KNOWN, map="joint", settled_frames=3),
+        lambda: list(sequence(16).frames()),
+        (0, 4, 9, 12),
+        joint=True,
+    ),
+    "lost, joint map": Case(
+        lambda: mono(KNOWN, map="joint", settled_frames=1),
+        lambda: list(sequence(30, lambda t, image: blinking(t - 12, image)).frames()),
+        (15, 20, 22, 26),
+        LOST,
+        True,
+    ),
     "waiting": Case(
         lambda: mono(KNOWN), lambda: list(sequence(4, lambda t, i: None if t < 2 else i).frames()), (0, 1, 2)
     ),
@@ -151,6 +165,7 @@ def test_a_checkpoint_after_any_frame_goes_on_with_the_same_bytes(case, tmp_path
         if t in case.after:
             system.save(tmp_path / f"{t}.npz", {"of the caller": np.array(t)})
     assert {each.state for each in whole} >= case.states
+    assert case.joint is None or (system.filter.consolidation is not None) is case.joint
     for t in case.after:
         again = case.make()
         assert again.load(tmp_path / f"{t}.npz")["of the caller"] == t
