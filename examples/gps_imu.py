@@ -19,34 +19,25 @@ from rbpf import (
     Sensor,
     Transition,
 )
+from rbpf.gaussian import psd_factor
+from rbpf.motion.odometry import Odometry, preintegrate
 
 RATE, SECONDS, OUTAGE = 50, 120, range(60, 85)
 STD_TICK = np.array([0.002, 0.01, 0.002])  # of an increment: turn [rad], forward [m], to the left [m]
 STD_BIAS, WALK_BIAS, STD_FIX = 0.05, 0.0002, 0.5  # rad/s, rad/s per √s, m
-
-
-def summed(ticks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Increments (K, 3) composed: the whole (3,), its noise's factor (3, 3), its derivative by the gyroscope's bias (3, 1)."""
-    whole, cov, by_bias = SE2.identity(), np.zeros((3, 3)), np.zeros((3, 1))
-    for tick in ticks:
-        step = SE2.exp(tick)
-        back, jac = SE2.adjoint(SE2.inverse(step)), SE2.right_jacobian(tick)
-        whole = SE2.compose(whole, step)
-        cov = back @ cov @ back.T + jac @ np.diag(STD_TICK**2) @ jac.T
-        by_bias = back @ by_bias - jac[:, :1] / RATE
-    return whole, np.linalg.cholesky(cov), by_bias
+BY_BIAS = np.array([[-1.0 / RATE], [0.0], [0.0]])  # of an increment
 
 
 class Driven(MotionModel):
-    """x' = x · whole · Exp(B bias + w); the control is what `summed` gives."""
+    """x' = x · delta · Exp(B bias + w); the control is what `preintegrate` gives."""
 
     space = SE2
 
     def transition(self, state, control, dt):
-        whole, factor, by_bias = control or (SE2.identity(), np.zeros((3, 3)), np.zeros((3, 1)))
+        moved, by_bias = control or (Odometry.at_rest(SE2), np.zeros((3, 1)))
         noise = np.zeros((4, 4))
-        noise[:3, :3], noise[3, 3] = factor, WALK_BIAS * np.sqrt(dt)
-        return Transition(SE2.compose(state, whole), noise[None], by_bias[None], np.eye(1)[None], np.zeros((1, 1)))
+        noise[:3, :3], noise[3, 3] = psd_factor(moved.cov), WALK_BIAS * np.sqrt(dt)
+        return Transition(SE2.compose(state, moved.delta), noise[None], by_bias[None], np.eye(1)[None], np.zeros((1, 1)))
 
 
 class Position(ObservationModel):
@@ -90,7 +81,7 @@ def track(world: list, seed: int) -> tuple[np.ndarray, np.ndarray, Filter]:
     rng, errors, nees = np.random.default_rng(seed), [], []
     filter_ = Filter(Driven(), Receiver(), held, rng=rng, lag=1, consolidation=window)
     for pose, _, ticks, fix in world:
-        filter_.step(fix, None if ticks is None else summed(ticks))
+        filter_.step(fix, None if ticks is None else preintegrate(ticks, np.diag(STD_TICK**2), BY_BIAS, SE2))
         mean, cov = filter_.belief().moments(Part.STATE)
         errors.append(SE2.local(mean, pose))
         nees.append(errors[-1] @ np.linalg.pinv(cov, hermitian=True) @ errors[-1])

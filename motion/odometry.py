@@ -39,6 +39,29 @@ class Odometry:
         return Odometry(space.compose(self.delta, later.delta), gaussian.symmetrise(cov))
 
 
+def preintegrate(
+    ticks: np.ndarray, cov: np.ndarray, by_bias: np.ndarray, space: LieGroup = SE3
+) -> tuple[Odometry, np.ndarray]:
+    """What comes at a high rate between two frames, as of wheels and a gyroscope, as one motion (T. Lupton, S. Sukkarieh 2012).
+
+    The motion is Π Exp(tick + by_bias b + noise) at b = 0, with the errors b alike in all ticks: a little of them moves its end by
+    Exp(B b).
+
+    Args:
+        ticks: (K, d) increments, in the chart [ω, v] of `space`.
+        cov: (d, d) of the noise of each.
+        by_bias: (d, k) how each depends on b; −dt in the row of ω for a gyroscope's bias.
+
+    Returns: the motion, and its derivative B (d, k), in the right chart there.
+    """
+    motion, derivative = Odometry.at_rest(space), np.zeros_like(by_bias, dtype=float)
+    for tick in ticks:
+        step, jac = space.exp(tick), space.right_jacobian(tick)
+        motion = motion.then(Odometry(step, jac @ cov @ jac.T), space)
+        derivative = space.adjoint(space.inverse(step)) @ derivative + jac @ by_bias
+    return motion, derivative
+
+
 @final
 class OdometryMotion(MotionModel):
     """x_t = x_{t−1} · delta · Exp(w), w ~ N(0, cov + diag(std_added²)). Without a control the robot stands still.

@@ -7,7 +7,7 @@ from rbpf.conformance import Example, check_model
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
-from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
+from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion, preintegrate
 from tests.core.scripted import Scripted
 
 N = 4
@@ -95,6 +95,21 @@ def test_chained_covariance_against_samples():
     rest = first.then(Odometry.at_rest())
     np.testing.assert_allclose(rest.delta, first.delta, atol=1e-15)
     np.testing.assert_allclose(rest.cov, first.cov, atol=1e-15)
+
+
+def test_what_comes_between_two_frames_is_one_motion():
+    rng = np.random.default_rng(0)
+    ticks, by, root = 0.1 * rng.normal(size=(20, 6)), rng.normal(size=(6, 2)), rng.normal(size=(6, 6))
+    motion, derivative = preintegrate(ticks, root @ root.T, by)
+
+    def end(off: np.ndarray) -> np.ndarray:
+        return SE3.local(motion.delta, preintegrate(ticks + off, np.eye(6), by)[0].delta)
+
+    found = [(end(1e-6 * by[:, k]) - end(-1e-6 * by[:, k])) / 2e-6 for k in range(2)]
+    np.testing.assert_allclose(np.transpose(found), derivative, atol=1e-8)
+    each = [[end(1e-6 * (np.arange(20) == t)[:, None] * root[:, k]) / 1e-6 for k in range(6)] for t in range(20)]
+    cov = np.einsum("tki,tkj->ij", each, each)
+    np.testing.assert_allclose(motion.cov, cov, atol=1e-4 * np.abs(cov).max())
 
 
 @pytest.mark.parametrize("std", [-1.0, np.ones(3), np.nan])
