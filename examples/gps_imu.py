@@ -37,7 +37,8 @@ class Driven(MotionModel):
         moved, by_bias = control or (Odometry.at_rest(SE2), np.zeros((3, 1)))
         noise = np.zeros((4, 4))
         noise[:3, :3], noise[3, 3] = psd_factor(moved.cov), WALK_BIAS * np.sqrt(dt)
-        return Transition(SE2.compose(state, moved.delta), noise[None], by_bias[None], np.eye(1)[None], np.zeros((1, 1)))
+        ahead = SE2.compose(state, moved.delta)
+        return Transition(ahead, noise[None], by_bias[None], np.eye(1)[None], np.zeros((1, 1)))
 
 
 class Position(ObservationModel):

@@ -42,15 +42,16 @@ class Odometry:
 def preintegrate(
     ticks: np.ndarray, cov: np.ndarray, by_bias: np.ndarray, space: LieGroup = SE3
 ) -> tuple[Odometry, np.ndarray]:
-    """What comes at a high rate between two frames, as of wheels and a gyroscope, as one motion (T. Lupton, S. Sukkarieh 2012).
+    """What wheels and a gyroscope say at a high rate between two frames, as one motion (T. Lupton, S. Sukkarieh 2012).
 
-    The motion is Π Exp(tick + by_bias b + noise) at b = 0, with the errors b alike in all ticks: a little of them moves its end by
-    Exp(B b).
+    The motion is Π Exp(tick + by_bias b + noise) at b = 0, with the errors b alike in all ticks: a little of them moves
+    its end by Exp(B b).
 
     Args:
         ticks: (K, d) increments, in the chart [ω, v] of `space`.
         cov: (d, d) of the noise of each.
         by_bias: (d, k) how each depends on b; −dt in the row of ω for a gyroscope's bias.
+        space: that they move in.
 
     Returns: the motion, and its derivative B (d, k), in the right chart there.
     """
