@@ -28,7 +28,9 @@ from rbpf.ranges import Positive, Range, Ranged, require_memory
 
 _FIRST_TILES = 256
 _EVERY = 2
-"""Of so many beams one is looked at on the lattice of a search."""
+"""Of so many beams one is looked at on the lattice of a search,"""
+_APART = 16
+"""of these first each so many-th, then those beside them, and so on."""
 GRID = Part("occupancy grid")
 """Its name in a filter."""
 
@@ -114,7 +116,11 @@ class GridMap(Conditional):
         info = np.linalg.inv(cov + 1e-12 * np.eye(3))
         found, value, hessian = np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3))
         place = self._place(prior.base, beams, slack)
-        cells.search(*place, info, radius, spacing, self._steps, _EVERY, found, value, hessian)
+        # Neighbours tell the same: beams far apart come first, each with what it and all after it can add at most.
+        few = beams[::_EVERY] * [1.0, 1.0, 1.0, 1.0, _EVERY]
+        few = few[np.argsort(np.arange(len(few)) % _APART, kind="stable")]
+        rest = np.ascontiguousarray(few[::-1, 4].cumsum()[::-1]) * float(self._stamps.max())
+        cells.search(*place, info, radius, spacing, self._steps, few, rest, found, value, hessian)
         factor = np.broadcast_to(prior.factor, (n, *prior.factor.shape[1:]))
         # What falls off about the maximum, as information; in units in which the steps weigh the same.
         unit = self._steps
@@ -242,7 +248,8 @@ class GridMap(Conditional):
             return
         more = max(count - free, self.users.size)
         require_memory(4.0 * (self.users.size + more) * self.pool[0].size, f"{self.users.size + more} tiles of the map")
-        self.pool = np.concatenate([self.pool, np.zeros((more, *self.pool.shape[1:]), dtype=np.float32)])
+        held, self.pool = self.pool, np.zeros((self.users.size + more, *self.pool.shape[1:]), dtype=np.float32)
+        self.pool[: len(held)] = held  # what is not used yet needs no memory
         self.users = np.concatenate([self.users, np.zeros(more, dtype=np.int64)])
 
 

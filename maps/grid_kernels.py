@@ -8,7 +8,7 @@ Cell (x, y) of the world is floor(position / side); `origin` is the tile of inde
 import math
 
 import numpy as np
-from numba import boolean, float32, float64, int32, int64, njit, prange, types, void
+from numba import boolean, float32, float64, int32, njit, prange, types, void
 
 from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR
 
@@ -306,20 +306,27 @@ def scores(state, beams, side, origin, index, pool, stamps, fields, marks, value
             _clear(field, marked, border)
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _outward(k):
+    """The integers in the order 0, 1, −1, 2, −2."""
+    return (k + 1) // 2 if k % 2 else -(k // 2)
+
+
 @njit(
-    void(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, int64, MATRIX, VECTOR, CUBE),
+    void(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, MATRIX, VECTOR, CUBE),
     parallel=True,
     cache=True,
     error_model="numpy",
 )
 def search(
-    state, beams, side, origin, index, pool, stamps, fields, marks, info, radius, spacing, steps, every,
+    state, beams, side, origin, index, pool, stamps, fields, marks, info, radius, spacing, steps, few, rest,
     increment, value, hessian,
 ):  # fmt: skip
     """The increments (N, 3) at which score minus ½ εᵀ info ε is highest, within ±`radius` (3,) of the states.
 
-    First on a lattice of `spacing` (3,), by the nearest cells' values for each `every`-th beam; then, from its best
-    point, along the axes with steps that are halved (G. Grisetti et al. 2007).
+    First on a lattice of `spacing` (3,) from its middle outward, by the nearest cells' values for the beams `few`: those
+    from each on can add `rest` at most, so that most points are given up early. Then, from its best point, along the axes
+    with steps that are halved (G. Grisetti et al. 2007).
     """
     border = stamps.shape[2] // 2
     threads = fields.shape[0]
@@ -329,37 +336,37 @@ def search(
         counts = np.zeros(3, dtype=np.int64)
         for a in range(3):
             counts[a] = math.ceil(radius[a] / spacing[a])
-        count = (beams.shape[0] + every - 1) // every
-        ends = np.zeros((count, 2))
+        ends = np.zeros((few.shape[0], 2))
         for n in range(thread, state.shape[0], threads):
             base, turn = state[n], radius[0] + spacing[0]
             margin = (border + 1) * side + math.hypot(radius[1] + spacing[1], radius[2] + spacing[2])
             _prepare(n, base, beams, turn, margin, side, origin, index, pool, stamps, field, marked, window)
             left, low = window[1] * TILE - border, window[0] * TILE - border
             highest = -np.inf
-            for i in range(-counts[0], counts[0] + 1):
-                trial[0] = i * spacing[0]
+            for i in range(2 * counts[0] + 1):
+                trial[0] = _outward(i) * spacing[0]
                 cos, sin = math.cos(base[0] + trial[0]), math.sin(base[0] + trial[0])
-                for k in range(count):
-                    beam = beams[k * every]
+                for k in range(few.shape[0]):
+                    beam = few[k]
                     ends[k, 0] = (base[1] + cos * beam[2] - sin * beam[3]) / side - left
                     ends[k, 1] = (base[2] + sin * beam[2] + cos * beam[3]) / side - low
                 # Shifts are along the axes of the robot half way through the turn, where Exp has its chord.
                 half = 0.5 * trial[0]
                 chord = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
                 cos, sin = chord * math.cos(base[0] + half) / side, chord * math.sin(base[0] + half) / side
-                for j in range(-counts[1], counts[1] + 1):
-                    trial[1] = j * spacing[1]
-                    for m in range(-counts[2], counts[2] + 1):
-                        trial[2] = m * spacing[2]
+                for j in range(2 * counts[1] + 1):
+                    trial[1] = _outward(j) * spacing[1]
+                    for m in range(2 * counts[2] + 1):
+                        trial[2] = _outward(m) * spacing[2]
                         shift_x = cos * trial[1] - sin * trial[2]
                         shift_y = sin * trial[1] + cos * trial[2]
-                        total = 0.0
-                        for k in range(count):
+                        total = -_penalty(info, trial)
+                        for k in range(few.shape[0]):
+                            if total + rest[k] <= highest:
+                                break
                             column, row = int(ends[k, 0] + shift_x), int(ends[k, 1] + shift_y)
                             if 0 <= column < field.shape[1] and 0 <= row < field.shape[0]:
-                                total += every * beams[k * every, 4] * field[row, column]
-                        total -= _penalty(info, trial)
+                                total += few[k, 4] * field[row, column]
                         if total > highest:
                             highest = total
                             best[:] = trial

@@ -118,14 +118,20 @@ def map_figure(found: RunFolder) -> Any:
 
 def _grid_figure(found: RunFolder, world: "World", path: Trajectory, motion: Similarity) -> Any:
     """Path and occupancy grid: black where something is, white where beams have passed, grey where none has."""
+    from matplotlib.transforms import Affine2D
+
     grid, figure, axes = found.grid, *new_axes(f"{found.name}: map in {world.name}")
-    height, width = grid.log_odds.shape
-    x = grid.corner[0] + grid.cell_m * np.arange(width + 1)
-    y = grid.corner[1] + grid.cell_m * np.arange(height + 1)
-    corners = np.stack([*np.meshgrid(x, y), np.zeros((height + 1, width + 1))], axis=-1)
-    at = motion.transform(corners.reshape(-1, 3)).reshape(corners.shape)
-    shade_ = np.sign(grid.log_odds)
-    axes.pcolormesh(at[..., 0], at[..., 1], shade_, cmap="Greys", vmin=-1.0, vmax=1.0, rasterized=True)
+    # An image, moved as the path is: a mesh of as many cells takes minutes and gigabytes in a large place.
+    extent = grid.cell_m * np.array(grid.log_odds.shape[::-1])
+    corners = grid.corner + extent * [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
+    at = motion.transform(np.pad(corners, ((0, 0), (0, 1))))[:, :2]
+    place = np.vstack([np.column_stack([at[1] - at[0], at[2] - at[0], at[0]]), [0.0, 0.0, 1.0]])
+    shades, unit = np.sign(grid.log_odds).astype(np.int8), (0.0, 1.0, 0.0, 1.0)
+    image = axes.imshow(shades, "Greys", vmin=-1, vmax=1, origin="lower", extent=unit, interpolation="nearest")
+    image.set_transform(Affine2D(place) + axes.transData)
+    axes.dataLim.update_from_data_xy(at, ignore=True)
+    axes.margins(0.0)
+    axes.autoscale()
     axes.plot(path.positions[:, 0], path.positions[:, 1], color=COLOURS["filter"], lw=0.7, label="path")
     axes.legend(loc="best", fontsize="small")
     return figure

@@ -10,6 +10,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.lie import SE2
+from rbpf.runs.plots import map_figure
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Trajectory, read_tum
 from rbpf.sensors.laser import Scan, Scanner
@@ -135,6 +136,12 @@ def test_a_run_leaves_a_map_that_map_server_reads(tmp_path: Path):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["system"] == "laser" and summary["fit_mean"] > 0.5 and (out / "map.png").stat().st_size > 10_000
     assert "report.html" in {path.name for path in out.iterdir()}
+    # One image with the grid's corners, not a polygon for each of its cells.
+    axes = map_figure(RunFolder.open(out)).axes[0]
+    (image,) = axes.images
+    ends = (image.get_transform() - axes.transData).transform([[0.0, 0.0], [1.0, 1.0]])
+    assert not axes.collections
+    assert np.hypot(*(ends[1] - ends[0])) == pytest.approx(0.05 * np.hypot(height, width), rel=1e-9)
     assert main(["run", "--from", str(out / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
     for name in ("trajectory.tum", "posterior.tum", "grid.npz"):
         assert (out / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
