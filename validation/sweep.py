@@ -30,17 +30,10 @@ import msgspec
 
 from rbpf import __version__
 from rbpf.errors import InputError
+from rbpf.runs import recordings
 from rbpf.runs.files import prepare_folder, write_csv
 from rbpf.runs.folder import summarise
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import (
-    LaserRecording,
-    MonoRecording,
-    Recording,
-    RobotRecording,
-    StereoRecording,
-    filter_recording,
-)
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
@@ -67,15 +60,15 @@ class SweepSystem:
     """A system that a sweep can run."""
 
     config: type  #: of its settings.
-    recording: Callable[..., Recording]  #: opens a sequence, from the paths of its fields.
+    recording: Callable[..., recordings.Recording]  #: opens a sequence, from the paths of its fields.
     fields: tuple[str, ...] = ("recording",)  #: of a sequence, each a path; the first is the recording itself.
 
 
 SYSTEMS = {
-    "range-bearing": SweepSystem(RangeBearingConfig, RobotRecording),
-    "laser": SweepSystem(LaserConfig, LaserRecording),
-    "mono": SweepSystem(MonoConfig, MonoRecording, ("recording", "known_points", "calibration")),
-    "stereo": SweepSystem(StereoConfig, StereoRecording, ("recording", "calibration")),
+    "range-bearing": SweepSystem(RangeBearingConfig, recordings.RobotRecording),
+    "laser": SweepSystem(LaserConfig, recordings.LaserRecording),
+    "mono": SweepSystem(MonoConfig, recordings.MonoRecording, ("recording", "known_points", "calibration")),
+    "stereo": SweepSystem(StereoConfig, recordings.StereoRecording, ("recording", "calibration")),
 }
 """By their names."""
 
@@ -261,7 +254,7 @@ def run_job(job: Job) -> Row:
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        figures = _figures(filter_recording(system.recording(*map(paths.get, system.fields)), job.config()))
+        figures = _figures(recordings.filter_recording(system.recording(*map(paths.get, system.fields)), job.config()))
     except InputError as error:
         figures = {"failure": str(error)}
     finally:

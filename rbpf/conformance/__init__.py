@@ -8,15 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rbpf.conformance.checks import (
-    conditional_checks,
-    groups_of,
-    landmark_checks,
-    likelihood_checks,
-    motion_checks,
-    observation_checks,
-    sensor_checks,
-)
+from rbpf.conformance import checks
 from rbpf.conformance.trial import Example, Scene, run
 from rbpf.core.models import Conditional, Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
@@ -51,16 +43,16 @@ def check_model(
         )
     with np.errstate(all="ignore"):
         if isinstance(model, Likelihood):
-            return run(likelihood_checks(model, rng))
+            return run(checks.likelihood_checks(model, rng))
         if isinstance(model, Landmark):
-            return run(landmark_checks(model, space, rng, example))
+            return run(checks.landmark_checks(model, space, rng, example))
         if space is None:
             raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
         if isinstance(model, Conditional):
-            return run(conditional_checks(model, space, rng, example))
+            return run(checks.conditional_checks(model, space, rng, example))
         if isinstance(model, MotionModel):
-            return run(motion_checks(model, space, rng, example))
-        return run(observation_checks(model, Scene.draw(model, space, rng, example), example.landmark))
+            return run(checks.motion_checks(model, space, rng, example))
+        return run(checks.observation_checks(model, Scene.draw(model, space, rng, example), example.landmark))
 
 
 def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) -> list[str]:
@@ -68,10 +60,10 @@ def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) 
     belief = example.belief
     if belief is not None and belief.landmarks != sensor.part:
         example = replace(example, belief=replace(belief, landmarks=sensor.part))
-    found = run(sensor_checks(sensor, example))
+    found = run(checks.sensor_checks(sensor, example))
     if found or example.belief is None:
         return found
-    space, findings, groups = example.belief.prior.space, list[str](), groups_of(sensor, example)
+    space, findings, groups = example.belief.prior.space, list[str](), checks.groups_of(sensor, example)
     for group in groups:
         tried = example
         if group.data is not None:

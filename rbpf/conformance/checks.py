@@ -23,26 +23,9 @@ from rbpf.conformance.trial import (
     require_truths,
     require_type,
 )
+from rbpf.core import models
 from rbpf.core.genealogy import Lineage
 from rbpf.core.linearisation import numeric_jacobians
-from rbpf.core.models import (
-    NEW,
-    Conditional,
-    FusedKernel,
-    Jacobians,
-    Landmark,
-    Likelihood,
-    LogDensities,
-    MotionModel,
-    NewLandmarks,
-    ObservationModel,
-    Observations,
-    Part,
-    Records,
-    Sensor,
-    Transition,
-    draws,
-)
 from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.gate import is_inlier, log_likelihood
@@ -69,7 +52,9 @@ _MARK = 1.5e300
 _OUTPUTS = ("nu", "jac_state", "jac_landmark")
 
 
-def motion_checks(model: MotionModel, space: LieGroup, rng: np.random.Generator, example: Example) -> list[Check]:
+def motion_checks(
+    model: models.MotionModel, space: LieGroup, rng: np.random.Generator, example: Example
+) -> list[Check]:
     """Shapes, membership of the group, and independence of the particles."""
     name, states = named(model.transition), example.states(space, rng)
 
@@ -77,7 +62,7 @@ def motion_checks(model: MotionModel, space: LieGroup, rng: np.random.Generator,
         """From the generator that is given, and from nothing else."""
         nonlocal states
         name = named(model.sample)
-        if draws(model):
+        if models.draws(model):
             twice = [
                 called(model.sample, states, example.control, example.dt, np.random.default_rng(1), repeat=False)
                 for _ in range(2)
@@ -95,7 +80,7 @@ def motion_checks(model: MotionModel, space: LieGroup, rng: np.random.Generator,
     def shapes() -> None:
         drawn()
         n, d, m, found = states.shape[0], space.dim, 0, transition(states)
-        require_type(name, found, Transition)
+        require_type(name, found, models.Transition)
         given = [part is not None for part in (found.coupling, found.dynamics, found.drift)]
         together = all(given) or not any(given)
         require(together, f"{name} must give coupling, dynamics and drift together, or none of them")
@@ -125,13 +110,13 @@ def motion_checks(model: MotionModel, space: LieGroup, rng: np.random.Generator,
     return [shapes, group, independence]
 
 
-def observation_checks(model: ObservationModel, scene: Scene, landmark: Landmark | None) -> list[Check]:
+def observation_checks(model: models.ObservationModel, scene: Scene, landmark: models.Landmark | None) -> list[Check]:
     """All checks, each to be run by itself after the first."""
     checks = (check_predict, check_residual, check_cut, check_visible, check_jacobians, check_kernel, check_invert)
     return [*(partial(check, model, scene) for check in checks), partial(check_initialise, model, scene, landmark)]
 
 
-def check_predict(model: ObservationModel, scene: Scene) -> None:
+def check_predict(model: models.ObservationModel, scene: Scene) -> None:
     """The shape of predictions, and that they broadcast."""
     name = named(model.predict)
     whole = called(model.predict, *scene.args)
@@ -146,7 +131,7 @@ def check_predict(model: ObservationModel, scene: Scene) -> None:
         require_close(f"{name} does not broadcast, with two more leading axes", stacked[1, 2], whole, 1e-9)
 
 
-def check_residual(model: ObservationModel, scene: Scene) -> None:
+def check_residual(model: models.ObservationModel, scene: Scene) -> None:
     """The residual of h and h is zero, and that of h + δ is δ."""
     name, predicted = named(model.residual), model.predict(*scene.args)
     z = predicted[0]
@@ -159,9 +144,9 @@ def check_residual(model: ObservationModel, scene: Scene) -> None:
     require_close(f"{name} of h + δ and h is not δ", moved, np.broadcast_to(step, moved.shape), 1e-9)
 
 
-def check_cut(model: ObservationModel, scene: Scene) -> None:
+def check_cut(model: models.ObservationModel, scene: Scene) -> None:
     """While the state turns around an axis of its chart, no residual may jump by 2π between two small steps."""
-    if Part.STATE not in model.reads:
+    if models.Part.STATE not in model.reads:
         return
     angles = np.linspace(0.0, 2 * np.pi, TURN_STEPS)[:, None, None, None]
     for axis in np.eye(scene.space.dim):
@@ -180,18 +165,18 @@ def check_cut(model: ObservationModel, scene: Scene) -> None:
         require(not where, f"{named(model.residual)} jumps by 2π in component {where}: wrap angles to [−π, π)")
 
 
-def check_visible(model: ObservationModel, scene: Scene) -> None:
+def check_visible(model: models.ObservationModel, scene: Scene) -> None:
     """Truth values of the right shape."""
     if scene.landmark is None:
         return
     require_truths(named(model.visible), called(model.visible, scene.state, scene.landmark, scene.const), scene.batch)
 
 
-def check_jacobians(model: ObservationModel, scene: Scene) -> None:
+def check_jacobians(model: models.ObservationModel, scene: Scene) -> None:
     """Analytic derivatives are the numeric ones."""
     analytic = called(model.jacobians, *scene.args)
     name = named(model.jacobians)
-    require_type(name, analytic, Jacobians, type(None))
+    require_type(name, analytic, models.Jacobians, type(None))
     if analytic is None:
         return
     for block, expected in numeric_jacobians(model, scene.space, *scene.args)._asdict().items():
@@ -207,10 +192,10 @@ def check_jacobians(model: ObservationModel, scene: Scene) -> None:
         require_close(what, found, expected, JACOBIAN_TOLERANCE)
 
 
-def check_kernel(model: ObservationModel, scene: Scene) -> None:
+def check_kernel(model: models.ObservationModel, scene: Scene) -> None:
     """The fused kernel is NumPy's twin: innovation and Jacobians of a block of particles, full and partly filled."""
     fused, name = model.kernel(), named(model.kernel)
-    require_type(name, fused, FusedKernel, type(None))
+    require_type(name, fused, models.FusedKernel, type(None))
     if fused is None or scene.landmark is None:
         return
     plain = isinstance(fused.params, np.ndarray) and fused.params.dtype.kind in "fiub"
@@ -229,7 +214,9 @@ def check_kernel(model: ObservationModel, scene: Scene) -> None:
             require_close(what, getattr(found, block), expected, tolerance)
 
 
-def _run(name: str, fused: FusedKernel, lanes: Scene, z: np.ndarray, count: int) -> tuple[np.ndarray, Jacobians]:
+def _run(
+    name: str, fused: models.FusedKernel, lanes: Scene, z: np.ndarray, count: int
+) -> tuple[np.ndarray, models.Jacobians]:
     """ν (count, p) and the Jacobians of the first lanes, each written between two guards."""
     assert lanes.landmark is not None
     shapes = ((z.size, BLOCK), (z.size, lanes.space.dim, BLOCK), (z.size, lanes.landmark.shape[-1], BLOCK))
@@ -257,12 +244,12 @@ def _run(name: str, fused: FusedKernel, lanes: Scene, z: np.ndarray, count: int)
         filled = np.isfinite(output[..., :count]).all()
         require(filled, f"{name} leaves entries of {what} unfilled, or fills them with NaN")
     nu, jac_state, jac_landmark = (np.moveaxis(output[..., :count], -1, 0) for output in outputs)
-    return nu, Jacobians(jac_state, jac_landmark)
+    return nu, models.Jacobians(jac_state, jac_landmark)
 
 
-def check_invert(model: ObservationModel, scene: Scene) -> None:
+def check_invert(model: models.ObservationModel, scene: Scene) -> None:
     """predict(state, invert(state, z)) is z."""
-    if scene.landmark is None or type(model).invert is ObservationModel.invert:
+    if scene.landmark is None or type(model).invert is models.ObservationModel.invert:
         return
     z = model.predict(*scene.args)
     landmark = called(model.invert, scene.state, z)
@@ -273,15 +260,15 @@ def check_invert(model: ObservationModel, scene: Scene) -> None:
     require_close(what, residual, np.zeros_like(residual), ROUND_TRIP_TOLERANCE)
 
 
-def check_initialise(model: ObservationModel, scene: Scene, landmark: Landmark | None) -> None:
+def check_initialise(model: models.ObservationModel, scene: Scene, landmark: models.Landmark | None) -> None:
     """First estimates have the parametrisation's shapes, a covariance, and predict what was measured."""
-    overridden = type(model).initialise is not ObservationModel.initialise
-    if scene.landmark is None or not (overridden or type(model).invert is not ObservationModel.invert):
+    overridden = type(model).initialise is not models.ObservationModel.initialise
+    if scene.landmark is None or not (overridden or type(model).invert is not models.ObservationModel.invert):
         return
     name, z = named(model.initialise), model.predict(*scene.args)[0]
     cov = np.repeat(STD**2 * np.eye(model.dim)[None], z.shape[0], axis=0)
     records = called(model.initialise, scene.state[:, 0], z, cov)
-    require_type(name, records, Records)
+    require_type(name, records, models.Records)
     lead = (scene.state.shape[0], scene.landmark.shape[1])
     components, dim = 1 if landmark is None else landmark.components, scene.landmark.shape[-1]
     inner = lead if components == 1 else (*lead, components)
@@ -301,11 +288,11 @@ def check_initialise(model: ObservationModel, scene: Scene, landmark: Landmark |
 
 
 def landmark_checks(
-    landmark: Landmark, space: LieGroup | None, rng: np.random.Generator, example: Example
+    landmark: models.Landmark, space: LieGroup | None, rng: np.random.Generator, example: Example
 ) -> list[Check]:
     """Sizes, world points, readiness and promotion."""
 
-    def tried() -> Records:
+    def tried() -> models.Records:
         if example.records is not None:
             return example.records
         lead, dim = (PARTICLES, LANDMARKS), landmark.dim
@@ -314,7 +301,7 @@ def landmark_checks(
         log_weights = np.full(inner, -np.log(landmark.components)) if landmark.components > 1 else None
         const = random_constants(landmark, space, rng, lead)
         cov = factor @ np.swapaxes(factor, -1, -2)
-        return Records(rng.normal(size=(*inner, dim)), cov, const, log_weights)
+        return models.Records(rng.normal(size=(*inner, dim)), cov, const, log_weights)
 
     def world_points() -> None:
         for size, least in (("dim", 1), ("constants", 0), ("components", 1)):
@@ -341,7 +328,7 @@ def landmark_checks(
     def promotion() -> None:
         records, name = tried(), named(landmark.promote)
         promoted, lead = called(landmark.promote, records), records.mean.shape[:2]
-        require_type(name, promoted, Records)
+        require_type(name, promoted, models.Records)
         require_shape(f"{name}: mean", promoted.mean, (*lead, 2), (*lead, 3))
         size = promoted.mean.shape[-1]
         require_shape(f"{name}: cov", promoted.cov, (*lead, size, size))
@@ -350,7 +337,7 @@ def landmark_checks(
     return [world_points, readiness, promotion]
 
 
-def likelihood_checks(likelihood: Likelihood, rng: np.random.Generator) -> list[Check]:
+def likelihood_checks(likelihood: models.Likelihood, rng: np.random.Generator) -> list[Check]:
     """Shapes, mass, and the compiled twin."""
     log_density, inlier = likelihood.log_density, likelihood.inlier
 
@@ -408,7 +395,7 @@ def likelihood_checks(likelihood: Likelihood, rng: np.random.Generator) -> list[
     return [shapes, mass, compiled_twin]
 
 
-def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
+def sensor_checks(sensor: models.Sensor, example: Example) -> list[Check]:
     """What it observes, then what it starts."""
     belief = example.belief
     if belief is None:
@@ -416,7 +403,7 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
         raise InputError(f"{name} is tried on a frame and a belief: give Example(frame=…, belief=…)")
     n = belief.log_weights.size
 
-    def measurements(name: str, group: Observations | NewLandmarks) -> None:
+    def measurements(name: str, group: models.Observations | models.NewLandmarks) -> None:
         k, p, model = group.z.shape[0], group.model.dim, type(group.model).__name__
         require_shape(f"{name}: z of {model}", group.z, (None, p))
         require_shape(f"{name}: cov of {model}", group.cov, (k, p, p))
@@ -425,11 +412,11 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
     def observed() -> None:
         name = named(sensor.observe)
         for group in groups_of(sensor, example):
-            require_type(f"{name}, for a group,", group, Observations)
+            require_type(f"{name}, for a group,", group, models.Observations)
             if group.data is not None:
                 continue
             measurements(name, group)
-            if Part.LANDMARK not in group.model.reads:
+            if models.Part.LANDMARK not in group.model.reads:
                 continue
             k, ids = group.z.shape[0], group.ids
             if ids is None:
@@ -438,13 +425,13 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
             require(ids.dtype.kind == "i", f"{name}: ids are {ids.dtype}, expected integers")
             unknown = np.setdiff1d(ids[ids >= 0], belief.map.ids).tolist()
             require(not unknown, f"{name} names landmarks {unknown}, which the map does not hold")
-            known = (ids >= NEW).all()
-            require(known, f"{name}: ids below {NEW} mean nothing, expected a landmark, NULL or NEW")
+            known = (ids >= models.NEW).all()
+            require(known, f"{name}: ids below {models.NEW} mean nothing, expected a landmark, NULL or NEW")
 
     def started() -> None:
         name, groups = named(sensor.new_landmarks), groups_of(sensor, example)
         for new_landmarks in called(sensor.new_landmarks, example.frame, belief, groups, repeat=False):
-            require_type(f"{name}, for a group,", new_landmarks, NewLandmarks)
+            require_type(f"{name}, for a group,", new_landmarks, models.NewLandmarks)
             measurements(name, new_landmarks)
             k = new_landmarks.z.shape[0]
             if new_landmarks.mask is not None:
@@ -457,7 +444,9 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
     return [observed, started]
 
 
-def conditional_checks(part: Conditional, space: LieGroup, rng: np.random.Generator, example: Example) -> list[Check]:
+def conditional_checks(
+    part: models.Conditional, space: LieGroup, rng: np.random.Generator, example: Example
+) -> list[Check]:
     """A few steps of what is marginalised: shapes, what a prediction may change, copies, and the checkpoint."""
     states, groups = example.states(space, rng), example.groups
     n, d = states.shape[0], space.dim
@@ -480,20 +469,21 @@ def conditional_checks(part: Conditional, space: LieGroup, rng: np.random.Genera
         require(same, what)
 
     def predicted(state: np.ndarray) -> Prior:
-        transition = example.transition or Transition(state, np.zeros((1, d, 1)))
+        transition = example.transition or models.Transition(state, np.zeros((1, d, 1)))
         prior = called(part.predict, transition, space, example.dt)
         require_type(named(part.predict), prior, Prior, type(None))
         return prior or Prior(space, transition.mean, np.zeros((1, d)), transition.noise_factor[:, :d])
 
-    def corrected(state: np.ndarray) -> LogDensities:
+    def corrected(state: np.ndarray) -> models.LogDensities:
         prior = predicted(state)
         found = called(part.correct, state, space.local(prior.base, state), groups, repeat=False)
-        require_type(named(part.correct), found, LogDensities)
+        require_type(named(part.correct), found, models.LogDensities)
         return found
 
     def life() -> None:
         require(
-            isinstance(part.supplies, Part), f"{type(part).__name__}.supplies is {part.supplies!r}, expected a Part"
+            isinstance(part.supplies, models.Part),
+            f"{type(part).__name__}.supplies is {part.supplies!r}, expected a Part",
         )
         begin()
         before = held()
@@ -546,6 +536,6 @@ def conditional_checks(part: Conditional, space: LieGroup, rng: np.random.Genera
     return [life, copies, checkpoint]
 
 
-def groups_of(sensor: Sensor, example: Example) -> list[Any]:
+def groups_of(sensor: models.Sensor, example: Example) -> list[Any]:
     """The groups of observations of the example's frame."""
     return list(called(sensor.observe, example.frame, example.belief))

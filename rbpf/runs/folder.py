@@ -42,18 +42,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays
-from rbpf.runs.files import (
-    GRID,
-    MAP,
-    POSTERIOR,
-    SUMMARY,
-    TRAJECTORY,
-    VERSION,
-    prepare_folder,
-    whole,
-    write_csv,
-    write_text,
-)
+from rbpf.runs import files
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.run import Run
@@ -74,7 +63,7 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
 
     Raises InputError: the folder cannot be written to, or the disk is full.
     """
-    prepare_folder(out)
+    files.prepare_folder(out)
     log, system = run.log, run.system
     write_tum(out / "trajectory.tum", in_space(log.stamps_ns, log.poses))
     corrections = (log["correction"], log["cov_correction"]) if "correction" in log else None
@@ -88,16 +77,16 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
     write_measurements(out, system.measurements(run.name, log))
     for table in (TIMINGS, DIAGNOSTICS):
         header, columns = log.table(table)
-        write_csv(out / table, header, zip(*columns, strict=True))
+        files.write_csv(out / table, header, zip(*columns, strict=True))
     for name, arrays in system.files(log).items():
         save_arrays(out / name, arrays)
-        if name == POSTERIOR:
+        if name == files.POSTERIOR:
             # The mean over the last frame's particles of their whole paths.
             weights = np.exp(arrays["log_weights"])
             (paths,) = (array for key, array in arrays.items() if key.startswith("world_from_"))
             mean = np.array([system.space.mean(poses, weights) for poses in paths])
             write_tum(out / "posterior.tum", in_space(arrays["stamps_ns"], mean))
-        if name == GRID:
+        if name == files.GRID:
             write_grid(out, arrays)
     write_config(out, system.name, sources, asdict(system.config))
     entries = summarise(run)
@@ -157,7 +146,7 @@ def remarks(run: Run) -> list[str]:
 def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
     """summary.json; numbers that are not finite become null, which JSON has."""
     plain = {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in entries.items()}
-    write_text(out / SUMMARY, json.dumps(plain, indent=2, allow_nan=False) + "\n")
+    files.write_text(out / files.SUMMARY, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 
 def write_map(out: Path, found: MapEstimate) -> None:
@@ -165,13 +154,13 @@ def write_map(out: Path, found: MapEstimate) -> None:
     arrays = {"id": found.ids, "mean": found.mean, "cov": found.cov, **found.columns}
     if found.ray_ends is not None:
         arrays["ray_ends"] = found.ray_ends
-    save_arrays(out / MAP, arrays)
+    save_arrays(out / files.MAP, arrays)
     axes = "xyz"[: found.mean.shape[1]]
     cov_names = [f"c{axes[a]}{axes[b]}" for a in range(len(axes)) for b in range(a + 1)]
     numbers = np.concatenate([found.mean, gaussian.pack(found.cov)], axis=1).tolist()
     columns = [column.tolist() for column in found.columns.values()]
     rows = ([name, *row, *more] for name, row, *more in zip(found.ids, numbers, *columns, strict=True))
-    write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names, *found.columns], rows)
+    files.write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names, *found.columns], rows)
 
 
 def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
@@ -179,7 +168,7 @@ def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
     log_odds, (x, y) = grid["log_odds"], grid["corner"].tolist()
     cells = np.select([log_odds > 0.0, log_odds < 0.0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
     height, width = cells.shape
-    with whole(out / "grid.pgm") as temporary:
+    with files.whole(out / "grid.pgm") as temporary:
         temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode() + cells[::-1].tobytes())
     words = {
         "image": "grid.pgm",
@@ -190,7 +179,7 @@ def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
         "occupied_thresh": "0.65",
         "free_thresh": "0.196",
     }
-    write_text(out / "grid.yaml", "".join(f"{name}: {value}\n" for name, value in words.items()))
+    files.write_text(out / "grid.yaml", "".join(f"{name}: {value}\n" for name, value in words.items()))
 
 
 def peak_memory_mb() -> float:
@@ -215,7 +204,7 @@ def write_trajectory(
     correction, cov_correction = corrections or (np.zeros((steps, 0)), np.zeros((steps, 0, 0)))
     poses, weights = particles or (np.zeros((0, mean.shape[1])), np.zeros(0))
     arrays = {
-        "version": np.array(VERSION),
+        "version": np.array(files.VERSION),
         "stamps_ns": stamps_ns,
         "mean": mean,
         "cov": cov,
@@ -224,4 +213,4 @@ def write_trajectory(
         "particles": poses,
         "weights": weights,
     }
-    save_arrays(out / TRAJECTORY, arrays)
+    save_arrays(out / files.TRAJECTORY, arrays)

@@ -15,22 +15,10 @@ from rbpf.runs.files import CHECKPOINT, prepare_folder
 from rbpf.runs.provenance import decisive_inputs
 from rbpf.runs.run import Listener, Run, Source, drive
 from rbpf.runs.truth import GroundTruth, truth_at
+from rbpf.sensors import readers
 from rbpf.sensors.calibration import Board, MarkerBoard, find_board, find_markers
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers import (
-    ImageSequence,
-    KnownPixels,
-    LaserOptions,
-    Part,
-    RobotLog,
-    Topics,
-    open_images,
-    open_log,
-    open_stereo,
-    read_known_points,
-    read_laser_log,
-)
 from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.sensors.readers.part import WHOLE
@@ -83,10 +71,10 @@ class RobotRecording:
     """A robot's log."""
 
     log: Path  #: folder or file of a known kind.
-    part: Part = WHOLE  #: which of its frames.
+    part: readers.Part = WHOLE  #: which of its frames.
 
     def open(self, config: RangeBearingConfig) -> Opened:
-        return open_robot_log(part_of_log(open_log(self.log, config.noise), self.part), config)
+        return open_robot_log(part_of_log(readers.open_log(self.log, config.noise), self.part), config)
 
     def sources(self) -> Sources:
         return {"recording": str(self.log)} | self.part.entries()
@@ -105,9 +93,9 @@ class MonoRecording:
     map: Path | None = None
     #: board of ArUco markers of which some are seen in the first image; likewise known points.
     markers: MarkerBoard | None = None
-    topics: Topics = NO_TOPICS  #: of a ROS bag, which images and which truth.
+    topics: readers.Topics = NO_TOPICS  #: of a ROS bag, which images and which truth.
     #: which of the images, and in which size; known points are those of the first of them, in the recording's pixels.
-    part: Part = WHOLE
+    part: readers.Part = WHOLE
 
     def __post_init__(self) -> None:
         if len(self.topics.images) > 1:
@@ -130,15 +118,15 @@ class MonoRecording:
         """The number of the camera whose images come as they are taken; None of a recording."""
         return camera_number(self.images)
 
-    def sequence(self) -> tuple[ImageSequence | LiveCamera, KnownPixels | None]:
+    def sequence(self) -> tuple[readers.ImageSequence | LiveCamera, readers.KnownPixels | None]:
         """The images, and the known points if there are any; errors as `open`."""
         if self.live is not None and self.known_points is not None:
             raise InputError(
                 "known points are pixels of a first image that is there already: "
                 "start a live camera from --board or --aruco, or without known points"
             )
-        known = None if self.known_points is None else read_known_points(self.known_points)
-        sequence: ImageSequence | LiveCamera
+        known = None if self.known_points is None else readers.read_known_points(self.known_points)
+        sequence: readers.ImageSequence | LiveCamera
         if self.live is not None:
             if self.part != WHOLE:
                 raise InputError(
@@ -146,7 +134,7 @@ class MonoRecording:
                 )
             sequence = LiveCamera(self.live, self.calibration)
         else:
-            sequence = whole = open_images(self.images, self.calibration, self.topics)
+            sequence = whole = readers.open_images(self.images, self.calibration, self.topics)
             if self.part != WHOLE:
                 sequence = self.part.apply(whole)
             if known is not None and sequence.camera != whole.camera:
@@ -177,11 +165,11 @@ class StereoRecording:
 
     pairs: Path  #: a sequence of any kind that `open_stereo` knows.
     calibration: Path | None = None  #: camera.yaml in place of the sequence's own camera.
-    topics: Topics = NO_TOPICS  #: of a ROS bag, which images and which truth.
-    part: Part = WHOLE  #: which of the pairs, and in which size.
+    topics: readers.Topics = NO_TOPICS  #: of a ROS bag, which images and which truth.
+    part: readers.Part = WHOLE  #: which of the pairs, and in which size.
 
     def open(self, config: StereoConfig) -> Opened:
-        return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
+        return open_pairs(readers.open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
 
     def sources(self) -> Sources:
         found = _given(recording=self.pairs, calibration=self.calibration)
@@ -193,10 +181,12 @@ class LaserRecording:
     """A laser scanner's log."""
 
     log: Path  #: file or folder of a known kind.
-    options: LaserOptions = field(default_factory=LaserOptions)  #: what it leaves open, and which of its scans.
+    options: readers.LaserOptions = field(
+        default_factory=readers.LaserOptions
+    )  #: what it leaves open, and which of its scans.
 
     def open(self, config: LaserConfig) -> Opened:
-        log = read_laser_log(self.log, self.options)
+        log = readers.read_laser_log(self.log, self.options)
         return Opened(LaserSlam(log.scanner, config), LogSource(log), log.stamps_ns, None)
 
     def sources(self) -> Sources:
@@ -210,7 +200,7 @@ def _given(**named: Path | str | float | None) -> Sources:
     return {name: str(v) if isinstance(v, Path) else v for name, v in named.items() if v is not None}
 
 
-def part_of_log(log: RobotLog, part: Part) -> RobotLog:
+def part_of_log(log: readers.RobotLog, part: readers.Part) -> readers.RobotLog:
     """Some frames of a robot's log; the odometry between two of them is composed of that between all in between."""
     if part == WHOLE:
         return log
@@ -227,7 +217,7 @@ def part_of_log(log: RobotLog, part: Part) -> RobotLog:
     return replace(log, frames=frames)
 
 
-def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
+def open_robot_log(log: readers.RobotLog, config: RangeBearingConfig) -> Opened:
     """A robot's log in memory; refused where landmarks are to be known by their names, and some have none."""
     if config.association == "known" and any((frame.landmarks == UNNAMED).any() for frame in log.frames):
         raise InputError(f"{log.name} has observations without a landmark's name: filter it with --association ml")
@@ -237,9 +227,9 @@ def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
 
 
 def open_mono(
-    sequence: ImageSequence | LiveCamera,
+    sequence: readers.ImageSequence | LiveCamera,
     config: MonoConfig,
-    known: KnownPixels | None = None,
+    known: readers.KnownPixels | None = None,
     known_map: KnownMap | None = None,
 ) -> Opened:
     """A sequence of images; with known points in the first one, a known map, or without either."""
@@ -251,7 +241,7 @@ def open_mono(
     return Opened(system, sequence, sequence.stamps_ns, sequence.truth)
 
 
-def open_pairs(sequence: ImageSequence, config: StereoConfig) -> Opened:
+def open_pairs(sequence: readers.ImageSequence, config: StereoConfig) -> Opened:
     """A sequence of pairs of images."""
     return Opened(StereoSlam(sequence.rig, config), sequence, sequence.stamps_ns, sequence.truth)
 
@@ -278,7 +268,7 @@ def open_features(
     return Opened(system, LogSource(log), stamps, log.truth)
 
 
-def first_image(sequence: ImageSequence | LiveCamera) -> np.ndarray:
+def first_image(sequence: readers.ImageSequence | LiveCamera) -> np.ndarray:
     """The image (H, W) that a run starts from. Raises InputError: it cannot be read."""
     first = next(sequence.frames(), None)
     if first is None or first.image is None:

@@ -31,28 +31,11 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
-from rbpf.validation.gtsam.batch_problem import (
-    Fit,
-    OnIteration,
-    Optimum,
-    Problem,
-    fit_of,
-    floats_in_scale,
-    solve_problem,
-)
+from rbpf.validation.gtsam import batch_problem
 from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.gtsam.path_sampling import draw_posterior
+from rbpf.validation.metrics import gaussian_differences as gaussians
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
-from rbpf.validation.metrics.gaussian_differences import (
-    Differences,
-    across_of,
-    away_from_first,
-    compare_last_pose,
-    compare_maps,
-    projected,
-    rescaled,
-    scale_onto,
-)
 
 POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the batch optimum"
 
@@ -75,12 +58,14 @@ class AgainstBatch:
     gauge: str  #: how the two worlds were made one, in words.
     scale: float  #: by which the filter was multiplied; 1 where the scale is measured.
     filter: PathAndMap  #: the run, in that scale.
-    optimum: Optimum  #: the batch.
+    optimum: batch_problem.Optimum  #: the batch.
     path: AbsoluteError  #: distances of the filter's online positions from the optimum's, per step, without alignment.
-    landmarks: Differences  #: Gaussians of the map.
-    poses: Differences  #: Gaussians of the last pose; none where the covariances are not known.
-    fit_filter: Fit  #: of the observations of landmarks that both have, by the filter's online poses and its last map.
-    fit_batch: Fit  #: by the optimum.
+    landmarks: gaussians.Differences  #: Gaussians of the map.
+    poses: gaussians.Differences  #: Gaussians of the last pose; none where the covariances are not known.
+    fit_filter: (
+        batch_problem.Fit
+    )  #: of the observations of landmarks that both have, by the filter's online poses and its last map.
+    fit_batch: batch_problem.Fit  #: by the optimum.
 
     @property
     def floats(self) -> bool:
@@ -99,8 +84,12 @@ class AgainstBatch:
         _, rows, others = np.intersect1d(ours.ids, theirs.ids, return_indices=True)
         found = ours.cov[rows], theirs.cov[others], theirs.mean[others] - ours.mean[rows]
         if self.floats and rows.size:
-            basis = across_of(theirs.mean[others] - self.optimum.estimate.world_from_body[0, 4:])
-            found = projected(basis, found[0]), projected(basis, found[1]), projected(basis, found[2])
+            basis = gaussians.across_of(theirs.mean[others] - self.optimum.estimate.world_from_body[0, 4:])
+            found = (
+                gaussians.projected(basis, found[0]),
+                gaussians.projected(basis, found[1]),
+                gaussians.projected(basis, found[2]),
+            )
         known = np.isfinite(found[1]).all(axis=(1, 2))
         own, batch, apart = (values[known] for values in found)
         pair = (
@@ -121,8 +110,11 @@ class AgainstBatch:
         carry = ours.space.right_jacobian_inverse(delta)
         covs = ours.cov_poses, np.asarray(carry @ theirs.cov_poses @ carry.mT)
         if self.floats:
-            basis = across_of(away_from_first(ours.world_from_body))
-            covs, delta = (projected(basis, covs[0]), projected(basis, covs[1])), projected(basis, delta)
+            basis = gaussians.across_of(gaussians.away_from_first(ours.world_from_body))
+            covs, delta = (
+                (gaussians.projected(basis, covs[0]), gaussians.projected(basis, covs[1])),
+                gaussians.projected(basis, delta),
+            )
         return *covs, delta
 
     def as_dict(self) -> dict[str, Any]:
@@ -154,7 +146,9 @@ def compare_folder(folder: Path) -> AgainstBatch:
     return compare(record.estimate, record.measurements)
 
 
-def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = None) -> AgainstBatch:
+def compare(
+    filtered: PathAndMap, problem: batch_problem.Problem, optimum: batch_problem.Optimum | None = None
+) -> AgainstBatch:
     """A filter's path and map, T poses, beside the batch optimum of the same T measurements.
 
     Where it is not known it is solved for with all errors Gaussian, as the filter takes them. An InputError says that path
@@ -166,10 +160,10 @@ def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = No
     if len(stamps) < LEAST_STEPS:
         raise InputError(f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch.")
     if optimum is None:
-        optimum = solve_problem(problem, filtered.world_from_body)
-    floats = floats_in_scale(problem)
-    scale = scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
-    scaled = rescaled(filtered, scale)
+        optimum = batch_problem.solve_problem(problem, filtered.world_from_body)
+    floats = batch_problem.floats_in_scale(problem)
+    scale = gaussians.scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
+    scaled = gaussians.rescaled(filtered, scale)
     shared = np.intersect1d(scaled.landmarks.ids, optimum.estimate.landmarks.ids)
     ours = scaled.at(optimum.steps)
     return AgainstBatch(
@@ -179,23 +173,27 @@ def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = No
         filter=scaled,
         optimum=optimum,
         path=ate(ours.trajectory, optimum.estimate.trajectory),
-        landmarks=compare_maps(ours, optimum.estimate, floats),
-        poses=compare_last_pose(ours, optimum.estimate, int(optimum.steps[-1]), floats),
-        fit_filter=fit_of(optimum.problem, ours, shared),
-        fit_batch=fit_of(optimum.problem, optimum.estimate, shared),
+        landmarks=gaussians.compare_maps(ours, optimum.estimate, floats),
+        poses=gaussians.compare_last_pose(ours, optimum.estimate, int(optimum.steps[-1]), floats),
+        fit_filter=batch_problem.fit_of(optimum.problem, ours, shared),
+        fit_batch=batch_problem.fit_of(optimum.problem, optimum.estimate, shared),
     )
 
 
-def solve_run(record: RunFolder, most: int | None = None, on_iteration: OnIteration | None = None) -> Optimum:
+def solve_run(
+    record: RunFolder, most: int | None = None, on_iteration: batch_problem.OnIteration | None = None
+) -> batch_problem.Optimum:
     """The batch optimum of a run's measurements: with Huber's loss for matches in images, which hold false ones.
 
     `most`, `on_iteration` and errors as of `solve_problem`.
     """
     robust = HUBER if isinstance(record.measurements, FeatureLog) else None
-    return solve_problem(record.measurements, record.path.mean, robust, most, on_iteration)
+    return batch_problem.solve_problem(record.measurements, record.path.mean, robust, most, on_iteration)
 
 
-def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tuple[Comparison, AgainstBatch]:
+def compare_with_batch(
+    record: RunFolder, optimum: batch_problem.Optimum | None = None
+) -> tuple[Comparison, AgainstBatch]:
     """A run beside the batch posterior of the same measurements, from `solve_run` where it is known; errors as that."""
     problem = record.measurements
     found = compare(record.estimate, problem, optimum=optimum or solve_run(record))

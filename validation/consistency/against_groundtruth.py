@@ -21,18 +21,8 @@ from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
 from rbpf.runs.truth import LEAST, RunTruth
 from rbpf.systems.map_estimate import MapEstimate
+from rbpf.validation.consistency import statistic
 from rbpf.validation.consistency.comparison import Comparison
-from rbpf.validation.consistency.statistic import (
-    STATE_FACTOR,
-    Statistic,
-    WhitenedErrors,
-    coverage,
-    degrees_of_freedom,
-    inverse_roots,
-    map_ratio,
-    variance_ratio,
-    whitened_errors,
-)
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
 from rbpf.validation.metrics.gaussian_differences import across_of, away_from_first, projected
 from rbpf.validation.metrics.scores import is_anonymous
@@ -53,7 +43,7 @@ class TruthErrors:
     path: FilteredPath  #: filtered poses.
     truth: RunTruth  #: at the steps `truth.rows`.
     positions: AbsoluteError  #: errors of the aligned positions.
-    whitened: WhitenedErrors  #: errors of the poses in units of the filter's own.
+    whitened: statistic.WhitenedErrors  #: errors of the poses in units of the filter's own.
     fitted: int  #: parameters of the motion that brought the truth into the run's world; 0 where it is there.
     landmarks: "LandmarkErrors | None"  #: the map's points whose true places are known; None without any.
 
@@ -90,7 +80,7 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     mean, cov = path.mean[truth.rows], path.cov[truth.rows] + np.diag(own)
     anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
     if truth.alignment == "none":
-        whitened = whitened_errors(space, mean, cov, truth.poses)
+        whitened = statistic.whitened_errors(space, mean, cov, truth.poses)
         landmarks = None if anonymous else _landmark_errors(record, truth, positions.alignment)
         return TruthErrors(path, truth, positions, whitened, 0, landmarks)
     # The truth brought into the run's world.
@@ -105,7 +95,7 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     basis = np.broadcast_to(np.eye(space.dim), cov.shape)
     if across:
         basis = across_of(away_from_first(path.mean)[truth.rows])
-    roots, ranks = inverse_roots(projected(basis, cov))
+    roots, ranks = statistic.inverse_roots(projected(basis, cov))
 
     def errors(motion: np.ndarray) -> np.ndarray:
         there = space.local(mean, space.compose(space.exp(motion), moved))
@@ -116,10 +106,10 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     points = {name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()}
     there = RunTruth(truth.rows, space.compose(turn, moved), points, truth.alignment)
     landmarks = None if anonymous else _landmark_errors(record, there, positions.alignment)
-    return TruthErrors(path, truth, positions, WhitenedErrors(errors(motion), ranks), space.dim, landmarks)
+    return TruthErrors(path, truth, positions, statistic.WhitenedErrors(errors(motion), ranks), space.dim, landmarks)
 
 
-def pose_statistics(errors: WhitenedErrors, fitted: int = 0) -> list[Statistic]:
+def pose_statistics(errors: statistic.WhitenedErrors, fitted: int = 0) -> list[statistic.Statistic]:
     """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact.
 
     `fitted` parameters were chosen to make the errors small: the upper end of the interval is raised by what that takes
@@ -129,12 +119,12 @@ def pose_statistics(errors: WhitenedErrors, fitted: int = 0) -> list[Statistic]:
     if not known.any():
         return []
     dim = errors.errors.shape[1]
-    dof, nees = degrees_of_freedom(errors.errors[known]), errors.nees[known]
-    ratio = variance_ratio(NEES, float(nees.sum() / errors.ranks[known].sum()), dof, STATE_FACTOR)
+    dof, nees = statistic.degrees_of_freedom(errors.errors[known]), errors.nees[known]
+    ratio = statistic.variance_ratio(NEES, float(nees.sum() / errors.ranks[known].sum()), dof, statistic.STATE_FACTOR)
     ratio = replace(ratio, high=ratio.high * (1.0 + fitted / dof))
     full = errors.ranks[known] == dim
     samples = max(dof**2 / (dof + fitted) / dim, 1.0)
-    return [ratio, *(coverage(nees[full], dim, samples) if full.any() else [])]
+    return [ratio, *(statistic.coverage(nees[full], dim, samples) if full.any() else [])]
 
 
 def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
@@ -170,7 +160,7 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
             "landmark_nees_mean": float(found.squares.mean()),
             "landmark_nees_right": float(found.white.shape[1]),
         }
-        statistics.append(map_ratio(LANDMARKS, found.truth, found.white))
+        statistics.append(statistic.map_ratio(LANDMARKS, found.truth, found.white))
     # The batch optimum's positions at the same steps, aligned in the same way, where the run has one.
     if (record.folder / "batch.tum").is_file():
         batch, beside = associate(read_tum(record.folder / "batch.tum"), reference, 0)
@@ -194,7 +184,7 @@ def _landmark_errors(record: RunFolder, truth: RunTruth, world: Similarity) -> L
         delta, cov = projected(basis, delta), projected(basis, cov)
     moved = moved_map(found, world)
     true = np.array([record.truth.landmarks[name] for name in found.ids.tolist()])
-    return LandmarkErrors(moved, true, np.einsum("mab,mb->ma", inverse_roots(cov)[0], delta))
+    return LandmarkErrors(moved, true, np.einsum("mab,mb->ma", statistic.inverse_roots(cov)[0], delta))
 
 
 def _metres(value: float) -> str:

@@ -21,31 +21,8 @@ from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
+from rbpf.validation.gtsam import observations, solvers
 from rbpf.validation.gtsam.camera_graph import FINE, CameraProblem, CameraState, adjust, covariances
-from rbpf.validation.gtsam.observations import (
-    HUBER,
-    ObservationTable,
-    first_centres,
-    in_camera,
-    in_front,
-    in_one_piece,
-    known_by_name,
-    observation_table,
-    parallax,
-    place,
-    sigmas,
-    spread,
-    triangulate,
-)
-from rbpf.validation.gtsam.solvers import (
-    ROUGH,
-    SPATIAL,
-    BatchSolution,
-    OnIteration,
-    levenberg_marquardt,
-    marginals,
-    noise,
-)
 
 LEAST = 3
 """Landmarks that fix a pose, and points that fix a frame."""
@@ -81,9 +58,9 @@ def solve_features(
     *,
     robust: float | None = None,
     marginals: bool = True,
-    on_iteration: OnIteration | None = None,
+    on_iteration: solvers.OnIteration | None = None,
     tolerance: float | None = None,
-) -> BatchSolution:
+) -> solvers.BatchSolution:
     """Solve for all poses and landmarks at once.
 
     The points known beforehand that are seen hold the world's frame. Without any, the first pose is held where it
@@ -106,8 +83,8 @@ def solve_features(
             estimate, the estimate puts a landmark behind its camera, a frame sees too few landmarks or none that
             connect it, the known points are fewer than three or on a line, or the optimiser does not converge.
     """
-    full = observation_table(log)
-    known = known_by_name(log.known, full.names)
+    full = observations.observation_table(log)
+    known = observations.known_by_name(log.known, full.names)
     problem = CameraProblem(log.name, len(log.frames), full.determined(known), known, robust)
     # Enough observations of each frame, frames that hang together, known points that fix the world's frame.
     table, name = problem.table, problem.name
@@ -117,7 +94,7 @@ def solve_features(
             f"Frame {few[0]} of {name} sees {counts[few[0]]} landmarks that are known or seen from elsewhere "
             f"too, expected {LEAST} or more; leave the frame out."
         )
-    piece = in_one_piece(table.steps, table.index, problem.frames, ~problem.free)
+    piece = observations.in_one_piece(table.steps, table.index, problem.frames, ~problem.free)
     if (apart := np.flatnonzero(~piece)).size:
         raise InputError(
             f"Frame {apart[0]} of {name} shares no landmark, directly or through others, with "
@@ -139,7 +116,7 @@ def solve_features(
         )
     cov_poses, cov_landmarks = covariances(found) if marginals else (np.empty((0, 6, 6)), {})
     state, names = found.state, found.problem.table.names
-    return BatchSolution(
+    return solvers.BatchSolution(
         world_from_body=state.path,
         landmarks=dict(zip(names.tolist(), state.points, strict=True)),
         cov_poses=cov_poses,
@@ -162,11 +139,11 @@ def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
             f"{problem.name}, found {path.shape}."
         )
     given = {name: mean for name, (mean, _) in problem.known.items()} | dict(start.landmarks)
-    points = triangulate(table, path)
+    points = observations.triangulate(table, path)
     rows = [index for index, name in enumerate(table.names.tolist()) if name in given]
     points[rows] = np.array([given[int(table.names[row])] for row in rows]).reshape(-1, 3)
-    points = place(table, path, points, ~in_front(table, path, points))
-    behind = np.flatnonzero(in_camera(table, path, points)[:, 2] <= 0)
+    points = observations.place(table, path, points, ~observations.in_front(table, path, points))
+    behind = np.flatnonzero(observations.in_camera(table, path, points)[:, 2] <= 0)
     if behind.size:
         row = behind[0]
         raise InputError(
@@ -176,7 +153,7 @@ def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
     return CameraState(path, points)
 
 
-def locate(table: ObservationTable, known: Known) -> tuple[Array, Array]:
+def locate(table: observations.ObservationTable, known: Known) -> tuple[Array, Array]:
     """Pose of a frame of which nothing is known, from four points or more: COLMAP's P3P and consensus, then `resect`."""
     import pycolmap
 
@@ -195,33 +172,35 @@ def locate(table: ObservationTable, known: Known) -> tuple[Array, Array]:
     return resect(table, known, SE3.inverse(SE3.normalise(pose)), 1e-9 * np.eye(6))
 
 
-def resect(table: ObservationTable, known: Known, near: Array, info: Array) -> tuple[Array, Array]:
+def resect(table: observations.ObservationTable, known: Known, near: Array, info: Array) -> tuple[Array, Array]:
     """Pose (7,) with Huber's loss, once more without the outliers, whose pull Huber only limits; covariance (6, 6).
 
     From observations of one frame and where its landmarks are. A weak prior stands in for what the image leaves open: it
     has its mean at `near` (7,) world_from_camera, where it starts, and the information (6, 6).
     """
 
-    def solve(part: ObservationTable, start: Array) -> tuple[Any, Any, CameraProblem]:
-        problem = CameraProblem("", 1, part, known, HUBER)
+    def solve(part: observations.ObservationTable, start: Array) -> tuple[Any, Any, CameraProblem]:
+        problem = CameraProblem("", 1, part, known, observations.HUBER)
         points = np.array([known[name][0] for name in part.names.tolist()])
         state = CameraState(start[None], points)
         graph = problem.graph(state, np.zeros(len(points), dtype=bool), state.path)
-        prior = gtsam.PriorFactorPose3(problem.pose_keys[0], SPATIAL.pose(near), noise(np.asarray(np.linalg.inv(info))))
+        prior = gtsam.PriorFactorPose3(
+            problem.pose_keys[0], solvers.SPATIAL.pose(near), solvers.noise(np.asarray(np.linalg.inv(info)))
+        )
         graph.push_back(prior)
-        values, _, _ = levenberg_marquardt(graph, problem.values(state), _FOUND)
+        values, _, _ = solvers.levenberg_marquardt(graph, problem.values(state), _FOUND)
         return graph, values, problem
 
     graph, values, problem = solve(table, near)
     pose = problem.state(values).path
     points = np.array([known[name][0] for name in table.names.tolist()])
-    inlier = sigmas(table, pose, points) < OUTLIER
+    inlier = observations.sigmas(table, pose, points) < OUTLIER
     if not inlier.all() and inlier.sum() >= KNOWN:
         graph, values, problem = solve(table.rows(inlier), pose[0])
-    return problem.state(values).path[0], marginals(graph, values, problem.pose_keys)[0]
+    return problem.state(values).path[0], solvers.marginals(graph, values, problem.pose_keys)[0]
 
 
-def from_scratch(problem: CameraProblem, on_iteration: OnIteration | None = None) -> InitialEstimate:
+def from_scratch(problem: CameraProblem, on_iteration: solvers.OnIteration | None = None) -> InitialEstimate:
     """Path and landmarks from the known points, or for a stereo pair without any, from the first frame.
 
     `on_iteration` as of `solve_features`. An InputError says where the path cannot begin, or breaks.
@@ -238,7 +217,7 @@ def from_scratch(problem: CameraProblem, on_iteration: OnIteration | None = None
 class _Growth:
     """A path that grows frame by frame, and the landmarks placed so far."""
 
-    def __init__(self, problem: CameraProblem, on_iteration: OnIteration | None) -> None:
+    def __init__(self, problem: CameraProblem, on_iteration: solvers.OnIteration | None) -> None:
         self.problem, self.on_iteration = problem, on_iteration
         self.table, frames = problem.table, problem.frames
         self.path = np.tile(SE3.identity(), (frames, 1))
@@ -294,11 +273,11 @@ class _Growth:
         moving = np.isin(self.table.index[:last], now[~settled[now]])
         if moving.any():
             part = self._blurred(self.table.rows(np.flatnonzero(moving)))
-            points = triangulate(part, self.path)
+            points = observations.triangulate(part, self.path)
             good = self._good(part, self.path, points)
             index = np.searchsorted(self.table.names, part.names[good])
             self.points[index], self.placed[index] = points[good], True
-            self.cov[index] = spread(part, self.path, points)[good]
+            self.cov[index] = observations.spread(part, self.path, points)[good]
         if step + 1 >= GROWTH * self.adjusted:
             self.adjusted = step + 1
             self._adjust(step)
@@ -307,9 +286,9 @@ class _Growth:
         last = np.searchsorted(self.table.steps, step + 1)
         part = self.table.rows(np.flatnonzero(self.placed[self.table.index[:last]]))
         before = np.searchsorted(self.table.names, part.names)
-        problem = CameraProblem(self.problem.name, step + 1, part, self.problem.known, HUBER)
+        problem = CameraProblem(self.problem.name, step + 1, part, self.problem.known, observations.HUBER)
         start = CameraState(self.path[: step + 1], self.points[before])
-        found = adjust(problem, start, ROUGH, self.on_iteration)
+        found = adjust(problem, start, solvers.ROUGH, self.on_iteration)
         state, part = found.state, found.problem.table
         index = np.searchsorted(self.table.names, part.names)
         self.placed[before] = False
@@ -318,18 +297,20 @@ class _Growth:
         good = self._good(part, state.path, state.points)
         self.placed[index] = self.fixed[index] | good
         free = ~self.fixed[index]
-        self.cov[index[free]] = spread(part, state.path, state.points)[free]
+        self.cov[index[free]] = observations.spread(part, state.path, state.points)[free]
 
     def _distance(self, index: NDArray[np.intp], step: int) -> float:
         """Median distance of landmarks from a frame's camera."""
         return float(np.median(np.linalg.norm(self.points[index] - SE3.translation(self.path[step]), axis=1)))
 
-    def _good(self, part: ObservationTable, path: Array, points: Array) -> NDArray[np.bool_]:
+    def _good(self, part: observations.ObservationTable, path: Array, points: Array) -> NDArray[np.bool_]:
         cap = np.inf if isinstance(part.camera, RectifiedStereo) else CAP
-        distance = np.linalg.norm(points - first_centres(part, path), axis=1)
+        distance = np.linalg.norm(points - observations.first_centres(part, path), axis=1)
         far = distance > NEAREST * self.usual
-        return far & in_front(part, path, points) & (parallax(part, path, points, cap) > PLACED)
+        return (
+            far & observations.in_front(part, path, points) & (observations.parallax(part, path, points, cap) > PLACED)
+        )
 
-    def _blurred(self, part: ObservationTable) -> ObservationTable:
+    def _blurred(self, part: observations.ObservationTable) -> observations.ObservationTable:
         blur = self.blur[part.steps][:, None, None] * np.eye(part.z.shape[1])
         return replace(part, cov_z=part.cov_z + blur)

@@ -24,28 +24,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.validation.gtsam.observations import (
-    ObservationTable,
-    Residuals,
-    collapsed,
-    first_centres,
-    is_open,
-    place,
-    reprojection,
-)
-from rbpf.validation.gtsam.solvers import (
-    ITERATIONS,
-    MOST_POSES,
-    ROUGH,
-    SPATIAL,
-    OnIteration,
-    explaining,
-    huber,
-    levenberg_marquardt,
-    marginals,
-    marginals_by_schur,
-    noise,
-)
+from rbpf.validation.gtsam import observations, solvers
 
 SCALE, SOFT_SCALE = 1e-6, 1e-3
 """Standard deviation of the distance that holds the scale, as a fraction of it, at the end and on the way there.
@@ -77,7 +56,7 @@ class CameraProblem:
         self,
         name: str,
         frames: int,
-        table: ObservationTable,
+        table: observations.ObservationTable,
         known: dict[int, tuple[Array, Array]],
         robust: float | None = None,
     ) -> None:
@@ -120,15 +99,15 @@ class CameraProblem:
         for name, key in zip(names, self.point_keys, strict=True):
             if name in self.known:
                 position, cov = self.known[name]
-                model = noise(cov) if cov.any() else gtsam.noiseModel.Constrained.All(3)
+                model = solvers.noise(cov) if cov.any() else gtsam.noiseModel.Constrained.All(3)
                 graph.push_back(gtsam.PriorFactorPoint3(key, position, model))
-        distance = np.linalg.norm(start.points - first_centres(self.table, start.path), axis=1)
+        distance = np.linalg.norm(start.points - observations.first_centres(self.table, start.path), axis=1)
         for index in np.flatnonzero(loose).tolist():
             model = gtsam.noiseModel.Isotropic.Sigma(3, WEAK * distance[index])
             graph.push_back(gtsam.PriorFactorPoint3(self.point_keys[index], start.points[index], model))
         if not self.known:
             hard = gtsam.noiseModel.Constrained.All(6)
-            graph.push_back(gtsam.PriorFactorPose3(self.pose_keys[0], SPATIAL.pose(held[0]), hard))
+            graph.push_back(gtsam.PriorFactorPose3(self.pose_keys[0], solvers.SPATIAL.pose(held[0]), hard))
         if self.scaled:
             distances = np.linalg.norm(SE3.translation(held) - SE3.translation(held[0]), axis=1)
             far = int(np.argmax(distances))
@@ -146,7 +125,7 @@ class CameraProblem:
         """GTSAM's values of a state."""
         values = gtsam.Values()
         for key, pose in zip(self.pose_keys, state.path, strict=True):
-            values.insert(key, SPATIAL.pose(pose))
+            values.insert(key, solvers.SPATIAL.pose(pose))
         for key, point in zip(self.point_keys, state.points, strict=True):
             values.insert(key, np.asarray(point))
         return values
@@ -160,7 +139,9 @@ class CameraProblem:
 
     def explaining(self) -> AbstractContextManager[None]:
         """GTSAM's complaints in words."""
-        return explaining(self.name, "frame", self.table.names, "check the measurements there, or add known points")
+        return solvers.explaining(
+            self.name, "frame", self.table.names, "check the measurements there, or add known points"
+        )
 
     def observation_factors(self) -> list[Any]:
         """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
@@ -187,9 +168,9 @@ class CameraProblem:
             lens = gtsam.Cal3DS2(*intrinsics, *camera.distortion[:4])
         else:
 
-            def evaluate(values: Any) -> Residuals:
+            def evaluate(values: Any) -> observations.Residuals:
                 state = self.state(values)
-                return reprojection(self.table, state.path, state.points)
+                return observations.reprojection(self.table, state.path, state.points)
 
             factor = together(evaluate)
             return self.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point], model))
@@ -205,19 +186,21 @@ class CameraProblem:
             cov = self.table.cov_z[row]
             code = cov.tobytes()
             if code not in models:
-                models[code] = huber(noise(cov if order is None else cov[np.ix_(order, order)]), self.robust)
+                models[code] = solvers.huber(
+                    solvers.noise(cov if order is None else cov[np.ix_(order, order)]), self.robust
+                )
             out.append(make(row, models[code], self.pose_keys[step], self.point_keys[index]))
         return out
 
 
-def together(evaluate: Callable[[Any], Residuals]) -> Callable[[int, list[int], Any], Any]:
+def together(evaluate: Callable[[Any], observations.Residuals]) -> Callable[[int, list[int], Any], Any]:
     """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
 
     GTSAM hands every factor the same object as long as Python holds it, as the loops of `solvers` do; an
     optimiser that changes its values in place would be shown old residuals.
     """
     held: Any = None
-    found: Residuals = np.empty(0), []
+    found: observations.Residuals = np.empty(0), []
 
     def factor(row: int, keys: list[int], model: Any) -> Any:
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
@@ -252,7 +235,7 @@ class Adjusted(NamedTuple):
 
 
 def adjust(
-    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: OnIteration | None = None
+    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: solvers.OnIteration | None = None
 ) -> Adjusted:
     """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
 
@@ -261,26 +244,26 @@ def adjust(
     """
 
     def run(graph: Any, state: CameraState, tolerance: float) -> tuple[Any, int, bool]:
-        most = _FEW if tolerance == ROUGH else ITERATIONS
+        most = _FEW if tolerance == solvers.ROUGH else solvers.ITERATIONS
         with problem.explaining():
-            return levenberg_marquardt(graph, problem.values(state), tolerance, most, on_iteration)
+            return solvers.levenberg_marquardt(graph, problem.values(state), tolerance, most, on_iteration)
 
     state, weak, total, loose = start, start, 0, np.zeros(len(start.points), dtype=bool)
     for round_ in range(_ROUNDS):
-        kept = ~(problem.free & collapsed(problem.table, state.path, state.points))
+        kept = ~(problem.free & observations.collapsed(problem.table, state.path, state.points))
         if not kept.all():
             table, loose = problem.table.rows(kept[problem.table.index]), loose[kept]
             problem = CameraProblem(problem.name, problem.frames, table, problem.known, problem.robust)
             state, weak = (replace(one, points=one.points[kept]) for one in (state, weak))
-        now = problem.free & is_open(problem.table, state.path, state.points)
+        now = problem.free & observations.is_open(problem.table, state.path, state.points)
         # The first judgement may be the start's fault; later ones only add, so that it comes to an end.
         now = now if round_ < 2 else now | loose
         settled = round_ > 0 and kept.all() and bool((now == loose).all())
         if not settled:
-            weak = replace(state, points=place(problem.table, state.path, state.points, now))
+            weak = replace(state, points=observations.place(problem.table, state.path, state.points, now))
             state, loose = weak, now
         graph = problem.graph(weak, loose, start.path)
-        values, count, converged = run(graph, state, tolerance if settled else ROUGH)
+        values, count, converged = run(graph, state, tolerance if settled else solvers.ROUGH)
         state, total = problem.state(values), total + count
         if settled and converged:
             break
@@ -296,11 +279,11 @@ def covariances(found: Adjusted) -> tuple[Array, dict[int, Array]]:
     """Marginal covariances of all poses (T, 6, 6) in the right chart, and of all landmarks, each (3, 3)."""
     problem = found.problem
     poses, points, names = problem.pose_keys, problem.point_keys, problem.table.names.tolist()
-    if not problem.scaled and len(poses) <= MOST_POSES:
-        of_poses, of_points = marginals_by_schur(
+    if not problem.scaled and len(poses) <= solvers.MOST_POSES:
+        of_poses, of_points = solvers.marginals_by_schur(
             found.graph, found.values, poses, points, problem.held_keys, problem.name
         )
         return of_poses, dict(zip(names, of_points, strict=True))
     with problem.explaining():
-        blocks = marginals(found.graph, found.values, [*poses, *points])
+        blocks = solvers.marginals(found.graph, found.values, [*poses, *points])
     return np.array(blocks[: len(poses)]), dict(zip(names, blocks[len(poses) :], strict=True))

@@ -24,20 +24,8 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, skew
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
+from rbpf.validation.gtsam import solvers
 from rbpf.validation.gtsam.observations import SINGULAR
-from rbpf.validation.gtsam.solvers import (
-    EXACT,
-    PLANAR,
-    ROUGH,
-    SPATIAL,
-    BatchSolution,
-    explaining,
-    gauss_newton,
-    huber,
-    levenberg_marquardt,
-    noise,
-)
-from rbpf.validation.gtsam.solvers import marginals as marginals_of
 
 SOFT = 0.1
 """Standard deviation of a softened constraint as a fraction of the step's largest."""
@@ -55,7 +43,7 @@ def solve(
     marginals: bool = True,
     initial: InitialEstimate | None = None,
     incremental: bool = False,
-) -> BatchSolution:
+) -> solvers.BatchSolution:
     """Solve for all poses and landmarks at once.
 
     Args:
@@ -71,7 +59,7 @@ def solve(
             does not converge.
     """
     problem = Problem(m, robust)
-    with explaining(m.recording, "the pose of step", problem.names, ADVICE):
+    with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):
         graph = problem.graph()
         if incremental:  # ISAM2 closes every loop from near by.
             *_, (_, isam) = _grown(problem, CHUNK)
@@ -81,10 +69,10 @@ def solve(
         # Until the error stands; hard constraints of the odometry are softened first, and then Gauss-Newton's.
         softened = 0
         if problem.null.any():
-            near, softened, _ = levenberg_marquardt(problem.graph(soft=True), values, ROUGH)
-            values, count, converged = gauss_newton(graph, near)
+            near, softened, _ = solvers.levenberg_marquardt(problem.graph(soft=True), values, solvers.ROUGH)
+            values, count, converged = solvers.gauss_newton(graph, near)
         else:
-            values, count, converged = levenberg_marquardt(graph, values, EXACT)
+            values, count, converged = solvers.levenberg_marquardt(graph, values, solvers.EXACT)
         if not converged:
             raise InputError(
                 f"The batch optimisation of {m.recording} did not converge in {count} iterations; "
@@ -93,10 +81,12 @@ def solve(
         path, landmarks = problem.estimate(values)
         cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
         if marginals:
-            found = marginals_of(graph, values, problem.pose_keys + problem.landmark_keys)
+            found = solvers.marginals(graph, values, problem.pose_keys + problem.landmark_keys)
             cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(path)]])
             cov_landmarks = dict(zip(problem.names.tolist(), found[len(path) :], strict=True))
-        return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count)
+        return solvers.BatchSolution(
+            path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count
+        )
 
 
 def solve_online(m: Measurements, robust: float | None = None) -> Array:
@@ -106,7 +96,7 @@ def solve_online(m: Measurements, robust: float | None = None) -> Array:
     of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
     """
     problem = Problem(m, robust)
-    with explaining(m.recording, "the pose of step", problem.names, ADVICE):
+    with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):
         return np.array([pose for pose, _ in _grown(problem, 1, MOVED)])
 
 
@@ -195,7 +185,7 @@ class Problem:
             place = f"landmark {m.landmarks[row]} at step {m.steps[row]}"
             raise InputError(f"The observation of {place} has a singular covariance, expected noise in all of it.")
         self.m, self.robust, self.sensor = m, robust, Sensor(m)
-        self.chart = PLANAR if isinstance(m.space, SE2Group) else SPATIAL
+        self.chart = solvers.PLANAR if isinstance(m.space, SE2Group) else solvers.SPATIAL
         self.names, self.index = np.unique(m.landmarks, return_inverse=True)
         self.pose_keys = [int(gtsam.symbol("x", step)) for step in range(len(m.stamps_ns))]
         self.landmark_keys = [int(gtsam.symbol("l", index)) for index in range(len(self.names))]
@@ -255,7 +245,7 @@ class Problem:
         keys = self.pose_keys[step - 1 : step + 1]
         if not null.any() or (soft and variances[-1] > 0):
             cov = ((axes * variances) @ axes.T)[np.ix_(chart.order, chart.order)]
-            return chart.between(*keys, chart.pose(delta), noise(cov))
+            return chart.between(*keys, chart.pose(delta), solvers.noise(cov))
         # e = U^T Log((x delta)^-1 y):  de/dy = U^T J_r^-1,  de/dx = -U^T J_l^-1 Ad(delta^-1).
         back = space.adjoint(space.inverse(delta))
 
@@ -281,5 +271,5 @@ class Problem:
                 jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
             return sensor.residual(state, landmark, z)
 
-        loss = huber(noise(self.m.cov_z[row]), self.robust)
+        loss = solvers.huber(solvers.noise(self.m.cov_z[row]), self.robust)
         return gtsam.CustomFactor(loss, [pose_key, landmark_key], error)
