@@ -1,6 +1,6 @@
 """`rbpf run`: one class per system, and the same run again."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels, use_threads
 from rbpf.cli.interrupts import finishing, patient
 from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
-from rbpf.cli.showing import OnProgress, answer, progress, say
+from rbpf.cli.showing import answer, progress, say
 from rbpf.errors import InputError
 from rbpf.ranges import Count, NotNegative, Range
 
@@ -90,6 +90,15 @@ class ImageRunOptions(PartOptions):
     batch_limit: WholeCount = None
     video: bool = True  #: write the annotated video.
 
+    def over_images(self, recording: "Recording", config: Any, video: bool) -> None:
+        """Filters images, with what can be left out as it is asked for."""
+        from rbpf.validation.report.video import require_rerun
+
+        if self.rerun is not None:
+            require_rerun()
+        more = {"rerun": self.rerun, "batch": self.batch, "most_iterations": self.batch_limit}
+        _run(self, recording, config, video=video, **more)
+
 
 @RUN.add("range-bearing")
 @dataclass(frozen=True, kw_only=True)
@@ -108,19 +117,14 @@ class RunRangeBearing(PartOptions):
     def __call__(self) -> None:
         from rbpf.runs.recordings import RobotRecording
         from rbpf.systems.range_bearing.config import RangeBearingConfig
-        from rbpf.validation.finish import finish_run
 
-        config = self.settings(RangeBearingConfig, "range-bearing", "association")
-        recording = RobotRecording(self.log, self.part())
-        with _prepared(self) as out:
-            with progress() as bar:
-                run = _filtered(self, recording, config, out, bar("filtering"))
+        def tell(run: "Run") -> None:
             say(run.system.why_map)
             if self.batch:
                 say("solving the batch problem with the same measurements …")
-            with finishing():
-                entries = finish_run(run, out, recording.sources(), batch=self.batch)
-        _finish(entries, self, out, run.failure)
+
+        config = self.settings(RangeBearingConfig, "range-bearing", "association")
+        _run(self, RobotRecording(self.log, self.part()), config, tell, batch=self.batch)
 
 
 @RUN.add("laser")
@@ -140,17 +144,9 @@ class RunLaser(PartOptions):
         from rbpf.runs.recordings import LaserRecording
         from rbpf.sensors.readers import LaserOptions
         from rbpf.systems.laser.config import LaserConfig
-        from rbpf.validation.finish import finish_run
 
-        config = self.settings(LaserConfig, "laser")
         told = LaserOptions(self.scanner, self.upside_down, self.max_range, self.part())
-        recording = LaserRecording(self.log, told)
-        with _prepared(self) as out:
-            with progress() as bar:
-                run = _filtered(self, recording, config, out, bar("filtering"))
-            with finishing():
-                entries = finish_run(run, out, recording.sources())
-        _finish(entries, self, out, run.failure)
+        _run(self, LaserRecording(self.log, told), self.settings(LaserConfig, "laser"))
 
 
 @RUN.add("mono")
@@ -205,7 +201,7 @@ class RunMono(ImageRunOptions):
                 raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
             video = False
             say("Ctrl-C ends the recording; the results are written then")
-        _run_images(self, recording, config, video)
+        self.over_images(recording, config, video)
 
 
 @RUN.add("stereo")
@@ -228,7 +224,7 @@ class RunStereo(ImageRunOptions):
         config = self.settings(StereoConfig, "stereo", "dof")
         topics = Topics.parse(self.image_topic, self.truth_topic)
         recording = StereoRecording(self.sequence, self.calibration, topics, self.part(self.resize))
-        _run_images(self, recording, config, self.video)
+        self.over_images(recording, config, self.video)
 
 
 def repeated(arguments: list[str]) -> list[str]:
@@ -249,38 +245,35 @@ def repeated(arguments: list[str]) -> list[str]:
     return ["run", *words, *out, *arguments[3:]]
 
 
-def _filtered(options: RunOptions, recording: "Recording", config: Any, out: Path, report: OnProgress) -> "Run":
-    """Filters a recording, and reports how many frames are done, and of how many."""
+def _run(
+    options: RunOptions,
+    recording: "Recording",
+    config: Any,
+    filtered: "Callable[[Run], None]" = lambda run: None,
+    **made: Any,
+) -> None:
+    """Filters, then writes everything that is to be `made`, with a bar for each stage of the work; see `finish_run`.
+
+    `filtered` is called in between.
+    """
     from rbpf.runs.recordings import filter_recording
-
-    with patient(report) as patiently:
-        listeners = [lambda run, _: patiently(len(run.log), run.expected or 0)]
-        return filter_recording(recording, config, out, options.resume, listeners)
-
-
-def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, video: bool) -> None:
-    """Filters, then writes everything, with a bar for each stage of the work."""
     from rbpf.validation.finish import finish_run
-    from rbpf.validation.report.video import require_rerun
 
-    if options.rerun is not None:
-        require_rerun()
     with _prepared(options) as out, progress() as bar:
-        run = _filtered(options, recording, config, out, bar("filtering"))
+        with patient(bar("filtering")) as report:
+            listeners = [lambda run, _: report(len(run.log), run.expected or 0)]
+            run = filter_recording(recording, config, out, options.resume, listeners)
+        filtered(run)
         solving = bar("batch")
+        made |= {"on_frame": bar("drawing"), "on_iteration": lambda count, _error: solving(count, None)}
         with finishing():
-            entries = finish_run(
-                run,
-                out,
-                recording.sources(),
-                video,
-                options.rerun,
-                options.batch,
-                on_frame=bar("drawing"),
-                on_iteration=lambda count, _error: solving(count, None),
-                most_iterations=options.batch_limit,
-            )
-    _finish(entries, options, out, run.failure)
+            entries = finish_run(run, out, recording.sources(), **made)
+    problems = entries.get("problems", ())
+    odd = [f"{len(problems)} remarks on single frames, the first: {problems[0]}"] if problems else []
+    where = f"pictures and report.html are in {out}, all figures in its summary.json"
+    answer(entries | {"out": str(out)}, options.json, *entries["sentences"], *odd, where)
+    if run.failure is not None:
+        raise InputError(f"{run.failure}; what was computed before it is in {out}")
 
 
 @contextmanager
@@ -300,13 +293,3 @@ def _prepared(options: RunOptions) -> Iterator[Path]:
                 "with --overwrite"
             )
         yield out
-
-
-def _finish(entries: dict[str, Any], options: RunOptions, out: Path, failure: str | None) -> None:
-    result = entries | {"out": str(out)}
-    problems = entries.get("problems", ())
-    odd = [f"{len(problems)} remarks on single frames, the first: {problems[0]}"] if problems else []
-    where = f"pictures and report.html are in {out}, all figures in its summary.json"
-    answer(result, options.json, *entries["sentences"], *odd, where)
-    if failure is not None:
-        raise InputError(f"{failure}; what was computed before it is in {out}")

@@ -22,6 +22,7 @@ from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam import robot
 from rbpf.validation.gtsam.camera import solve_features
+from rbpf.validation.gtsam.camera_graph import FINE
 from rbpf.validation.gtsam.observations import in_one_piece, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
@@ -55,16 +56,6 @@ class Optimum:
     estimate: PathAndMap
     steps: NDArray[np.intp]  #: (B,) steps of the run that took part, one per pose.
     error: float  #: half the sum of squared whitened residuals, or the sum of their robust losses.
-
-
-@final
-@dataclass(frozen=True)
-class Fit:
-    """How well a path and a map explain observations."""
-
-    log_likelihood: float  #: Σ log N(z − h(x̂, m̂); 0, R) [nats].
-    rms_sigmas: float  #: root of the mean square whitened residual per measured number.
-    sightings: int  #: how many observations took part; the name is that of the key in the file.
 
 
 def floats_in_scale(problem: Problem) -> bool:
@@ -117,7 +108,7 @@ def solve_problem(
                 f"the batch adjustment was given up after {limit} iterations: allow more with --batch-limit"
             )
 
-    tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else None
+    tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else FINE
     solve = partial(solve_features, part, robust=robust, on_iteration=watch, tolerance=tolerance)
     # A start that leads nowhere is passed over, if another one does not.
     solutions, problems = [], []
@@ -136,8 +127,11 @@ def solve_problem(
     return _optimum(replace(part, known=log.known), found, frames)
 
 
-def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> Fit:
-    """How likely the observations of the named landmarks are, of the estimate's own poses and landmarks."""
+def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> dict[str, float]:
+    """How well an estimate's own poses and landmarks explain the observations of the named landmarks.
+
+    Σ log N(z − h(x̂, m̂); 0, R) [nats], the root of the mean square whitened residual per measured number, and how many took part.
+    """
     places = estimate.landmarks.named()
     if isinstance(problem, FeatureLog):
         table = observation_table(problem)
@@ -153,7 +147,8 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
     square = np.square(mahalanobis(residuals, cov))
     log_norm = np.linalg.slogdet(2.0 * np.pi * cov)[1]
     rms = float(np.sqrt(square.sum() / max(residuals.size, 1)))
-    return Fit(float(-0.5 * (square + log_norm).sum()), rms, len(residuals))
+    log_likelihood = float(-0.5 * (square + log_norm).sum())
+    return {"log_likelihood": log_likelihood, "rms_sigmas": rms, "sightings": len(residuals)}
 
 
 def softened(known: KnownPoints | None) -> KnownPoints | None:
@@ -186,9 +181,8 @@ def connected_frames(log: FeatureLog) -> NDArray[np.intp]:
 
 
 def _optimum(problem: Problem, found: BatchSolution, steps: NDArray[np.intp]) -> Optimum:
-    names, dim = sorted(found.landmarks.keys() - set(found.undetermined)), 3
-    if not isinstance(problem, FeatureLog):
-        dim = problem.z.shape[1]
+    names = sorted(found.landmarks.keys() - set(found.undetermined))
+    dim = 3 if isinstance(problem, FeatureLog) else problem.z.shape[1]
     unknown = np.full((dim, dim), np.nan)
     points = MapEstimate(
         np.array(names, dtype=np.int64),

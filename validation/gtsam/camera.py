@@ -59,7 +59,7 @@ def solve_features(
     robust: float | None = None,
     marginals: bool = True,
     on_iteration: solvers.OnIteration | None = None,
-    tolerance: float | None = None,
+    tolerance: float = FINE,
 ) -> solvers.BatchSolution:
     """Solve for all poses and landmarks at once.
 
@@ -75,8 +75,7 @@ def solve_features(
         marginals: compute covariances.
         on_iteration: given the error before each iteration, also of adjustments on the way to an initial estimate;
             what it raises ends it all.
-        tolerance: fraction of the error that is no gain any more; by default a billionth, for which far landmarks creep
-            through hundreds of iterations.
+        tolerance: fraction of the error that is no gain any more; by default far landmarks creep through hundreds of iterations.
 
     Raises:
         InputError: a number makes no sense, the first frame sees too few known points and there is no initial
@@ -108,7 +107,7 @@ def solve_features(
         if across[1] <= LINE * across[0]:
             raise InputError(f"The known points that {name} sees lie on a line; add one beside it.")
     start = begin(problem, initial or from_scratch(problem, on_iteration))
-    found = adjust(problem, start, tolerance or FINE, on_iteration)
+    found = adjust(problem, start, tolerance, on_iteration)
     if not found.converged:
         raise InputError(
             f"The batch adjustment of {name} did not converge in {found.iterations} iterations; "
