@@ -142,8 +142,8 @@ def camera_causes(
     record, log = RunFolder.open(folder), read_feature_log(folder)
     path = record.path
     config = load_settings(MonoConfig, "mono", folder / "config.yaml", (), {})
-    whole = np.arange(len(path.mean))
-    adjusted = partial(solve_problem, log, path.mean, HUBER, marginals=False)
+    whole = np.arange(len(path.world_from_body))
+    adjusted = partial(solve_problem, log, path.world_from_body, HUBER, marginals=False)
     batch = adjusted()
     try:
         truth = record.truth
@@ -159,7 +159,7 @@ def camera_causes(
     found = error(batch.steps, batch.estimate.world_from_body)
     clean = agreeing_matches(log, batch)
     calibrated = refine_calibration(log, batch)
-    out = [Cause(AS_IT_IS, (error(whole, path.mean),), found)]
+    out = [Cause(AS_IT_IS, (error(whole, path.world_from_body),), found)]
     for name, one in {
         BATCH: batch,
         FROM_FILTER: adjusted(twice=False),

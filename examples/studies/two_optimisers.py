@@ -349,7 +349,7 @@ def main(run: Path | None = None, out: Path = Path("demo/two_optimisers"), quick
         assert log.truth is not None
         path = log.truth.world_from_camera
     else:
-        log, path = read_feature_log(run), RunFolder.open(run).path.mean
+        log, path = read_feature_log(run), RunFolder.open(run).path.world_from_body
     found = adjust_by_both(log, path)
     entries = {name: float(value) for name, value in found.as_dict().items()}
     write_table(out / "two_optimisers.csv", ("figure", "value"), list(entries.items()))

@@ -183,7 +183,7 @@ def judged(run: Run, folder: Path) -> tuple[Verdict, Verdict, dict[str, float]]:
 
 def from_first_pose(record: RunFolder) -> RunTruth:
     """A truth that is exact, in the world that begins with the run's first pose, and in the run's scale."""
-    truth, ours = record.truth, record.path.mean[record.truth.rows]
+    truth, ours = record.truth, record.path.world_from_body[record.truth.rows]
     begin = SE3.compose(ours[0], SE3.inverse(truth.poses[0]))
     poses = SE3.compose(begin, truth.poses)
     out, true = ours[:, 4:] - ours[0, 4:], poses[:, 4:] - ours[0, 4:]

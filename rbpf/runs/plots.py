@@ -21,7 +21,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import GRID, whole
-from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH
 from rbpf.sensors.feature_log import FeatureLog
@@ -168,7 +168,7 @@ def error_figure(found: RunFolder) -> Any | None:
         return None
     truth, path = found.truth, found.path
     rows, how = truth.rows, truth.alignment
-    estimate, reference = path.trajectory(rows), in_space(path.stamps_ns[rows], truth.poses)
+    estimate, reference = path.at(rows).trajectory, in_space(path.stamps_ns[rows], truth.poses)
     moved = fit(how, estimate.positions, reference.positions)
     error = moved.transform(estimate.positions) - reference.positions
     turned = moved.scale * moved.rotation
@@ -304,14 +304,12 @@ def moved_map(found: MapEstimate, motion: Similarity) -> MapEstimate:
     return replace(found, mean=motion.transform(found.mean), cov=turn @ found.cov @ turn.T, ray_ends=ends)
 
 
-def position_covariances(path: FilteredPath) -> np.ndarray:
+def position_covariances(path: PathAndMap) -> np.ndarray:
     """(T, 3, 3) of the positions along the axes of the run's world; zero in z for a path in the plane."""
-    local = np.zeros((len(path.mean), 3, 3))
+    local = path.cov_poses[:, -3:, -3:]
     if path.space.dim == 3:
-        local[:, :2, :2] = path.cov[:, 1:, 1:]
-    else:
-        local = path.cov[:, 3:, 3:]
-    turn = SE3.rotation(path.trajectory().world_from_body)
+        local = np.pad(local[:, 1:, 1:], ((0, 0), (0, 1), (0, 1)))
+    turn = SE3.rotation(path.trajectory.world_from_body)
     return np.asarray(turn @ local @ turn.mT)
 
 
@@ -321,14 +319,14 @@ def lost_frames(found: RunFolder) -> np.ndarray:
         table = found.table("diagnostics.csv")
     except InputError:
         table = {}
-    return table.get("lost", table.get("assumed", np.zeros(len(found.path.mean)))) > 0
+    return table.get("lost", table.get("assumed", np.zeros(len(found.trajectory)))) > 0
 
 
 def tracking_losses(found: RunFolder) -> tuple[int | None, int]:
     """In how many frames a run was lost, and their number; None of a system that cannot be."""
     table = found.table("diagnostics.csv")
     able = "lost" in table or "assumed" in table
-    return (int(lost_frames(found).sum()) if able else None), len(found.path.mean)
+    return (int(lost_frames(found).sum()) if able else None), len(found.trajectory)
 
 
 @dataclass(frozen=True)

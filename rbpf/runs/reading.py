@@ -10,7 +10,7 @@ trajectory.npz   stamps_ns (T,), mean (T, E) and cov (T, d, d) in the right char
 
 import csv
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
@@ -36,10 +36,8 @@ from rbpf.systems.map_estimate import MapEstimate
 MOST_BYTES = 1 << 30
 """No file of a run folder is larger."""
 
-_PATH = {
-    "stamps_ns": integers("frames"),
-    "mean": numbers("frames", "size"),
-    "cov": numbers("frames", "dim", "dim"),
+_PATH = {"stamps_ns": integers("frames"), "mean": numbers("frames", "size"), "cov": numbers("frames", "dim", "dim")}
+_CORRECTIONS = {
     "correction": numbers("frames", "r", values="any"),
     "cov_correction": numbers("frames", "r", "r", values="any"),
 }
@@ -49,6 +47,7 @@ _MAP = {
     "cov": numbers("landmarks", "axes", "axes", values="any"),
     "ray_ends": numbers("landmarks", 2, 3, values="any"),
 }
+_NO_LANDMARKS = MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 _GRID = {"log_odds": numbers("rows", "columns"), "cell_m": numbers(), "corner": numbers(2)}
 _PARTICLES = {"particles": numbers("particles", "size"), "weights": numbers("particles", least=0)}
 
@@ -61,7 +60,7 @@ class PathAndMap:
     stamps_ns: NDArray[np.int64]  #: (T,).
     world_from_body: Array  #: (T, E).
     cov_poses: Array  #: (T, d, d) in the right chart at each pose, order [ω, v]; no rows where they are not known.
-    landmarks: MapEstimate  #: those that are points.
+    landmarks: MapEstimate = _NO_LANDMARKS  #: those that are points; none of a path alone.
 
     @classmethod
     def of_run(cls, run: Run) -> "PathAndMap":
@@ -74,34 +73,13 @@ class PathAndMap:
 
     @property
     def trajectory(self) -> Trajectory:
+        """The poses in space."""
         return in_space(self.stamps_ns, self.world_from_body)
 
     def at(self, rows: NDArray[np.intp]) -> "PathAndMap":
         """Some of the poses, with all landmarks."""
         covs = self.cov_poses[rows] if len(self.cov_poses) else self.cov_poses
         return PathAndMap(self.stamps_ns[rows], self.world_from_body[rows], covs, self.landmarks)
-
-
-@dataclass(frozen=True)
-class FilteredPath:
-    """Filtered poses of a run: stamps (T,), mean (T, E) in SE2 or SE3 and cov (T, d, d) in the right chart there.
-
-    The corrections (T, r) of the motions and their covariances (T, r, r) have r = 0 where the system does not report them.
-    """
-
-    stamps_ns: np.ndarray
-    mean: np.ndarray
-    cov: np.ndarray
-    correction: np.ndarray
-    cov_correction: np.ndarray
-
-    @property
-    def space(self) -> SE2Group | SE3Group:
-        return SE2 if self.mean.shape[1] == SE2.size else SE3
-
-    def trajectory(self, rows: np.ndarray | slice = slice(None)) -> Trajectory:
-        """Some of the poses, in space."""
-        return in_space(self.stamps_ns[rows], self.mean[rows])
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,8 +118,9 @@ class RunFolder:
         return printable(str(self.summary.get("recording", self.folder.name)))
 
     @cached_property
-    def path(self) -> FilteredPath:
-        """The filtered poses, with what they were corrected by."""
+    def path(self) -> PathAndMap:
+        """The filtered poses, without landmarks."""
+        return self._poses[0]
         file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
         if not file.is_file():
             raise InputError(f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}")
@@ -151,8 +130,11 @@ class RunFolder:
             raise InputError(f"{file} has version {version}, this program reads version {VERSION}; {again}")
         try:
             with fitting(file):
-                found = FilteredPath(**read(arrays, _PATH))
-                if found.mean.shape[1] not in (SE2.size, SE3.size) or found.cov.shape[1] != found.space.dim:
+                found = PathAndMap(*read(arrays, _PATH).values())
+                if (
+                    found.world_from_body.shape[1] not in (SE2.size, SE3.size)
+                    or found.cov_poses.shape[1] != found.space.dim
+                ):
                     raise InputError("the poses are neither in the plane nor in space")
         except InputError as error:
             raise InputError(f"{file} does not hold the poses of a run ({error}); {again}") from error
@@ -161,17 +143,26 @@ class RunFolder:
     @property
     def trajectory(self) -> Trajectory:
         """The online filtered path in space."""
-        return self.path.trajectory()
+        return self.path.trajectory
 
     @property
     def covariance(self) -> np.ndarray:
         """(T, d, d) of the poses in the right chart at each, [ω, v]."""
-        return self.path.cov
+        return self.path.cov_poses
+
+    @cached_property
+    def corrections(self) -> tuple[Array, Array]:
+        """Corrections (T, r) of the motions and their covariances (T, r, r); r = 0 where the system does not report them."""
+        file = self.folder / TRAJECTORY
+        arrays = load_arrays(file)
+        with fitting(file):
+            correction, cov = read(arrays, _CORRECTIONS).values()
+        return correction, cov
 
     @cached_property
     def truth(self) -> RunTruth:
         """The ground truth at the run's frames."""
-        return read_truth(self.folder, len(self.path.mean), self.path.mean.shape[1])
+        return read_truth(self.folder, *self.path.world_from_body.shape)
 
     @cached_property
     def map(self) -> MapEstimate:
@@ -205,7 +196,7 @@ class RunFolder:
         file = self.folder / TRAJECTORY
         arrays = load_arrays(file)
         with fitting(file):
-            poses, weights = read(arrays, _PARTICLES, size=self.path.mean.shape[1]).values()
+            poses, weights = read(arrays, _PARTICLES, size=self.path.space.size).values()
         return poses, weights
 
     @cached_property
@@ -217,7 +208,7 @@ class RunFolder:
     def estimate(self) -> PathAndMap:
         """Poses and the landmarks that are points, with their covariances; of a run of this version of the program."""
         require_own_version(self.config, self.folder)
-        return PathAndMap(self.path.stamps_ns, self.path.mean, self.path.cov, self.map.points())
+        return replace(self.path, landmarks=self.map.points())
 
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table of numbers by its columns' names: diagnostics.csv, timings.csv."""

@@ -51,7 +51,7 @@ def test_a_part_is_run_repeated_and_compared(tmp_path, capsys):
     assert main([*words, str(tmp_path / "part"), "--start", "2", "--every", "3"]) == 0
     assert main(["run", "--from", str(tmp_path / "part" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
     assert main([*words, str(tmp_path / "whole")]) == 0
-    once, again = (RunFolder.open(tmp_path / name).path.mean for name in ("part", "again"))
+    once, again = (RunFolder.open(tmp_path / name).path.world_from_body for name in ("part", "again"))
     assert len(once) == 4
     np.testing.assert_array_equal(once, again)
     capsys.readouterr()

@@ -89,7 +89,7 @@ def test_a_run_is_scored_by_relations_and_by_another_path(tmp_path, capsys, plai
     run = tmp_path / "run"
     command = ["run", "range-bearing", str(tmp_path / "log"), "--out", str(run), "--particles", "20", "--no-batch"]
     assert main(command) == 0
-    path = load(run).path.mean
+    path = load(run).path.world_from_body
     off = SE2.compose(SE2.between(path[2], path[10]), SE2.inverse(np.array([0.0, 0.3, 0.0])))
     # Logs without times count their steps, in nanoseconds.
     file = written(tmp_path, relation("0.000000002", "0.000000010", off))

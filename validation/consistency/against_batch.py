@@ -188,7 +188,7 @@ def solve_run(
     `most`, `on_iteration` and errors as of `solve_problem`.
     """
     robust = HUBER if isinstance(record.measurements, FeatureLog) else None
-    return batch_problem.solve_problem(record.measurements, record.path.mean, robust, most, on_iteration)
+    return batch_problem.solve_problem(record.measurements, record.path.world_from_body, robust, most, on_iteration)
 
 
 def compare_with_batch(

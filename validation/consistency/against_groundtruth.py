@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.runs.plots import moved_map
-from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
 from rbpf.runs.truth import LEAST, RunTruth
 from rbpf.systems.map_estimate import MapEstimate
@@ -40,7 +40,7 @@ _HOW = {
 class TruthErrors:
     """A run beside the truth."""
 
-    path: FilteredPath  #: filtered poses.
+    path: PathAndMap  #: filtered poses.
     truth: RunTruth  #: at the steps `truth.rows`.
     positions: AbsoluteError  #: errors of the aligned positions.
     whitened: statistic.WhitenedErrors  #: errors of the poses in units of the filter's own.
@@ -74,10 +74,10 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
             f"{record.folder}: {truth.rows.size} steps of the run have a true pose, a comparison needs {LEAST}"
         )
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
-    positions = ate(path.trajectory(truth.rows), reference, truth.alignment)
+    positions = ate(path.at(truth.rows).trajectory, reference, truth.alignment)
     turns = 1 if path.space.dim == SE2.dim else 3
     own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
-    mean, cov = path.mean[truth.rows], path.cov[truth.rows] + np.diag(own)
+    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows] + np.diag(own)
     anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
     if truth.alignment == "none":
         whitened = statistic.whitened_errors(space, mean, cov, truth.poses)
@@ -94,7 +94,7 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
         plane, moved = start, start.transform_poses(truth.poses)
     basis = np.broadcast_to(np.eye(space.dim), cov.shape)
     if across:
-        basis = across_of(away_from_first(path.mean)[truth.rows])
+        basis = across_of(away_from_first(path.world_from_body)[truth.rows])
     roots, ranks = statistic.inverse_roots(projected(basis, cov))
 
     def errors(motion: np.ndarray) -> np.ndarray:
@@ -133,9 +133,9 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     accuracy = (
         f"The path is {_metres(at.rmse)} (rms) from the truth, {_metres(at.max)} at worst, over {at.keys.size} of "
-        f"{len(path.mean)} steps {_HOW[truth.alignment]}"
+        f"{len(path.world_from_body)} steps {_HOW[truth.alignment]}"
     )
-    relative = rpe(path.trajectory(truth.rows), reference, alignment=at.alignment)
+    relative = rpe(path.at(truth.rows).trajectory, reference, alignment=at.alignment)
     figures: dict[str, Any] = {
         "alignment": truth.alignment,
         "steps_compared": int(truth.rows.size),
@@ -180,7 +180,7 @@ def _landmark_errors(record: RunFolder, truth: RunTruth, world: Similarity) -> L
     found = MapEstimate(found.ids[kept], found.mean[kept], found.cov[kept])
     delta, cov = np.array([truth.landmarks[name] for name in found.ids.tolist()]) - found.mean, found.cov
     if truth.alignment == "similarity":
-        basis = across_of(found.mean - record.path.mean[0, 4:])
+        basis = across_of(found.mean - record.path.world_from_body[0, 4:])
         delta, cov = projected(basis, delta), projected(basis, cov)
     moved = moved_map(found, world)
     true = np.array([record.truth.landmarks[name] for name in found.ids.tolist()])

@@ -110,8 +110,7 @@ def compare_with_itself(record: RunFolder) -> Comparison:
         raise InputError(f"{record.folder / 'diagnostics.csv'} has no columns nis and nis_dof")
     correction, cov = np.zeros((0, 0)), np.zeros((0, 0, 0))
     try:
-        path = record.path
-        correction, cov = path.correction, path.cov_correction
+        correction, cov = record.corrections
     except InputError:
         pass  # a folder of another version has no such file; whoever needs the poses says so
     statistics = innovation_statistics(table["nis"], table["nis_dof"], correction, cov)

@@ -72,7 +72,7 @@ def _camera_colmap(record: RunFolder) -> Comparison:
     from rbpf.validation.colmap.reconstruct import ReconstructionOptions
     from rbpf.validation.report.comparison_pictures import plot_against_colmap
 
-    every = max(ReconstructionOptions().every, -(-len(record.path.mean) // KEY_FRAMES))
+    every = max(ReconstructionOptions().every, -(-len(record.path.world_from_body) // KEY_FRAMES))
     run, truth = compare_folder_with_colmap(record.folder, ReconstructionOptions(every=every))
     figures = {f"run_{name}": value for name, value in run.as_dict().items()}
     if truth is not None:
