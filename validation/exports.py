@@ -14,7 +14,6 @@ npz      run.npz: stamps_ns (T,), world_from_body (T, E), cov_poses (T, d, d); l
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,7 +30,6 @@ from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import OVER_IMAGES, Names, build_model, lay_out, recorded_images
 from rbpf.validation.gtsam.batch_problem import Problem
 from rbpf.validation.gtsam.observations import ObservationTable, observation_table
@@ -63,20 +61,20 @@ def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
         raise InputError(f"a run is exported as {', '.join(FORMATS)}, not as {unknown[0]}")
     estimate = RunFolder.open(run).estimate
     prepare_folder(out)
-    return [path for name in dict.fromkeys(formats) for path in FORMATS[name](run, estimate, out)]
+    return [out / file for name in dict.fromkeys(formats) for file in FORMATS[name](run, estimate, out)]
 
 
-def _tum(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
+def _tum(_run: Path, estimate: PathAndMap, out: Path) -> list[str]:
     write_tum(out / "trajectory.tum", estimate.trajectory)
-    return [out / "trajectory.tum"]
+    return ["trajectory.tum"]
 
 
-def _kitti(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
+def _kitti(_run: Path, estimate: PathAndMap, out: Path) -> list[str]:
     write_kitti(out / "trajectory_kitti.txt", estimate.trajectory)
-    return [out / "trajectory_kitti.txt"]
+    return ["trajectory_kitti.txt"]
 
 
-def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
+def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[str]:
     problem = RunFolder.open(run).measurements if (run / OBSERVATIONS).exists() else None
     names: Names | None = None
     if (config := read_config(run))["system"] in OVER_IMAGES:
@@ -85,38 +83,38 @@ def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
         except InputError as error:
             _log.warning("%s: the images of the run are not exported: %s", run, error)
     export_colmap(estimate, problem, out / MODEL / "sparse" / "0", names=names)
-    return [out / MODEL]
+    return [MODEL]
 
 
-def _npz(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
+def _npz(_run: Path, estimate: PathAndMap, out: Path) -> list[str]:
     landmarks = estimate.landmarks
     arrays = {name: getattr(estimate, name) for name in ("stamps_ns", "world_from_body", "cov_poses")}
     arrays |= {"landmark_ids": landmarks.ids, "landmarks": landmarks.mean, "cov_landmarks": landmarks.cov}
     save_arrays(out / "run.npz", arrays)
-    return [out / "run.npz"]
+    return ["run.npz"]
 
 
-def _rerun(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
-    path, trajectory = out / "run.rrd", estimate.trajectory
-    with recording(path, run.resolve().name) as (rr, stream):
+def _rerun(run: Path, estimate: PathAndMap, out: Path) -> list[str]:
+    trajectory = estimate.trajectory
+    with recording(out / "run.rrd", run.resolve().name) as (rr, stream):
         stream.log("world/path", rr.LineStrips3D([trajectory.positions]), static=True)
-        stream.log("world/map", ellipsoids(rr, raised(estimate.landmarks)), static=True)
+        stream.log("world/map", ellipsoids(rr, estimate.landmarks), static=True)
         for t, pose in enumerate(trajectory.world_from_body):
             log_time(stream, t, int(estimate.stamps_ns[t] - estimate.stamps_ns[0]))
             log_pose(rr, stream, "body", pose)
             stream.log("world/body", rr.TransformAxes3D(AXIS_M))
-    return [path]
+    return ["run.rrd"]
 
 
-FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[Path]]] = {
+FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[str]]] = {
     "tum": _tum,
     "kitti": _kitti,
-    "ply": lambda _run, estimate, out: [out / name for name in export_ply(estimate, out)],
+    "ply": lambda _run, estimate, out: export_ply(estimate, out),
     "colmap": _colmap,
     "rerun": _rerun,
     "npz": _npz,
 }
-"""How each is written."""
+"""How each is written; the names of the files are returned."""
 
 
 def export_colmap(
@@ -135,8 +133,7 @@ def export_colmap(
     Raises:
         InputError: path and measurements are not of one run.
     """
-    landmarks = raised(estimate.landmarks)
-    colours, ids = colours_by_sigma(standard_deviations(estimate.landmarks.cov)), landmarks.ids
+    colours, ids = colours_by_sigma(standard_deviations(estimate.landmarks.cov)), estimate.landmarks.ids
     if isinstance(problem, FeatureLog):
         if len(problem.frames) != len(estimate.stamps_ns):
             counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
@@ -150,7 +147,7 @@ def export_colmap(
         none, names = np.zeros(0, dtype=np.intp), None
         shown = ObservationTable(NOMINAL, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
         poses = SE3.compose(estimate.trajectory.world_from_body, _BODY_FROM_CAMERA)
-    model = build_model(shown, poses, landmarks.mean, colours, names)
+    model = build_model(shown, poses, estimate.landmarks.in_space()[0], colours, names)
     prepare_folder(folder)
     (model.write_text if kind == "text" else model.write_binary)(folder)
     return model
@@ -159,20 +156,13 @@ def export_colmap(
 def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
     """Writes map.ply and path.ply; returns their names."""
     prepare_folder(folder)
-    landmarks, std = raised(estimate.landmarks), standard_deviations(estimate.landmarks.cov)
-    write_ply(folder / MAP, landmarks.mean, colours_by_sigma(std), std)
+    std = standard_deviations(estimate.landmarks.cov)
+    write_ply(folder / MAP, estimate.landmarks.in_space()[0], colours_by_sigma(std), std)
     at = estimate.trajectory.positions
     steps = np.arange(max(len(at) - 1, 0))
     edges = np.stack([steps, steps + 1], axis=1)
     write_ply(folder / PATH, at, np.repeat(_PATH_COLOUR, len(at), axis=0), edges=edges)
     return [MAP, PATH]
-
-
-def raised(landmarks: MapEstimate) -> MapEstimate:
-    """Landmarks of the plane at height 0, with no spread above it."""
-    more = (0, 3 - landmarks.mean.shape[1])
-    mean, cov = np.pad(landmarks.mean, ((0, 0), more)), np.pad(landmarks.cov, ((0, 0), more, more))
-    return replace(landmarks, mean=mean, cov=cov)
 
 
 def standard_deviations(cov: Array) -> Array:

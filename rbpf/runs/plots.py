@@ -54,12 +54,10 @@ _NOT_COUNTS = {
 
 def draw_run(found: RunFolder) -> list[str]:
     """Draws all figures of a run into its folder; returns their file names."""
-    figures = {}
-    for name, draw in FIGURES.items():
-        figure = draw(found)
-        if figure is not None:
-            figures["ess.png" if name == "tracking.png" and found.system == "range-bearing" else name] = figure
-    return save_figures(figures, found.folder)
+    drawn = {name: draw(found) for name, draw in FIGURES.items()}
+    if found.system == "range-bearing":
+        drawn["ess.png"] = drawn.pop("tracking.png")
+    return save_figures({name: figure for name, figure in drawn.items() if figure is not None}, found.folder)
 
 
 def path_figure(found: RunFolder) -> Any:
@@ -407,11 +405,13 @@ def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
     return list(figures)
 
 
-def new_axes(title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True) -> tuple[Any, Any]:
+def new_axes(
+    title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, height: float = 6.0
+) -> tuple[Any, Any]:
     """A figure of one pair of axes, by default of equal scale."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 6.0))
+    figure = Figure(figsize=(7.0, height), layout="constrained")
     axes = figure.subplots()
     label(axes, title, xlabel, ylabel, equal)
     return figure, axes

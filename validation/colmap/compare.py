@@ -143,10 +143,8 @@ def compare_with_path(
     return ColmapComparison(found, errors, move, cloud, extent)
 
 
-def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> ColmapComparison:
-    """COLMAP beside the truth, interpolated at the key frames; an InputError where there is none, or too little."""
-    if truth is None:
-        raise InputError(f"{found.name} has no ground truth to compare with; compare with a run's path instead.")
+def compare_with_truth(found: Reconstruction, truth: CameraTruth) -> ColmapComparison:
+    """COLMAP beside the truth, interpolated at the key frames; an InputError where there is too little."""
     rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, found.stamps_ns)
     if len(rows) < LEAST_FRAMES:
         raise InputError(

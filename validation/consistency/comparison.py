@@ -20,6 +20,7 @@ The second follows from the statistics of `rbpf.validation.consistency.statistic
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -109,10 +110,8 @@ def compare_with_itself(record: RunFolder) -> Comparison:
     if not {"nis", "nis_dof"} <= table.keys():
         raise InputError(f"{record.folder / 'diagnostics.csv'} has no columns nis and nis_dof")
     correction, cov = np.zeros((0, 0)), np.zeros((0, 0, 0))
-    try:
+    with suppress(InputError):  # a folder of another version has no such file; whoever needs the poses says so
         correction, cov = record.corrections
-    except InputError:
-        pass  # a folder of another version has no such file; whoever needs the poses says so
     statistics = innovation_statistics(table["nis"], table["nis_dof"], correction, cov)
     figures = {statistic.name: statistic.value for statistic in statistics if np.isfinite(statistic.value)}
     return Comparison("itself", "", figures, statistics)

@@ -130,7 +130,7 @@ def solve_problem(
 def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> dict[str, float]:
     """How well an estimate's own poses and landmarks explain the observations of the named landmarks.
 
-    Σ log N(z − h(x̂, m̂); 0, R) [nats], the root of the mean square whitened residual per measured number, and how many took part.
+    Σ log N(z − h(x̂, m̂); 0, R) [nats], root mean square of a whitened residual per measured number, number of observations.
     """
     places = estimate.landmarks.named()
     if isinstance(problem, FeatureLog):

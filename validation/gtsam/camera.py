@@ -75,7 +75,7 @@ def solve_features(
         marginals: compute covariances.
         on_iteration: given the error before each iteration, also of adjustments on the way to an initial estimate;
             what it raises ends it all.
-        tolerance: fraction of the error that is no gain any more; by default far landmarks creep through hundreds of iterations.
+        tolerance: fraction of the error that is no gain any more; at the default far landmarks creep for long.
 
     Raises:
         InputError: a number makes no sense, the first frame sees too few known points and there is no initial

@@ -8,7 +8,7 @@ import numpy as np
 
 from rbpf.core.diagnostics import chi_square_band, chi_square_quantile
 from rbpf.runs import plots
-from rbpf.runs.plots import COLOURS, SIGMAS, Views, World, label, moved_map, new_axes, outline, save_figures
+from rbpf.runs.plots import COLOURS, SIGMAS, Views, World, close_up, moved_map, new_axes, outline, save_figures
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
@@ -24,7 +24,7 @@ _LOWEST = 0.01
 def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
     """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
     rows, name, white = errors.truth.rows, record.name, errors.whitened
-    world = plots.World.of(record)
+    world = World.of(record)
     known, dim = white.ranks > 0, white.errors.shape[1]
     figures = {
         "groundtruth_path.png": plots.path_figure(record),
@@ -39,7 +39,7 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
         true = np.pad(found.truth, ((0, 0), (0, 3 - found.truth.shape[1])))
         title = f"{name}: map over the truth, in {world.name}"
         figures["groundtruth_map.png"] = map_figure(title, ours, mean, cov, {"truth": true}, wide_axes(ours[rows]))
-    return plots.save_figures(figures, record.folder)
+    return save_figures(figures, record.folder)
 
 
 def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = None) -> list[str]:
@@ -52,11 +52,10 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
     motions = {which: world.motion(path) for which, path in both.items()}
     paths = {which: motions[which].transform(path.positions) for which, path in both.items()}
     plane = wide_axes(paths["batch"])
-    figure, axes = _axes(7.0, 6.0)
+    figure, axes = in_plane(f"{name}: paths in {world.name}", plane)
     for which, at in paths.items():
         axes.plot(*at[:, plane].T, "-", color=COLOURS[which], lw=1.2, label=which)
         axes.plot(*at[0, plane], "o", color=COLOURS[which], ms=4)
-    label(axes, f"{name}: paths in {world.name}", f"{'xyz'[plane[0]]} [m]", f"{'xyz'[plane[1]]} [m]", equal=True)
     axes.legend(fontsize="small")
     figures = {"gtsam_path.png": figure}
     cov, cov_batch, delta = found.pose_errors()
@@ -111,22 +110,18 @@ def wide_axes(positions: np.ndarray) -> list[int]:
     return sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
 
 
-def _axes(width: float, height: float) -> tuple[Any, Any]:
-    """A figure of one pair of axes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots()
+def in_plane(title: str, plane: list[int]) -> tuple[Any, Any]:
+    """A figure of one pair of axes for two of the world's."""
+    return new_axes(title, f"{'xyz'[plane[1]]} [m]", f"{'xyz'[plane[0]]} [m]")
 
 
 def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any:
     """Normalised squared errors (R,) of one run over the steps, with the band of an honest filter."""
-    (figure, axes), band = _axes(9.0, 4.0), chi_square_band(dim)
+    (figure, axes), band = new_axes(title, "NEES", "step", equal=False, height=4.0), chi_square_band(dim)
     axes.axhspan(band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
     axes.axhline(band.expected, color="tab:green", lw=0.8, label=f"its mean, {dim}")
     shown = np.maximum(nees, _LOWEST * band.low)
     axes.plot(rows, shown, color=COLOURS["filter"], lw=1.0, label="NEES of the pose")
-    label(axes, title, "step", "NEES", equal=False)
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.8 * min(float(shown.min(initial=band.low)), 0.5 * band.low))
     axes.legend(fontsize="small")
@@ -135,12 +130,11 @@ def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any
 
 def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
     """Distances of landmarks (M,) in σ, in order, beside those that an honest filter's would have."""
-    (figure, axes), count = _axes(7.0, 5.0), squares.size
-    places = np.arange(1, count + 1)
-    right = np.sqrt(chi_square_quantile((places - 0.5) / count, dim))
+    figure, axes = new_axes(title, "distance [σ of the filter]", "landmark", equal=False)
+    places = np.arange(1, squares.size + 1)
+    right = np.sqrt(chi_square_quantile((places - 0.5) / squares.size, dim))
     axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
     axes.plot(places, right, color="tab:green", lw=1.0, label="independent landmarks of an honest filter")
-    label(axes, title, "landmark", "distance [σ of the filter]", equal=False)
     axes.set_ylim(bottom=0.0)
     axes.legend(fontsize="small")
     return figure
@@ -150,19 +144,14 @@ def map_figure(
     title: str, path: np.ndarray, mean: np.ndarray, cov: np.ndarray, other: Mapping[str, np.ndarray], plane: list[int]
 ) -> Any:
     """A map's points (M, 3) with ellipses from (M, 3, 3), over others' by name, in a plane of the world."""
-    figure, axes = _axes(7.0, 6.0)
+    figure, axes = in_plane(title, plane)
     axes.plot(*path[:, plane].T, color=COLOURS["filter"], lw=0.8, alpha=0.6, label="path of the filter")
     for name, points in other.items():
         axes.plot(*points[:, plane].T, "+", color=COLOURS[name], ms=7, label=f"landmarks: {name}")
     axes.plot(*mean[:, plane].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
     ellipses = outline(mean[:, plane], cov[:, plane][:, :, plane])
     axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color=COLOURS["map"], lw=0.7)
-    label(axes, title, f"{'xyz'[plane[0]]} [m]", f"{'xyz'[plane[1]]} [m]", equal=True)
-    shown = np.concatenate([path, *other.values(), mean])[:, plane]
-    low, high = np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0)
-    middle, half = 0.5 * (low + high), 0.65 * max(float((high - low).max()), 1e-3)
-    axes.set_xlim(middle[0] - half, middle[0] + half)
-    axes.set_ylim(middle[1] - half, middle[1] + half)
-    axes.set_aspect("equal", adjustable="box")
+    shown = np.concatenate([path, *other.values(), mean])
+    close_up(axes, plane, np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0))
     axes.legend(fontsize="small")
     return figure

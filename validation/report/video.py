@@ -349,12 +349,13 @@ def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
 
 
 def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
-    """A map's 3σ ellipsoids, with the landmarks' names."""
-    values, vectors = np.linalg.eigh(landmarks.cov)
+    """A map's 3σ ellipsoids, with the landmarks' names; those of the plane lie at z = 0."""
+    mean, cov = landmarks.in_space()
+    values, vectors = np.linalg.eigh(cov)
     turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, landmarks.mean[..., None]], axis=-1)
+    poses = np.concatenate([turned, mean[..., None]], axis=-1)
     return rr.Ellipsoids3D(
-        centers=landmarks.mean,
+        centers=mean,
         half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
         quaternions=SE3.from_matrix(poses)[:, :4],
         labels=[str(name) for name in landmarks.ids],
