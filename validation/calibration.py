@@ -21,8 +21,8 @@ from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
 from rbpf.sensors.readers.images.video import read_uncalibrated
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
+#: Images that are looked at, and views that take part; more change nothing but the time.
 MOST_SHOTS, MOST_VIEWS = 150, 40
-"""Images that are looked at, and views that take part; more change nothing but the time."""
 _INTRINSICS = "fx", "fy", "cx", "cy"
 
 

@@ -39,8 +39,8 @@ _log = logging.getLogger(__name__)
 
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 
+#: Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing.
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
-"""Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing."""
 _STOPS = np.array([[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float)
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
 _BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
@@ -106,6 +106,7 @@ def _rerun(run: Path, estimate: PathAndMap, out: Path) -> list[str]:
     return ["run.rrd"]
 
 
+#: How each is written; the names of the files are returned.
 FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[str]]] = {
     "tum": _tum,
     "kitti": _kitti,
@@ -114,7 +115,6 @@ FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[str]]] = {
     "rerun": _rerun,
     "npz": _npz,
 }
-"""How each is written; the names of the files are returned."""
 
 
 def export_colmap(

@@ -23,9 +23,9 @@ from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks,
 from rbpf.validation.report.validate import COMPARISONS, VIDEO, compare_gtsam, validate, write_report
 from rbpf.validation.report.video import PICTURES, write_annotated, write_rerun
 
+#: Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
+#: who asks for it.
 MOST = 300_000
-"""Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
-who asks for it."""
 
 
 def finish_run(

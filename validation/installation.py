@@ -97,6 +97,7 @@ def _ffmpeg(imageio_ffmpeg: Any) -> str:
     return path
 
 
+#: What it does, the extra that it comes with, module and distribution, and how it is tried once it is loaded.
 _PROBES: tuple[tuple[str, str, str, str, Callable[[Any], str | None]], ...] = (
     ("compiled kernels", "", "numba", "numba", _compiler),
     ("images and video", "", "cv2", "opencv-python-headless", _images),
@@ -108,4 +109,3 @@ _PROBES: tuple[tuple[str, str, str, str, Callable[[Any], str | None]], ...] = (
     ("ROS bags", "bags", "rosbags.rosbag2", "rosbags", lambda _: None),
     ("sweeps on a cluster", "cluster", "distributed", "Dask", lambda _: None),
 )
-"""What it does, the extra that it comes with, module and distribution, and how it is tried once it is loaded."""

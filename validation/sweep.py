@@ -47,8 +47,7 @@ from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate, scor
 
 ROWS = "rows.jsonl"
 TABLE = "table.csv"
-SECONDS = 20
-"""That a scheduler may take to answer."""
+SECONDS = 20  #: That a scheduler may take to answer.
 MOST_RUNS = 100_000
 
 Value = str | int | float | bool | None
@@ -64,13 +63,13 @@ class SweepSystem:
     fields: tuple[str, ...] = ("recording",)  #: of a sequence, each a path; the first is the recording itself.
 
 
+#: By their names.
 SYSTEMS = {
     "range-bearing": SweepSystem(RangeBearingConfig, recordings.RobotRecording),
     "laser": SweepSystem(LaserConfig, recordings.LaserRecording),
     "mono": SweepSystem(MonoConfig, recordings.MonoRecording, ("recording", "known_points", "calibration")),
     "stereo": SweepSystem(StereoConfig, recordings.StereoRecording, ("recording", "calibration")),
 }
-"""By their names."""
 
 
 @dataclass(frozen=True)

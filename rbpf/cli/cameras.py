@@ -10,8 +10,8 @@ from rbpf.cli.options import Printed
 from rbpf.cli.showing import answer, progress, say
 from rbpf.ranges import Positive
 
+#: Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends.
 LOOSE = 0.01
-"""Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends."""
 
 
 @dataclass(frozen=True, kw_only=True)

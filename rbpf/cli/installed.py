@@ -55,11 +55,11 @@ class Doctor(Printed):
             raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
 
 
+#: The last line for zsh is one for a file in its `fpath`; evaluated, it would complete nothing.
 _ZSH = (
     '\n_tyro_rbpf "$@"\n',
     '\nif [ "$funcstack[1]" = "_rbpf" ]; then _tyro_rbpf "$@"; else compdef _tyro_rbpf rbpf; fi\n',
 )
-"""The last line for zsh is one for a file in its `fpath`; evaluated, it would complete nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)

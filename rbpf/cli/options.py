@@ -22,8 +22,7 @@ RealPositive = Annotated[Real, Range(gt=0.0)]
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Where = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 
-MOST_PX = 1 << 15
-"""Of a side of an image."""
+MOST_PX = 1 << 15  #: Of a side of an image.
 
 
 @dataclass(frozen=True, kw_only=True)

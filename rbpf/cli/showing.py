@@ -13,8 +13,8 @@ from rbpf.errors import printable
 
 CONSOLE = Console(stderr=True)
 
+#: Called with how many are done, and of how many; None where that is not known.
 OnProgress = Callable[[int, int | None], None]
-"""Called with how many are done, and of how many; None where that is not known."""
 
 
 @contextmanager

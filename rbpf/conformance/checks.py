@@ -35,19 +35,14 @@ from rbpf.lie import LieGroup
 
 KERNEL_IDS = (-1, 0, 1, 2)
 MASS_TOLERANCE = 5e-3
-FAR = 1000.0
-"""Standard deviations up to which a density is integrated; out there only a uniform floor is left of it."""
-ESTIMATE_STD = 0.1
-"""Of random estimates of landmarks, in the parametrisation's units."""
+FAR = 1000.0  #: Standard deviations up to which a density is integrated; out there only a uniform floor is left of it.
+ESTIMATE_STD = 0.1  #: Of random estimates of landmarks, in the parametrisation's units.
 JACOBIAN_TOLERANCE = 1e-5
 KERNEL_TOLERANCE = 1e-9
 ROUND_TRIP_TOLERANCE = 1e-7
-TURN_STEPS = 720
-"""Steps in which a state is turned once around, to come upon the cut of an angle."""
-STD = 1e-3
-"""Of the measurement noise that first estimates are made with, in the measurement's units."""
-GUARD = 64 * BLOCK
-"""Numbers in front of and behind each output of a kernel, which it must leave alone."""
+TURN_STEPS = 720  #: Steps in which a state is turned once around, to come upon the cut of an angle.
+STD = 1e-3  #: Of the measurement noise that first estimates are made with, in the measurement's units.
+GUARD = 64 * BLOCK  #: Numbers in front of and behind each output of a kernel, which it must leave alone.
 _MARK = 1.5e300
 _OUTPUTS = ("nu", "jac_state", "jac_landmark")
 

@@ -11,10 +11,8 @@ from rbpf.errors import InputError
 from rbpf.lie import LieGroup, Product, SE2Group, SE3Group
 
 PARTICLES, LANDMARKS = 5, 4
-CANDIDATES = 400
-"""Random landmarks per particle, of which the first visible ones are taken."""
-SPREAD = 5.0
-"""Standard deviation of random landmarks, in their own units."""
+CANDIDATES = 400  #: Random landmarks per particle, of which the first visible ones are taken.
+SPREAD = 5.0  #: Standard deviation of random landmarks, in their own units.
 
 
 @dataclass(frozen=True)

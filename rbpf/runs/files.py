@@ -16,10 +16,8 @@ from rbpf.errors import InputError
 
 CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajectory.npz", "map.npz"
 POSTERIOR, GRID = "posterior.npz", "grid.npz"
-LOCK = ".lock"
-"""In a run's folder while somebody writes there; with the number of that process."""
-VERSION = 1
-"""Of trajectory.npz."""
+LOCK = ".lock"  #: In a run's folder while somebody writes there; with the number of that process.
+VERSION = 1  #: Of trajectory.npz.
 
 
 @contextmanager

@@ -51,11 +51,11 @@ from rbpf.runs.truth import write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 
+#: Bytes of grid.pgm: where something is, where beams have passed, where nothing is known.
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-"""Bytes of grid.pgm: where something is, where beams have passed, where nothing is known."""
 
+#: A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth.
 STILL = 0.01
-"""A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth."""
 
 
 def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:

@@ -16,14 +16,14 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, Column, Ragged, System, Tracked, TrackingState
 
+#: Columns of every system; times are written in milliseconds.
 COMMON = (
     Column("seconds", "time that the system took, without reading and decoding", "s", table=TIMINGS),
     Column("state", "state of tracking, as its place in `TrackingState`", kind=int),
 )
-"""Columns of every system; times are written in milliseconds."""
 
+#: Likewise; written where a system has a name for it (`System.waiting`).
 WAITING = Column("seconds_waiting", "time until the frame was read and decoded", "s")
-"""Likewise; written where a system has a name for it (`System.waiting`)."""
 
 _STATES = list(TrackingState)
 

@@ -62,8 +62,7 @@ ODOMETRY = "observations_odometry.csv"
 FRAMES = "observations_frames.csv"
 KNOWN = "observations_known_points.csv"
 
-PLAIN = "radial-tangential"
-"""The lens that is meant where none is named."""
+PLAIN = "radial-tangential"  #: The lens that is meant where none is named.
 
 _TITLES = {
     OBSERVATIONS: "rbpf observations 1",

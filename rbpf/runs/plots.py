@@ -37,19 +37,18 @@ COLOURS = {
     "known": "tab:green",
 }
 
+#: The map's picture holds the path and this fraction of the points; single points far off do not make it small.
 MAP_FRACTION = 0.9
-"""The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
 
-CAMERA_HZ = 30.0
-"""What a camera's frames are to keep up with."""
+CAMERA_HZ = 30.0  #: What a camera's frames are to keep up with.
 
+#: Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera.
 _UPRIGHT = 0.05
-"""Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera."""
 
+#: Columns of diagnostics.csv that are no curve of the picture's first row: all others are.
 _NOT_COUNTS = {
     "step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof", "lost", "updated", "assumed",
 }  # fmt: skip
-"""Columns of diagnostics.csv that are no curve of the picture's first row: all others are."""
 
 
 def draw_run(found: RunFolder) -> list[str]:

@@ -33,8 +33,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 
-MOST_BYTES = 1 << 30
-"""No file of a run folder is larger."""
+MOST_BYTES = 1 << 30  #: No file of a run folder is larger.
 
 _PATH = {"stamps_ns": integers("frames"), "mean": numbers("frames", "size"), "cov": numbers("frames", "dim", "dim")}
 _CORRECTIONS = {

@@ -36,8 +36,7 @@ from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
 
-Sources = dict[str, str | float | bool]
-"""What a run reads, by the name that it has in config.yaml."""
+Sources = dict[str, str | float | bool]  #: What a run reads, by the name that it has in config.yaml.
 
 
 class Opened(NamedTuple):

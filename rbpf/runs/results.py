@@ -12,10 +12,10 @@ from rbpf.errors import InputError
 from rbpf.runs.plots import map_figure
 from rbpf.runs.reading import RunFolder
 
+#: Entries of summary.json that stand for a run in a notebook.
 _SHOWN = (
     "frames", "particles", "ate_rmse_m", "path_rmse_m", "ate_sim3_rmse_m", "filter_minus_batch_rmse_m", "ms_per_frame",
 )  # fmt: skip
-"""Entries of summary.json that stand for a run in a notebook."""
 
 
 @final

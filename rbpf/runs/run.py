@@ -37,8 +37,7 @@ class Source(Protocol):
 
 
 SystemT = TypeVar("SystemT", bound=System)
-_BEGUN = "log/begun"
-"""Entry of a checkpoint: what the run was begun with."""
+_BEGUN = "log/begun"  #: Entry of a checkpoint: what the run was begun with.
 
 
 @dataclass(eq=False)

@@ -20,11 +20,10 @@ from rbpf.systems.system import Gauge
 
 TRUTH = "truth.npz"
 
+#: Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored.
 LONGEST_GAP_NS = 500_000_000
-"""Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored."""
 
-LEAST = 3
-"""Frames with a true pose that a comparison needs."""
+LEAST = 3  #: Frames with a true pose that a comparison needs.
 
 _TRUTH = {
     "rows": integers("rows", least=0, below="steps"),

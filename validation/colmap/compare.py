@@ -27,10 +27,8 @@ from rbpf.validation.colmap.model import OVER_IMAGES, recorded_images
 from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction, ReconstructionOptions, reconstruct
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
-NEIGHBOURS = 6
-"""Points of the cloud that a plane is laid through."""
-LEAST_POINTS = 3
-"""Of a cloud, for a plane."""
+NEIGHBOURS = 6  #: Points of the cloud that a plane is laid through.
+LEAST_POINTS = 3  #: Of a cloud, for a plane.
 
 
 @final

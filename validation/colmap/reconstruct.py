@@ -23,10 +23,8 @@ from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.readers.images.sequence import ImageSequence
 from rbpf.validation.colmap.model import from_colmap_pose, to_colmap_camera
 
-LEAST_FRAMES = 3
-"""Key frames; two have no third view that tells a wrong match."""
-OVERLAP = 10
-"""Each key frame is matched with so many that follow, and with those 2^i further on."""
+LEAST_FRAMES = 3  #: Key frames; two have no third view that tells a wrong match.
+OVERLAP = 10  #: Each key frame is matched with so many that follow, and with those 2^i further on.
 
 
 @final

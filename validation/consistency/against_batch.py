@@ -39,12 +39,9 @@ from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
 POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the batch optimum"
 
-LEAST_STEPS = 3
-"""Of a run that is compared."""
-DRAWS = 200
-"""Of paths and maps from a robot's batch posterior."""
-LEAST_COUNT = 0.1
-"""Fraction of them that has to count for the posterior to be a witness."""
+LEAST_STEPS = 3  #: Of a run that is compared.
+DRAWS = 200  #: Of paths and maps from a robot's batch posterior.
+LEAST_COUNT = 0.1  #: Fraction of them that has to count for the posterior to be a witness.
 SAME = "one world: nothing to fix"
 SCALED = "the filter scaled about the first camera onto the optimum; densities across the line from that camera"
 

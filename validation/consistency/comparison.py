@@ -34,8 +34,8 @@ from rbpf.validation.consistency.statistic import Statistic, motion_statistics, 
 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 
+#: By system, where its configuration holds the one standard deviation of all measurements, px.
 SETTINGS = {"mono": ("search", "noise_px")}
-"""By system, where its configuration holds the one standard deviation of all measurements, px."""
 _PREFIX = "validation_"
 
 
@@ -155,8 +155,8 @@ Leaning = Literal["over-confident", "cautious", ""]
 
 Grade = Literal["good", "fair", "poor", "not known"]
 
+#: Grades of a path, with the largest error as a fraction of its spread, and the largest fraction of lost frames.
 GRADES: tuple[tuple[Grade, float, float], ...] = (("good", 0.03, 0.05), ("fair", 0.1, 0.25))
-"""Grades of a path, with the largest error as a fraction of its spread, and the largest fraction of lost frames."""
 
 _LEANINGS: dict[Leaning, str] = {
     "over-confident": "it claims to know more than it does (over-confident); ",

@@ -34,10 +34,8 @@ from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
-NOISY = 3.0
-"""Spread s of log Ẑ over the seeds beyond which its law is not used."""
-CLEAR = 2.0
-"""A difference of this many of its errors is one."""
+NOISY = 3.0  #: Spread s of log Ẑ over the seeds beyond which its law is not used.
+CLEAR = 2.0  #: A difference of this many of its errors is one.
 Config = RangeBearingConfig | MonoConfig | StereoConfig
 Data = Path | RobotRecording | RobotLog | FeatureLog
 

@@ -29,21 +29,17 @@ from scipy.special import betaincinv, chdtr, ndtri
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.lie import LieGroup
 
-LEVEL = 0.95
-"""Of all intervals."""
+LEVEL = 0.95  #: Of all intervals.
+#: The standard deviations of poses and landmarks may be wrong by this: they rest on few independent samples.
 STATE_FACTOR = 2.0
-"""The standard deviations of poses and landmarks may be wrong by this: they rest on few independent samples."""
+#: Those of measurements and motions: they rest on thousands, and an error in them is repeated in every step.
 NOISE_FACTOR = 1.1
-"""Those of measurements and motions: they rest on thousands, and an error in them is repeated in every step."""
+#: A motion's bias per step may have this many of its standard deviations: over 16 steps it adds up to as much as the
+#: noise does.
 BIAS = 0.25
-"""A motion's bias per step may have this many of its standard deviations: over 16 steps it adds up to as much as the
-noise does."""
-INFORMED = 0.05
-"""A direction of the motion that the observations inform by less than this fraction is left out."""
-PROBABILITIES = 0.5, 0.9, 0.95
-"""Of credible regions."""
-_NOTHING = 1e-12
-"""Variances below this fraction of the largest, or of one, are none."""
+INFORMED = 0.05  #: A direction of the motion that the observations inform by less than this fraction is left out.
+PROBABILITIES = 0.5, 0.9, 0.95  #: Of credible regions.
+_NOTHING = 1e-12  #: Variances below this fraction of the largest, or of one, are none.
 
 
 @dataclass(frozen=True)

@@ -30,19 +30,16 @@ from rbpf.validation.metrics.gaussian_differences import mahalanobis
 Problem = Measurements | FeatureLog
 
 OnIteration = Callable[[int, float], None]
-LEAST = 4
-"""Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
+LEAST = 4  #: Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses.
+#: Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long.
 EXACT = 1e-4
-"""Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long."""
+#: Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work
+#: is counted and not the time, so that a result does not depend on what else the machine does.
 WORK = 30_000_000
-"""Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work is
-counted and not the time, so that a result does not depend on what else the machine does."""
-LEAST_ITERATIONS = 100
-"""That are allowed however many observations there are."""
+LEAST_ITERATIONS = 100  #: That are allowed however many observations there are.
+#: Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre.
 STEREO_TOLERANCE = 1e-6
-"""Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre."""
-AFAR = 300
-"""Steps from which on a robot's batch is begun incrementally."""
+AFAR = 300  #: Steps from which on a robot's batch is begun incrementally.
 
 
 @final

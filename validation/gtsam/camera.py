@@ -24,32 +24,22 @@ from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam import observations, solvers
 from rbpf.validation.gtsam.camera_graph import FINE, CameraProblem, CameraState, adjust, covariances
 
-LEAST = 3
-"""Landmarks that fix a pose, and points that fix a frame."""
-LINE = 1e-3
-"""Known points whose spread across a line is below this fraction of that along it lie on it."""
-KNOWN = 4
-"""Known points that the first frame has to see."""
-PLACED = 5.0
-"""A landmark is placed once its inverse distance differs from zero by so many standard deviations."""
+LEAST = 3  #: Landmarks that fix a pose, and points that fix a frame.
+LINE = 1e-3  #: Known points whose spread across a line is below this fraction of that along it lie on it.
+KNOWN = 4  #: Known points that the first frame has to see.
+PLACED = 5.0  #: A landmark is placed once its inverse distance differs from zero by so many standard deviations.
+#: Nor is it placed nearer than this fraction of the usual distance: near cameras that rest a point fits anything.
 NEAREST = 0.2
-"""Nor is it placed nearer than this fraction of the usual distance: near cameras that rest a point fits anything."""
-CAP = 4.5
-"""What one observation of a single camera says for it at most, as a loss: one outlier must not do."""
-GROWTH = 1.2
-"""All is adjusted whenever the number of frames has grown by this factor."""
-SETTLED = 30
-"""A landmark seen more often moves only when all is adjusted."""
-LOST = 10
-"""As many frames in a row without three placed landmarks are the end."""
-OUTLIER = 5.0
-"""An observation farther off takes no part in a frame's pose, in standard deviations."""
+CAP = 4.5  #: What one observation of a single camera says for it at most, as a loss: one outlier must not do.
+GROWTH = 1.2  #: All is adjusted whenever the number of frames has grown by this factor.
+SETTLED = 30  #: A landmark seen more often moves only when all is adjusted.
+LOST = 10  #: As many frames in a row without three placed landmarks are the end.
+OUTLIER = 5.0  #: An observation farther off takes no part in a frame's pose, in standard deviations.
 _EARLIEST = 8
 _MOTION = 0.1  # of a frame: rad, and metres per metre of distance to what is seen
 _FOUND = 1e-6  # fraction of the error that is no gain any more
 
-Known = dict[int, tuple[Array, Array]]
-"""Position (3,) and covariance (3, 3) by name."""
+Known = dict[int, tuple[Array, Array]]  #: Position (3,) and covariance (3, 3) by name.
 
 
 def solve_features(

@@ -31,10 +31,8 @@ SCALE, SOFT_SCALE = 1e-6, 1e-3
 
 Nothing else speaks of the scale, but a hard one could only be followed along a curve.
 """
-FINE = 1e-9
-"""A gain of this fraction of the error is none; landmarks without much parallax would creep on for ever."""
-WEAK = 0.25
-"""Standard deviation of an undetermined landmark's prior, as a fraction of its distance."""
+FINE = 1e-9  #: A gain of this fraction of the error is none; landmarks without much parallax would creep on for ever.
+WEAK = 0.25  #: Standard deviation of an undetermined landmark's prior, as a fraction of its distance.
 _ROUNDS = 10
 _FEW = 8
 

@@ -19,16 +19,11 @@ from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 
 Index = NDArray[np.intp]
 
-Residuals = tuple[Array, list[Array]]
-"""Residuals (K, p), and their Jacobians (K, p, d) by each variable."""
-SINGULAR = 1e-12
-"""An eigenvalue of a covariance below this fraction of the largest counts as zero."""
-HUBER = 1.345
-"""Threshold of the loss where outliers must not do harm, in standard deviations."""
-LOOSE = 0.25
-"""A landmark whose distance is uncertain by more than this fraction counts as undetermined."""
-COLLAPSED = 0.02
-"""Depth, as a fraction of the usual distance of a landmark, of one that has run into its camera."""
+Residuals = tuple[Array, list[Array]]  #: Residuals (K, p), and their Jacobians (K, p, d) by each variable.
+SINGULAR = 1e-12  #: An eigenvalue of a covariance below this fraction of the largest counts as zero.
+HUBER = 1.345  #: Threshold of the loss where outliers must not do harm, in standard deviations.
+LOOSE = 0.25  #: A landmark whose distance is uncertain by more than this fraction counts as undetermined.
+COLLAPSED = 0.02  #: Depth, as a fraction of the usual distance of a landmark, of one that has run into its camera.
 _ROUNDS = 6
 _FAR = 1e4
 _REACHES = np.geomspace(0.2, 50.0, 40)

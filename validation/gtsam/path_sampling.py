@@ -35,10 +35,9 @@ from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.validation.gtsam.robot import Problem
 
 DRAWS = 400
+#: Root mean square over the draws of what is not linear in a motion's whitened noise, from which on it is drawn itself.
 BENT = 0.1
-"""Root mean square over the draws of what is not linear in a motion's whitened noise, from which on it is drawn itself."""
-_BLOCK = 300_000
-"""Observations that are predicted at once."""
+_BLOCK = 300_000  #: Observations that are predicted at once.
 
 
 @final

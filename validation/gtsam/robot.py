@@ -27,12 +27,9 @@ from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, ini
 from rbpf.validation.gtsam import solvers
 from rbpf.validation.gtsam.observations import SINGULAR
 
-SOFT = 0.1
-"""Standard deviation of a softened constraint as a fraction of the step's largest."""
-CHUNK = 50
-"""Steps that an incremental start adds at once."""
-MOVED = 1e-3
-"""How far a variable may be from where `solve_online` linearised it [rad, m]."""
+SOFT = 0.1  #: Standard deviation of a softened constraint as a fraction of the step's largest.
+CHUNK = 50  #: Steps that an incremental start adds at once.
+MOVED = 1e-3  #: How far a variable may be from where `solve_online` linearised it [rad, m].
 ADVICE = "check the covariances there"
 _PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
 

@@ -24,10 +24,8 @@ from rbpf.validation.gtsam.camera_graph import FINE, SCALE, CameraProblem, adjus
 from rbpf.validation.gtsam.observations import HUBER, Residuals, known_by_name, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
 
-ITERATIONS = 200
-"""Most of the adjustment."""
-_STEP = 1e-6
-"""Of focal length and k1, for the residuals' derivatives by them."""
+ITERATIONS = 200  #: Most of the adjustment.
+_STEP = 1e-6  #: Of focal length and k1, for the residuals' derivatives by them.
 OnRound = Callable[[int, int], None]
 
 

@@ -15,10 +15,10 @@ from rbpf.lie import SE3, Array
 from rbpf.runs.reading import PathAndMap
 from rbpf.systems.map_estimate import MapEstimate
 
+#: What is told of each pair of Gaussians.
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
-"""What is told of each pair of Gaussians."""
+#: A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none.
 _TINY = 1e-9
-"""A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none."""
 
 
 def mahalanobis(delta: Array, cov: Array) -> Array:

@@ -24,11 +24,11 @@ from rbpf.runs.trajectory import MAX_DIFFERENCE_NS, Trajectory
 from rbpf.sensors.readers.text import parse_time, read_columns
 from rbpf.validation.metrics.scores import ODOMETRY
 
+#: Times (R, 2) of both ends, and poses (R, 7) at the second time, seen from that at the first.
 Relations = tuple[NDArray[np.int64], Array]
-"""Times (R, 2) of both ends, and poses (R, 7) at the second time, seen from that at the first."""
 _COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
+#: Files of a run's paths, by prefix: "" of the filter, "final_" of its last particles, "odometry_" without it.
 PATHS = {"": "trajectory.tum", "final_": "posterior.tum", "odometry_": ODOMETRY}
-"""Files of a run's paths, by prefix: "" of the filter, "final_" of its last particles, "odometry_" without it."""
 
 
 @dataclass(frozen=True)

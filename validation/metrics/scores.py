@@ -19,8 +19,8 @@ from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
 BATCH, ODOMETRY = "batch.tum", "odometry.tum"
 
+#: How the figures of the odometry alone begin, by system; otherwise with `odometry_`.
 ODOMETRY_PREFIX = {"stereo": "vo_"}
-"""How the figures of the odometry alone begin, by system; otherwise with `odometry_`."""
 
 
 def absolute_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
@@ -46,11 +46,11 @@ def relative_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth
     }
 
 
+#: Figures of merit of a path: the estimate and the truth at the same frames, and how they are brought together.
 MERITS: tuple[Callable[[Trajectory, Trajectory, RunTruth], Mapping[str, float]], ...] = (
     absolute_errors,
     relative_errors,
 )
-"""Figures of merit of a path: the estimate and the truth at the same frames, and how they are brought together."""
 
 
 def score_run(found: RunFolder) -> dict[str, Any]:

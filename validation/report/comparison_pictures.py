@@ -15,10 +15,8 @@ from rbpf.validation.consistency.against_batch import AgainstBatch
 from rbpf.validation.consistency.against_groundtruth import TruthErrors
 from rbpf.validation.consistency.statistic import inverse_roots
 
-CLOSE = 0.95
-"""A map's picture holds this fraction of its landmarks; single ones far off do not make it small."""
-_LOWEST = 0.01
-"""NEES below this fraction of the band are drawn there."""
+CLOSE = 0.95  #: A map's picture holds this fraction of its landmarks; single ones far off do not make it small.
+_LOWEST = 0.01  #: NEES below this fraction of the band are drawn there.
 
 
 def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:

@@ -39,12 +39,11 @@ if TYPE_CHECKING:
 PAGE = "report.html"
 VIDEO = "annotated.mp4"
 
+#: Pictures of a comparison that show what one of the run's own does.
 _SAME = {"groundtruth_path.png": "path.png", "groundtruth_error.png": "error.png"}
-"""Pictures of a comparison that show what one of the run's own does."""
+#: Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do.
 KEY_FRAMES = 60
-"""Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do."""
-Compare = Callable[[RunFolder], Comparison]
-"""With pictures in the run's folder."""
+Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folder.
 
 
 def _groundtruth(record: RunFolder) -> Comparison:
@@ -111,14 +110,14 @@ def _path(record: RunFolder, file: Path) -> Comparison:
 
 
 ANY = "*"
+#: By what a run is compared with, then by the run's system.
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "groundtruth": {ANY: _groundtruth},
     "gtsam": dict.fromkeys(("range-bearing", "mono", "stereo"), compare_gtsam),
     "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
-"""By what a run is compared with, then by the run's system."""
+#: By what a file holds that a run of any system is compared with.
 WITH_A_FILE: dict[str, Callable[[RunFolder, Path], Comparison]] = {"relations": _relations, "path": _path}
-"""By what a file holds that a run of any system is compared with."""
 
 
 def validate(folder: Path, against: str, out: Path | None = None, file: Path | None = None) -> Verdict:

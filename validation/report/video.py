@@ -29,15 +29,13 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.landmarks import FeatureKind
 
 Colour = tuple[int, int, int]
-Place = Callable[[np.ndarray], list[tuple[float, float]]]
-"""Pixels (…, 2) of the image to points of the picture."""
+Place = Callable[[np.ndarray], list[tuple[float, float]]]  #: Pixels (…, 2) of the image to points of the picture.
 FOUND, MISSED, STARTED, TEXT = (60, 220, 60), (240, 60, 50), (90, 170, 255), (255, 255, 255)
 
-_SMALL_PX = 800
-"""Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing."""
+_SMALL_PX = 800  #: Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing.
 _ARM, _BAND = 4, 24
+#: Height of letters as a fraction of the drawn width, and its bounds, px.
 _LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
-"""Height of letters as a fraction of the drawn width, and its bounds, px."""
 
 
 def drawn_size(width: int, height: int) -> tuple[int, int]:
@@ -142,13 +140,13 @@ def _clipped(line: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return start + np.array([[enter], [max(enter, leave)]]) * step
 
 
+#: Names and colours of what a feature of a pair is to the map, in the order in which they are drawn.
 FEATURES: Mapping[FeatureKind, tuple[str, Colour]] = {
     FeatureKind.FEATURE: ("feature", (150, 150, 150)),
     FeatureKind.CANDIDATE: ("candidate", (255, 190, 40)),
     FeatureKind.LANDMARK: ("landmark", FOUND),
     FeatureKind.NEW: ("new", STARTED),
 }
-"""Names and colours of what a feature of a pair is to the map, in the order in which they are drawn."""
 
 
 def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
@@ -173,11 +171,11 @@ def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
     return annotate(frame.image, (camera.width, camera.height), (text, alarm), list(FEATURES.values()), paint)
 
 
+#: By the system's name, how a frame is drawn.
 PICTURES: dict[str, Callable[[Run, int, ImageFrame], np.ndarray]] = {
     "mono": picture_of_search,
     "stereo": picture_of_pair,
 }
-"""By the system's name, how a frame is drawn."""
 
 
 def annotated_frames(run: Run) -> Iterator[np.ndarray]:
@@ -193,10 +191,9 @@ def write_annotated(run: Run, path: Path, on_frame: Callable[[int, int], None] |
     write_video(chain([first], frames), first.shape[1::-1], run.log.stamps_ns, path, on_frame)
 
 
+#: Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps.
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
-"""Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""
-RATE_FACTOR = "23"
-"""Constant rate factor of H.264: 18 is nearly without loss, 28 poor."""
+RATE_FACTOR = "23"  #: Constant rate factor of H.264: 18 is nearly without loss, 28 poor.
 ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact"
 
 
@@ -261,12 +258,9 @@ def frame_rate(stamps_ns: np.ndarray) -> float:
     return round(1.0 / min(max(typical, SHORTEST_S), LONGEST_S), 3)
 
 
-JPEG_QUALITY = 75
-"""Of the JPEG images in the recording, in per cent."""
-AXIS_M = 0.1
-"""Length of the camera's drawn image plane from its centre."""
-NEAREST = 0.02
-"""Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m."""
+JPEG_QUALITY = 75  #: Of the JPEG images in the recording, in per cent.
+AXIS_M = 0.1  #: Length of the camera's drawn image plane from its centre.
+NEAREST = 0.02  #: Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m.
 
 
 def require_rerun() -> Any:
@@ -388,5 +382,5 @@ def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], po
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
 
 
+#: By the system's name, what logs what a frame showed, and which figures are plotted.
 DRAWN = {"mono": (_log_search, ("found", "lost")), "stereo": (_log_pair, ("features", "agreeing", "observed"))}
-"""By the system's name, what logs what a frame showed, and which figures are plotted."""

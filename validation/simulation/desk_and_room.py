@@ -10,9 +10,9 @@ from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.paths import HandHeld, Wave, eased, looking, shaken
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, apart, stamps_ns
 
-SHEET_M = 0.0001
-"""Sheets of paper lie this much above each other."""
+SHEET_M = 0.0001  #: Sheets of paper lie this much above each other.
 
+#: Size and print of what lies flat on a desk: pages, magazines, postcards, notes, cards, pencils.
 PAPERS = [
     ((0.21, 0.297), textures.page),
     ((0.30, 0.21), textures.picture),
@@ -21,18 +21,14 @@ PAPERS = [
     ((0.09, 0.055), textures.carton),
     ((0.15, 0.014), textures.carton),
 ]
-"""Size and print of what lies flat on a desk: pages, magazines, postcards, notes, cards, pencils."""
 
-DESK_M, HIGHEST_M = 0.75, 0.25
-"""Height of a desk, and of the highest thing on it."""
-BOOKS = 0.4
-"""Fraction of books among the things; the others are boxes."""
-COARSE = 4.0
-"""Texels of the walls round a desk are larger by this: they are farther away."""
+DESK_M, HIGHEST_M = 0.75, 0.25  #: Height of a desk, and of the highest thing on it.
+BOOKS = 0.4  #: Fraction of books among the things; the others are boxes.
+COARSE = 4.0  #: Texels of the walls round a desk are larger by this: they are farther away.
 OVER_DESK = HandHeld(nearest_m=0.8, farthest_m=1.3, elevation_deg=50.0, wander=0.25)
 
+#: Nothing stands nearer to a chessboard's corners than this: it is seen whole from where the camera starts.
 BOARD_CLEAR_M = 0.15
-"""Nothing stands nearer to a chessboard's corners than this: it is seen whole from where the camera starts."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +94,13 @@ class TexturedDesk(Ranged):
         return TexturedScene("desk", stamps_ns(self.frames, self.rate_hz), path, rectangles, board)
 
 
+#: Size of a room along x, y and z, pictures on each of its walls, and most boxes on its floor.
 ROOM_M, PICTURES, BOXES = (6.0, 5.0, 2.6), 5, 14
-"""Size of a room along x, y and z, pictures on each of its walls, and most boxes on its floor."""
+#: The circle that is walked in it, the camera's height, and how far it looks outwards from straight ahead, and down.
 RADIUS_M, EYE_M, GAZE_DEG, DROP_DEG = 1.0, 1.4, 60.0, 10.0
-"""The circle that is walked in it, the camera's height, and how far it looks outwards from straight ahead, and down."""
+#: The hand shakes at these frequencies, moves and turns the camera by so much per axis at most.
 SHAKE_HZ, SHAKE_M, SHAKE_DEG = (0.3, 1.5), 0.03, 3.0
-"""The hand shakes at these frequencies, moves and turns the camera by so much per axis at most."""
-ALONG_M = 0.7
-"""What stands along a room's walls stays within this distance of them."""
+ALONG_M = 0.7  #: What stands along a room's walls stays within this distance of them.
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,8 @@ from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene,
 
 DRIFT_HZ = 0.1, 0.5
 
-PROBES = 12, 16
-"""Rows and columns of pixels at which the motion during an exposure is measured."""
-MOST_RAYS = 8
-"""Along each side of a pixel: more than 64 px of motion during an exposure is rendered with gaps."""
+PROBES = 12, 16  #: Rows and columns of pixels at which the motion during an exposure is measured.
+MOST_RAYS = 8  #: Along each side of a pixel: more than 64 px of motion during an exposure is rendered with gaps.
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,8 @@ class Shutter:
         poses = scene.world_from_camera
         lapse = np.maximum(seconds[after] - seconds[before], np.finfo(float).tiny)[:, None]
         self._rates = SE3.local(poses[before], poses[after]) / lapse
+        #: (T, 3) of the camera in the world, m/s.
         self.velocities = (SE3.translation(poses[after]) - SE3.translation(poses[before])) / lapse
-        """(T, 3) of the camera in the world, m/s."""
         # Factors (H, W) that fall with the square of the distance from the principal point.
         at = np.indices((camera.height, camera.width))
         square = (at[1] - camera.cx) ** 2 + (at[0] - camera.cy) ** 2
@@ -139,18 +137,16 @@ class Shutter:
         return SE3.retract(middle, (2.0 * moment - 1.0)[:, None] * half)
 
 
+#: The corners keep this fraction of the image's size from its border: they stay in view when the camera begins to move.
 MIDDLE = 0.15
-"""The corners keep this fraction of the image's size from its border: they stay in view when the camera begins to move."""
-FLAT = 0.025
-"""All within this fraction of the image's width of a corner lies in one plane: its patch can be warped."""
+FLAT = 0.025  #: All within this fraction of the image's width of a corner lies in one plane: its patch can be warped.
+#: Sheets nearer to each other than this, with normals nearer than this [rad], lie in one plane.
 THICK_M, PARALLEL = 0.005, 0.01
-"""Sheets nearer to each other than this, with normals nearer than this [rad], lie in one plane."""
+#: Most corners to look for, and the least quality of one, as a fraction of the best (J. Shi, C. Tomasi 1994).
 CANDIDATES, QUALITY = 300, 0.01
-"""Most corners to look for, and the least quality of one, as a fraction of the best (J. Shi, C. Tomasi 1994)."""
-STRONGEST = 0.5
-"""Fraction of the corners found that are strong enough, if they are as many as asked for."""
+STRONGEST = 0.5  #: Fraction of the corners found that are strong enough, if they are as many as asked for.
+#: Corners are on a line if they extend, in the image, less than this fraction of their length to the side.
 LEAST_SPREAD = 0.05
-"""Corners are on a line if they extend, in the image, less than this fraction of their length to the side."""
 
 
 def known_corners(
@@ -206,10 +202,8 @@ def known_corners(
     return px, SE3.transform(pose, local)
 
 
-DEPTH_PER_M = 5000.0
-"""Of a depth image, as TUM's RGB-D recordings have it: out to 13 m."""
-COMPRESSION = 1
-"""Of PNG files, 0 to 9: noise does not become much smaller by trying harder."""
+DEPTH_PER_M = 5000.0  #: Of a depth image, as TUM's RGB-D recordings have it: out to 13 m.
+COMPRESSION = 1  #: Of PNG files, 0 to 9: noise does not become much smaller by trying harder.
 
 TRUTH_COLUMNS = [
     "#timestamp",

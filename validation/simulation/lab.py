@@ -21,23 +21,17 @@ from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdomet
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
 from rbpf.validation.simulation.textures import Paint
 
-SIZE_M = 18.0, 10.0, 2.8
-"""Of both rooms together."""
-PARTITION_M = 9.9, 10.1
-"""Where the wall between the rooms begins and ends along x."""
-DOOR_M, LINTEL_M = (4.2, 5.8), 2.1
-"""Where the door begins and ends along y, and its height."""
-JAMB_M = 0.3
-"""Nothing stands nearer to the door than this."""
+SIZE_M = 18.0, 10.0, 2.8  #: Of both rooms together.
+PARTITION_M = 9.9, 10.1  #: Where the wall between the rooms begins and ends along x.
+DOOR_M, LINTEL_M = (4.2, 5.8), 2.1  #: Where the door begins and ends along y, and its height.
+JAMB_M = 0.3  #: Nothing stands nearer to the door than this.
+#: The walls along y stay free so far from the rooms' corners, where the furniture of the others stands.
 CORNER_M = 0.95
-"""The walls along y stay free so far from the rooms' corners, where the furniture of the others stands."""
-BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0
-"""How the robot drives: see `Drive`."""
+BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0  #: How the robot drives: see `Drive`.
 TOUR_FRAMES, TURN_BACK_FRAMES = 4000, 600
 RATE_HZ = 15.0
 
-AWAY_DEG, AWAY_S = 140.0, 5.0
-"""The robot looks away by this angle and for this time."""
+AWAY_DEG, AWAY_S = 140.0, 5.0  #: The robot looks away by this angle and for this time.
 
 
 @dataclass(frozen=True)
@@ -90,17 +84,17 @@ def walls() -> list[Wall]:
     ]
 
 
+#: (2, 2, 2) where tables stand in the middle of the rooms, least and greatest x and y.
 ISLANDS = np.array([[[3.9, 3.8], [5.7, 6.2]], [[13.4, 4.0], [14.8, 6.0]]])
-"""(2, 2, 2) where tables stand in the middle of the rooms, least and greatest x and y."""
 
+#: Once round the first room, half a round again, through the door and round the second room, back through the door and
+#: half round the first room the other way.
 TOUR = [
     *[(2.0, 5.0), (2.0, 2.1), (7.6, 2.1), (7.6, 7.9), (2.0, 7.9)],
     *[(2.0, 5.0), (2.0, 2.1), (7.6, 2.1), (7.6, 5.0)],
     *[(12.2, 5.0), (12.2, 2.3), (16.0, 2.3), (16.0, 7.7), (12.2, 7.7), (12.2, 5.0)],
     *[(7.6, 5.0), (7.6, 2.1), (2.0, 2.1), (2.0, 5.0)],
 ]
-"""Once round the first room, half a round again, through the door and round the second room, back through the door and
-half round the first room the other way."""
 
 
 def tour() -> Drive:
@@ -118,16 +112,13 @@ def turn_back() -> Drive:
     return Drive(np.array([0.0, 1.6, 2.1]), moves, (TURN_BACK_FRAMES - 1) / RATE_HZ, ARM_M, RAMP_S)
 
 
-ABOVE_M = 0.9
-"""What hangs higher than this is seen from below as well."""
-TOUCHING_M = 0.002
-"""Faces nearer to a wall than this are not seen."""
+ABOVE_M = 0.9  #: What hangs higher than this is seen from below as well.
+TOUCHING_M = 0.002  #: Faces nearer to a wall than this are not seen.
+#: Thickness of a shelf's boards, of a table's top, of its legs, and of what things lean against.
 BOARD_M, TOP_M, LEG_M, BACK_M = 0.025, 0.04, 0.05, 0.01
-"""Thickness of a shelf's boards, of a table's top, of its legs, and of what things lean against."""
 TABLE_M = 0.74
 
-HANG_M = 0.01
-"""Posters are this far from what they hang on."""
+HANG_M = 0.01  #: Posters are this far from what they hang on.
 
 
 class Surface(NamedTuple):
@@ -218,8 +209,7 @@ def _along(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
         place, last = place + wide + lab.uniform(0.05, 0.5), kind
 
 
-WIDTHS_M = (0.9, 1.5), (1.2, 1.8), (0.6, 1.0), (0.5, 1.1)
-"""Of a shelf, a table, a cabinet, and a heap of cartons."""
+WIDTHS_M = (0.9, 1.5), (1.2, 1.8), (0.6, 1.0), (0.5, 1.1)  #: Of a shelf, a table, a cabinet, and a heap of cartons.
 
 
 def _shelf(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
@@ -323,9 +313,9 @@ def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
             lab.hang(side, place, 1.22, size)
 
 
+#: (7,) the left camera looks forwards, 1 m above the floor, from a little before and to the left of the wheels' middle;
+#: the robot's frame has x forwards, y to the left, z up, its origin between the wheels on the floor.
 ROBOT_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.06], [0.0, -1.0, 0.0, 1.0]]))
-"""(7,) the left camera looks forwards, 1 m above the floor, from a little before and to the left of the wheels' middle;
-the robot's frame has x forwards, y to the left, z up, its origin between the wheels on the floor."""
 
 
 @dataclass(frozen=True)
@@ -358,8 +348,8 @@ class LabDrive:
         return drive()(np.arange(self.images[-1] + 1) / RATE_HZ)
 
 
+#: A drive and its number of frames, by name.
 DRIVES = {"tour": (tour, TOUR_FRAMES), "turn_back": (turn_back, TURN_BACK_FRAMES)}
-"""A drive and its number of frames, by name."""
 
 
 def world_from_camera(world_from_robot: np.ndarray) -> np.ndarray:

@@ -17,10 +17,12 @@ from rbpf.runs.files import write_text
 from rbpf.runs.trajectory import Trajectory, write_tum
 from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners
 
+#: Corners of the walls around the corridor, counterclockwise [m].
 OUTER = ((0.0, 0.0), (16.0, 0.0), (16.0, 12.0), (0.0, 12.0))
-"""Corners of the walls around the corridor, counterclockwise [m]."""
+#: Corners of the block that it leads round, clockwise: the corridor is on the left of both.
 INNER = ((2.0, 2.0), (2.0, 10.0), (14.0, 10.0), (14.0, 2.0))
-"""Corners of the block that it leads round, clockwise: the corridor is on the left of both."""
+#: Along each wall, of the outer ones first: where a door begins, how wide and how deep it is [m]; below zero it juts
+#: out.
 NICHES = (
     ((3.0, 1.0, 0.6), (8.5, 0.9, 0.25), (12.0, 2.0, 1.5)),
     ((2.5, 0.9, 0.3), (7.0, 1.4, 0.8)),
@@ -31,10 +33,8 @@ NICHES = (
     ((3.0, 0.9, 0.5),),
     ((2.0, 1.0, 0.25), (6.0, 0.5, -0.3), (9.5, 0.9, 0.25)),
 )
-"""Along each wall, of the outer ones first: where a door begins, how wide and how deep it is [m]; below zero it juts out."""
 LANE_M, BEND_M, SPEED_M_S, RAMP_S = 1.0, 0.7, 0.5, 1.0
-NO_RETURN_M = 81.83
-"""What SICK's scanners write."""
+NO_RETURN_M = 81.83  #: What SICK's scanners write.
 START_S, READINGS = 1_000_000_000, 10
 
 

@@ -91,14 +91,13 @@ def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np
 
 
 ARM_HZ = 0.2, 0.8
-WRIST_HZ = 0.8, 2.0
-"""Before the path is slowed down to the speed of a hand, to about a third."""
+WRIST_HZ = 0.8, 2.0  #: Before the path is slowed down to the speed of a hand, to about a third.
 TREMOR_HZ = 1.0, 3.0
 
+#: Greatest turn about the point looked at to either side; up and down it is this fraction of that.
 SWEEP_DEG, RISE = 40.0, 0.25
-"""Greatest turn about the point looked at to either side; up and down it is this fraction of that."""
+#: Greatest rotation by the wrist, and rotation and displacement by the hand's tremor, per axis.
 WRIST_DEG, TREMOR_DEG, TREMOR_M = 10.0, 0.3, 0.002
-"""Greatest rotation by the wrist, and rotation and displacement by the hand's tremor, per axis."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +145,9 @@ class HandHeld:
         return shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
 
 
-KNOTS = 257
-"""Of the table that gives the fraction of a bend for the way along it."""
+KNOTS = 257  #: Of the table that gives the fraction of a bend for the way along it.
+#: Of the Gauss-Legendre rule that integrates a position along a bend: exact to the last digits up to half a turn.
 NODES = 24
-"""Of the Gauss-Legendre rule that integrates a position along a bend: exact to the last digits up to half a turn."""
 
 
 @dataclass(frozen=True)
@@ -287,8 +285,7 @@ def _fraction_by_way(move: Move, arm_m: float) -> Any:
     return CubicSpline(np.concatenate([[0.0], np.cumsum(pieces)]), fraction)
 
 
-Error = Annotated[float, Range(gt=-0.5, lt=0.5)]
-"""As a fraction of what is right."""
+Error = Annotated[float, Range(gt=-0.5, lt=0.5)]  #: As a fraction of what is right.
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ import math
 import numpy as np
 from numba import float32, float64, int64, njit, types, uint8, void
 
-TILE = 16
-"""Side of a tile, px: its rays and depths stay in the innermost cache."""
+TILE = 16  #: Side of a tile, px: its rays and depths stay in the innermost cache.
+#: A footprint longer than this times its width is read as if it were shorter: less blur at grazing angles.
 ELONGATED = 2.0
-"""A footprint longer than this times its width is read as if it were shorter: less blur at grazing angles."""
 _MATRIX = types.Array(float64, 2, "C")
 _HYPER = types.Array(float64, 4, "C")
 _CUBE = types.Array(float64, 3, "C")

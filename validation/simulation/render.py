@@ -9,8 +9,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides, sides
 
-NEAR_M = 1e-3
-"""What is nearer to the camera's plane is not seen."""
+NEAR_M = 1e-3  #: What is nearer to the camera's plane is not seen.
 
 
 class Renderer:

@@ -31,8 +31,8 @@ from rbpf.sensors.readers.wheel_odometry import WheelOdometry
 from rbpf.validation.simulation.paths import frame_stamps
 from rbpf.validation.simulation.textures import Paint, chessboard, faded
 
+#: Stamp of the first image: all stamps have as many digits, so that file names sort by time.
 EPOCH_NS = 1_400_000_000_000_000_000
-"""Stamp of the first image: all stamps have as many digits, so that file names sort by time."""
 
 
 @dataclass(frozen=True)
@@ -129,14 +129,10 @@ def cast(
         return 1.0 / inverse, np.where(inverse > 0.0, row, -1)
 
 
-LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
-"""Direction to the lamp."""
-DIRECT = 0.25
-"""Fraction of the light that comes from there."""
-MOST_TRIES = 1000
-"""Places drawn for things that do not touch."""
-BOARD_TEXELS = 40
-"""Per square of a chessboard; its white margin is one square wide."""
+LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])  #: Direction to the lamp.
+DIRECT = 0.25  #: Fraction of the light that comes from there.
+MOST_TRIES = 1000  #: Places drawn for things that do not touch.
+BOARD_TEXELS = 40  #: Per square of a chessboard; its white margin is one square wide.
 
 
 class Furniture:

@@ -8,12 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 Shape = tuple[int, int]
-Paint = Callable[[Shape, np.random.Generator], np.ndarray]
-"""Draws a texture of that shape."""
-GLYPH = 7, 5
-"""Cells of a mark, rows and columns."""
-FINE = 4
-"""Fractional bits of the corners of what is drawn."""
+Paint = Callable[[Shape, np.random.Generator], np.ndarray]  #: Draws a texture of that shape.
+GLYPH = 7, 5  #: Cells of a mark, rows and columns.
+FINE = 4  #: Fractional bits of the corners of what is drawn.
 
 
 def clouds(shape: Shape, rng: np.random.Generator, exponent: float = 1.0) -> np.ndarray:
