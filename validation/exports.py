@@ -36,15 +36,12 @@ from rbpf.validation.gtsam.observations import ObservationTable, observation_tab
 from rbpf.validation.report.video import AXIS_M, ellipsoids, log_pose, log_time, recording
 
 _log = logging.getLogger(__name__)
-
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
-
 #: Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing.
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 _STOPS = np.array([[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float)
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
 _BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
-
 _VERTEX = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue")), ("sigma_m", "<f4")]
 _EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
 _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}

@@ -49,7 +49,6 @@ ROWS = "rows.jsonl"
 TABLE = "table.csv"
 SECONDS = 20  #: That a scheduler may take to answer.
 MOST_RUNS = 100_000
-
 Value = str | int | float | bool | None
 Row = dict[str, Any]
 

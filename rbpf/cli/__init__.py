@@ -24,7 +24,6 @@ from rbpf.ranges import MOST, Range
 
 PROGRAM = "rbpf"
 BAD_INPUT, STOPPED = 2, 130  #: Exit codes; 0 is success, 1 a fault of the program.
-
 APP = Commands()
 _DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
 

@@ -21,7 +21,6 @@ WholeCount = Annotated[Whole, Range(ge=1, le=MOST)]
 RealPositive = Annotated[Real, Range(gt=0.0)]
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Where = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-
 MOST_PX = 1 << 15  #: Of a side of an image.
 
 

@@ -12,7 +12,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rbpf.errors import printable
 
 CONSOLE = Console(stderr=True)
-
 #: Called with how many are done, and of how many; None where that is not known.
 OnProgress = Callable[[int, int | None], None]
 

@@ -53,7 +53,6 @@ from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 
 #: Bytes of grid.pgm: where something is, where beams have passed, where nothing is known.
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-
 #: A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth.
 STILL = 0.01
 

@@ -24,7 +24,6 @@ COMMON = (
 
 #: Likewise; written where a system has a name for it (`System.waiting`).
 WAITING = Column("seconds_waiting", "time until the frame was read and decoded", "s")
-
 _STATES = list(TrackingState)
 
 

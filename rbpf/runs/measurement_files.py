@@ -61,7 +61,6 @@ OBSERVATIONS = "observations.csv"
 ODOMETRY = "observations_odometry.csv"
 FRAMES = "observations_frames.csv"
 KNOWN = "observations_known_points.csv"
-
 PLAIN = "radial-tangential"  #: The lens that is meant where none is named.
 
 _TITLES = {

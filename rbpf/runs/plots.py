@@ -39,9 +39,7 @@ COLOURS = {
 
 #: The map's picture holds the path and this fraction of the points; single points far off do not make it small.
 MAP_FRACTION = 0.9
-
 CAMERA_HZ = 30.0  #: What a camera's frames are to keep up with.
-
 #: Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera.
 _UPRIGHT = 0.05
 

@@ -19,13 +19,11 @@ from rbpf.systems.settings import HEADER
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"  #: Whose version may change a run's bytes.
-
 _FILES = "recording", "known_points", "calibration", "known_map"  #: Entries that name files or folders that a run read.
 _FLAGS = ("localize",)
 _MADE = "video", "batch"  #: What a run makes besides its data, unless it is asked not to.
 _HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
 _INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
-
 #: Settings that cannot change the results: a run may go on with others. All else must be the same.
 FREE = ("checkpoint_every",)
 

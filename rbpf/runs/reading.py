@@ -34,7 +34,6 @@ from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 
 MOST_BYTES = 1 << 30  #: No file of a run folder is larger.
-
 _PATH = {"stamps_ns": integers("frames"), "mean": numbers("frames", "size"), "cov": numbers("frames", "dim", "dim")}
 _CORRECTIONS = {
     "correction": numbers("frames", "r", values="any"),

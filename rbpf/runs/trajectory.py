@@ -17,7 +17,6 @@ from rbpf.runs.files import write_text
 from rbpf.sensors.readers.text import read_columns
 
 MAX_DIFFERENCE_NS = 10_000_000
-
 Alignment = Literal["none", "rigid", "similarity"]
 
 

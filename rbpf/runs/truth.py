@@ -19,10 +19,8 @@ from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.systems.system import Gauge
 
 TRUTH = "truth.npz"
-
 #: Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored.
 LONGEST_GAP_NS = 500_000_000
-
 LEAST = 3  #: Frames with a true pose that a comparison needs.
 
 _TRUTH = {

@@ -29,7 +29,6 @@ HALF_PX = 0.5  #: Added to our pixels it gives COLMAP's.
 LEFT, RIGHT = 1, 2  #: Numbers of the cameras.
 OVER_IMAGES = "mono", "stereo"  #: Systems whose runs have images.
 Names = dict[tuple[int, int], str]  #: Names of images by frame and side.
-
 _UPRIGHT = 1  #: What a photo's tag of its orientation says where it is not turned.
 
 

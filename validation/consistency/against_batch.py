@@ -38,7 +38,6 @@ from rbpf.validation.metrics import gaussian_differences as gaussians
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
 POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the batch optimum"
-
 LEAST_STEPS = 3  #: Of a run that is compared.
 DRAWS = 200  #: Of paths and maps from a robot's batch posterior.
 LEAST_COUNT = 0.1  #: Fraction of them that has to count for the posterior to be a witness.

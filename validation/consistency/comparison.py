@@ -33,7 +33,6 @@ from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.statistic import Statistic, motion_statistics, step_ratio
 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
-
 #: By system, where its configuration holds the one standard deviation of all measurements, px.
 SETTINGS = {"mono": ("search", "noise_px")}
 _PREFIX = "validation_"
@@ -150,11 +149,8 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
 
 
 Trust = Literal["trust", "do not trust", "cannot tell"]
-
 Leaning = Literal["over-confident", "cautious", ""]
-
 Grade = Literal["good", "fair", "poor", "not known"]
-
 #: Grades of a path, with the largest error as a fraction of its spread, and the largest fraction of lost frames.
 GRADES: tuple[tuple[Grade, float, float], ...] = (("good", 0.03, 0.05), ("fair", 0.1, 0.25))
 

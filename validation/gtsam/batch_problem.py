@@ -28,7 +28,6 @@ from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
-
 OnIteration = Callable[[int, float], None]
 LEAST = 4  #: Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses.
 #: Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long.

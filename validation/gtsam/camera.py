@@ -38,7 +38,6 @@ OUTLIER = 5.0  #: An observation farther off takes no part in a frame's pose, in
 _EARLIEST = 8
 _MOTION = 0.1  # of a frame: rad, and metres per metre of distance to what is seen
 _FOUND = 1e-6  # fraction of the error that is no gain any more
-
 Known = dict[int, tuple[Array, Array]]  #: Position (3,) and covariance (3, 3) by name.
 
 

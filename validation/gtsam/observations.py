@@ -18,7 +18,6 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 
 Index = NDArray[np.intp]
-
 Residuals = tuple[Array, list[Array]]  #: Residuals (K, p), and their Jacobians (K, p, d) by each variable.
 SINGULAR = 1e-12  #: An eigenvalue of a covariance below this fraction of the largest counts as zero.
 HUBER = 1.345  #: Threshold of the loss where outliers must not do harm, in standard deviations.

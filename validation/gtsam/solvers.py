@@ -27,11 +27,9 @@ ROUGH = 1e-4  #: Fraction of the error that still counts as progress far from th
 EXACT = 1e-11  #: The same near by.
 ITERATIONS = 200  #: Most of them.
 OnIteration = Callable[[float], None]
-
 _DAMPING = 1e-5
 _MIN_DAMPING = 1e-10
 _MAX_DAMPING = 1e10
-
 MOST_POSES = 1_500  #: Whose dense reduced system is taken for covariances: 9,000 unknowns, 650 MB.
 _POSE, _POINT = 6, 3
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")

@@ -18,7 +18,6 @@ from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
 BATCH, ODOMETRY = "batch.tum", "odometry.tum"
-
 #: How the figures of the odometry alone begin, by system; otherwise with `odometry_`.
 ODOMETRY_PREFIX = {"stereo": "vo_"}
 

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 VIDEO = "annotated.mp4"
-
 #: Pictures of a comparison that show what one of the run's own does.
 _SAME = {"groundtruth_path.png": "path.png", "groundtruth_error.png": "error.png"}
 #: Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do.

@@ -31,7 +31,6 @@ from rbpf.systems.stereo.landmarks import FeatureKind
 Colour = tuple[int, int, int]
 Place = Callable[[np.ndarray], list[tuple[float, float]]]  #: Pixels (…, 2) of the image to points of the picture.
 FOUND, MISSED, STARTED, TEXT = (60, 220, 60), (240, 60, 50), (90, 170, 255), (255, 255, 255)
-
 _SMALL_PX = 800  #: Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing.
 _ARM, _BAND = 4, 24
 #: Height of letters as a fraction of the drawn width, and its bounds, px.

@@ -26,7 +26,6 @@ DESK_M, HIGHEST_M = 0.75, 0.25  #: Height of a desk, and of the highest thing on
 BOOKS = 0.4  #: Fraction of books among the things; the others are boxes.
 COARSE = 4.0  #: Texels of the walls round a desk are larger by this: they are farther away.
 OVER_DESK = HandHeld(nearest_m=0.8, farthest_m=1.3, elevation_deg=50.0, wander=0.25)
-
 #: Nothing stands nearer to a chessboard's corners than this: it is seen whole from where the camera starts.
 BOARD_CLEAR_M = 0.15
 

@@ -30,7 +30,6 @@ from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
 
 DRIFT_HZ = 0.1, 0.5
-
 PROBES = 12, 16  #: Rows and columns of pixels at which the motion during an exposure is measured.
 MOST_RAYS = 8  #: Along each side of a pixel: more than 64 px of motion during an exposure is rendered with gaps.
 

@@ -30,7 +30,6 @@ CORNER_M = 0.95
 BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0  #: How the robot drives: see `Drive`.
 TOUR_FRAMES, TURN_BACK_FRAMES = 4000, 600
 RATE_HZ = 15.0
-
 AWAY_DEG, AWAY_S = 140.0, 5.0  #: The robot looks away by this angle and for this time.
 
 
@@ -117,7 +116,6 @@ TOUCHING_M = 0.002  #: Faces nearer to a wall than this are not seen.
 #: Thickness of a shelf's boards, of a table's top, of its legs, and of what things lean against.
 BOARD_M, TOP_M, LEG_M, BACK_M = 0.025, 0.04, 0.05, 0.01
 TABLE_M = 0.74
-
 HANG_M = 0.01  #: Posters are this far from what they hang on.
 
 

@@ -93,7 +93,6 @@ def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np
 ARM_HZ = 0.2, 0.8
 WRIST_HZ = 0.8, 2.0  #: Before the path is slowed down to the speed of a hand, to about a third.
 TREMOR_HZ = 1.0, 3.0
-
 #: Greatest turn about the point looked at to either side; up and down it is this fraction of that.
 SWEEP_DEG, RISE = 40.0, 0.25
 #: Greatest rotation by the wrist, and rotation and displacement by the hand's tremor, per axis.
