@@ -54,7 +54,7 @@ def test_in_a_linear_world_the_filter_is_the_batch_within_monte_carlo_error(line
         assert gaussians.bhattacharyya.max() < 0.0125
     assert found.poses.keys.tolist() == [11]
     assert found.scale == 1.0 and found.gauge == SAME
-    assert found.fit_batch.sightings == found.fit_filter.sightings == len(found.optimum.problem.z)
+    assert found.fit_batch["sightings"] == found.fit_filter["sightings"] == len(found.optimum.problem.z)
 
 
 def test_a_posterior_that_is_not_gaussian_is_no_witness(folder, monkeypatch):

@@ -17,7 +17,7 @@ densities are compared in the directions that a change of scale does not move: a
 (two of a landmark's three, five of a pose's six).
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
@@ -31,7 +31,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
-from rbpf.validation.gtsam import batch_problem
+from rbpf.validation.gtsam.batch_problem import OnIteration, Optimum, Problem, fit_of, floats_in_scale, solve_problem
 from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.gtsam.path_sampling import draw_posterior
 from rbpf.validation.metrics import gaussian_differences as gaussians
@@ -54,14 +54,13 @@ class AgainstBatch:
     gauge: str  #: how the two worlds were made one, in words.
     scale: float  #: by which the filter was multiplied; 1 where the scale is measured.
     filter: PathAndMap  #: the run, in that scale.
-    optimum: batch_problem.Optimum  #: the batch.
+    optimum: Optimum  #: the batch.
     path: AbsoluteError  #: distances of the filter's online positions from the optimum's, per step, without alignment.
     landmarks: gaussians.Differences  #: Gaussians of the map.
     poses: gaussians.Differences  #: Gaussians of the last pose; none where the covariances are not known.
-    fit_filter: (
-        batch_problem.Fit
-    )  #: of the observations of landmarks that both have, by the filter's online poses and its last map.
-    fit_batch: batch_problem.Fit  #: by the optimum.
+    #: of the observations of landmarks that both have, see `fit_of`, by the filter's online poses and its last map.
+    fit_filter: dict[str, float]
+    fit_batch: dict[str, float]  #: by the optimum.
 
     @property
     def floats(self) -> bool:
@@ -78,23 +77,17 @@ class AgainstBatch:
         cov, cov_batch, delta = self.pose_errors()
         ours, theirs = self.ours.landmarks, self.optimum.estimate.landmarks
         _, rows, others = np.intersect1d(ours.ids, theirs.ids, return_indices=True)
-        found = ours.cov[rows], theirs.cov[others], theirs.mean[others] - ours.mean[rows]
+        found: tuple[Array, ...] = ours.cov[rows], theirs.cov[others], theirs.mean[others] - ours.mean[rows]
         if self.floats and rows.size:
             basis = gaussians.across_of(theirs.mean[others] - self.optimum.estimate.world_from_body[0, 4:])
-            found = (
-                gaussians.projected(basis, found[0]),
-                gaussians.projected(basis, found[1]),
-                gaussians.projected(basis, found[2]),
-            )
+            found = tuple(gaussians.projected(basis, part) for part in found)
         known = np.isfinite(found[1]).all(axis=(1, 2))
         own, batch, apart = (values[known] for values in found)
-        pair = (
-            posterior_ratio(POSES, cov, cov_batch, delta),
-            posterior_ratio(LANDMARKS, own, batch, apart, same_data=True),
-        )
-        return [statistic for statistic in pair if statistic is not None]
+        poses = posterior_ratio(POSES, cov, cov_batch, delta)
+        landmarks = posterior_ratio(LANDMARKS, own, batch, apart, same_data=True)
+        return [statistic for statistic in (poses, landmarks) if statistic is not None]
 
-    def pose_errors(self) -> tuple[Array, Array, Array]:
+    def pose_errors(self) -> tuple[Array, ...]:
         """Of B steps the filter's covariances (B, d, d), the batch's, and its poses from the filter's (B, d).
 
         All in the chart at the filter's poses; none where the optimum has no covariances.
@@ -104,14 +97,11 @@ class AgainstBatch:
         if not (len(theirs.cov_poses) and len(ours.cov_poses)):
             return ours.cov_poses[:0], ours.cov_poses[:0], delta[:0]
         carry = ours.space.right_jacobian_inverse(delta)
-        covs = ours.cov_poses, np.asarray(carry @ theirs.cov_poses @ carry.mT)
-        if self.floats:
-            basis = gaussians.across_of(gaussians.away_from_first(ours.world_from_body))
-            covs, delta = (
-                (gaussians.projected(basis, covs[0]), gaussians.projected(basis, covs[1])),
-                gaussians.projected(basis, delta),
-            )
-        return *covs, delta
+        found = ours.cov_poses, np.asarray(carry @ theirs.cov_poses @ carry.mT), delta
+        if not self.floats:
+            return found
+        basis = gaussians.across_of(gaussians.away_from_first(ours.world_from_body))
+        return tuple(gaussians.projected(basis, part) for part in found)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything for JSON."""
@@ -125,8 +115,8 @@ class AgainstBatch:
             "path_distances_m": self.path.distances.tolist(),
             "landmarks": self.landmarks.as_dict(),
             "poses": self.poses.as_dict(),
-            "fit_filter": asdict(self.fit_filter),
-            "fit_batch": asdict(self.fit_batch),
+            "fit_filter": self.fit_filter,
+            "fit_batch": self.fit_batch,
             "batch_error": self.optimum.error,
         }
 
@@ -142,9 +132,7 @@ def compare_folder(folder: Path) -> AgainstBatch:
     return compare(record.estimate, record.measurements)
 
 
-def compare(
-    filtered: PathAndMap, problem: batch_problem.Problem, optimum: batch_problem.Optimum | None = None
-) -> AgainstBatch:
+def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = None) -> AgainstBatch:
     """A filter's path and map, T poses, beside the batch optimum of the same T measurements.
 
     Where it is not known it is solved for with all errors Gaussian, as the filter takes them. An InputError says that path
@@ -156,8 +144,8 @@ def compare(
     if len(stamps) < LEAST_STEPS:
         raise InputError(f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch.")
     if optimum is None:
-        optimum = batch_problem.solve_problem(problem, filtered.world_from_body)
-    floats = batch_problem.floats_in_scale(problem)
+        optimum = solve_problem(problem, filtered.world_from_body)
+    floats = floats_in_scale(problem)
     scale = gaussians.scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
     scaled = gaussians.rescaled(filtered, scale)
     shared = np.intersect1d(scaled.landmarks.ids, optimum.estimate.landmarks.ids)
@@ -171,25 +159,21 @@ def compare(
         path=ate(ours.trajectory, optimum.estimate.trajectory),
         landmarks=gaussians.compare_maps(ours, optimum.estimate, floats),
         poses=gaussians.compare_last_pose(ours, optimum.estimate, int(optimum.steps[-1]), floats),
-        fit_filter=batch_problem.fit_of(optimum.problem, ours, shared),
-        fit_batch=batch_problem.fit_of(optimum.problem, optimum.estimate, shared),
+        fit_filter=fit_of(optimum.problem, ours, shared),
+        fit_batch=fit_of(optimum.problem, optimum.estimate, shared),
     )
 
 
-def solve_run(
-    record: RunFolder, most: int | None = None, on_iteration: batch_problem.OnIteration | None = None
-) -> batch_problem.Optimum:
+def solve_run(record: RunFolder, most: int | None = None, on_iteration: OnIteration | None = None) -> Optimum:
     """The batch optimum of a run's measurements: with Huber's loss for matches in images, which hold false ones.
 
     `most`, `on_iteration` and errors as of `solve_problem`.
     """
     robust = HUBER if isinstance(record.measurements, FeatureLog) else None
-    return batch_problem.solve_problem(record.measurements, record.path.world_from_body, robust, most, on_iteration)
+    return solve_problem(record.measurements, record.path.world_from_body, robust, most, on_iteration)
 
 
-def compare_with_batch(
-    record: RunFolder, optimum: batch_problem.Optimum | None = None
-) -> tuple[Comparison, AgainstBatch]:
+def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tuple[Comparison, AgainstBatch]:
     """A run beside the batch posterior of the same measurements, from `solve_run` where it is known; errors as that."""
     problem = record.measurements
     found = compare(record.estimate, problem, optimum=optimum or solve_run(record))
@@ -211,9 +195,9 @@ def compare_with_batch(
         batch = found.optimum.estimate
         start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
         draws = draw_posterior(problem, start, np.random.default_rng(0), DRAWS)
-        weighed = {"log_evidence_batch": draws.log_evidence, "log_evidence_batch_error": draws.error}
-        weighed["posterior_draws_ess"] = draws.ess
-        figures |= {name: value for name, value in weighed.items() if np.isfinite(value)}
+        names = "log_evidence_batch", "log_evidence_batch_error", "posterior_draws_ess"
+        weighed = zip(names, (draws.log_evidence, draws.error, draws.ess), strict=True)
+        figures |= {name: value for name, value in weighed if np.isfinite(value)}
         if not draws.ess >= LEAST_COUNT * DRAWS:
             statistics = [s for s in statistics if s.name not in (POSES, LANDMARKS)]
             said = (
@@ -225,5 +209,5 @@ def compare_with_batch(
     for name, rows in (("landmarks", found.landmarks), ("poses", found.poses)):
         figures |= {f"{name}_{key}": value for key, value in rows.as_dict().items() if not isinstance(value, list)}
     for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
-        figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
+        figures |= {f"{name}_{key}": value for key, value in fit.items()}
     return Comparison("gtsam", f"{accuracy}{said}.", figures, statistics), found
