@@ -54,8 +54,9 @@ def parts() -> list[Part]:
     found = []
     for name, extra, module, distribution, probe in _PROBES:
         try:
-            says = probe(import_module(module))
-            found.append(Part(name, True, not extra, says or f"{distribution} {version(distribution)}"))
+            said = probe(import_module(module))
+            says = said if isinstance(said, str) else f"{distribution} {version(distribution)}"
+            found.append(Part(name, True, not extra, says))
         except Exception as error:  # whatever a broken library raises as it is loaded
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             again = "install the package again: pip install --force-reinstall"
@@ -87,10 +88,6 @@ def _gtsam(gtsam: Any) -> None:
     gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
 
 
-def _reconstruction(pycolmap: Any) -> None:
-    pycolmap.Reconstruction()
-
-
 def _ffmpeg(imageio_ffmpeg: Any) -> str:
     path: str = imageio_ffmpeg.get_ffmpeg_exe()
     subprocess.run([path, "-version"], check=True, capture_output=True, timeout=30)
@@ -98,11 +95,11 @@ def _ffmpeg(imageio_ffmpeg: Any) -> str:
 
 
 #: What it does, the extra that it comes with, module and distribution, and how it is tried once it is loaded.
-_PROBES: tuple[tuple[str, str, str, str, Callable[[Any], str | None]], ...] = (
+_PROBES: tuple[tuple[str, str, str, str, Callable[[Any], Any]], ...] = (
     ("compiled kernels", "", "numba", "numba", _compiler),
     ("images and video", "", "cv2", "opencv-python-headless", _images),
     ("batch optimum", "", "gtsam", "GTSAM", _gtsam),
-    ("reconstruction", "", "pycolmap", "pycolmap", _reconstruction),
+    ("reconstruction", "", "pycolmap", "pycolmap", lambda pycolmap: pycolmap.Reconstruction()),
     ("annotated video", "", "imageio_ffmpeg", "imageio-ffmpeg", _ffmpeg),
     ("pictures", "", "matplotlib.figure", "Matplotlib", lambda figure: figure.Figure().canvas.draw()),
     ("Rerun recordings", "viewing", "rerun", "rerun-sdk", lambda _: None),

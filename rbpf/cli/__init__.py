@@ -4,6 +4,7 @@ import os
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +15,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from rbpf import __version__
 from rbpf.cli import cameras, installed, judging
 from rbpf.cli.commands import Commands
-from rbpf.cli.compiling import require_threads
 from rbpf.cli.options import Printed
 from rbpf.cli.running import RUN, RunMono, repeated
 from rbpf.cli.showing import say
@@ -59,15 +59,6 @@ APP.add("doctor")(installed.Doctor)
 APP.add("completion")(installed.Completion)
 
 
-def _require_filled(arguments: list[str]) -> None:
-    """Refuses a name that is empty, which would stand for the folder one is in."""
-    for before, word in zip(["", *arguments], arguments, strict=False):
-        option, equals, value = word.partition("=")
-        if not word or (option.startswith("--") and equals and not value):
-            named = before if not word else option
-            raise InputError(f"{named} is empty" if named.startswith("--") else "an argument is empty")
-
-
 def _require_streams(wanted: bool) -> None:
     """Gives what was closed (`>&-`) back, leading nowhere: else the next file that is opened would take its place."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
@@ -87,8 +78,16 @@ def main(arguments: list[str] | None = None) -> int:
         if given == ["--version"]:
             print(f"{PROGRAM} {__version__}", flush=True)
             return 0
-        _require_filled(given)
-        require_threads()
+        # A name that is empty would stand for the folder one is in.
+        for before, word in pairwise(["", *given]):
+            option, equals, value = word.partition("=")
+            if not word or (option.startswith("--") and equals and not value):
+                named = before if not word else option
+                raise InputError(f"{named} is empty" if named.startswith("--") else "an argument is empty")
+        # With other numbers Numba cannot be imported, or would run what it likes.
+        threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+        if not (threads.isdecimal() and int(threads) >= 1):
+            raise InputError(f"the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got {threads!r}")
         expanded = repeated(given)
         APP.require_known(expanded, PROGRAM)
         APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=expanded)

@@ -56,7 +56,11 @@ class Commands(SubcommandApp):
         if isinstance(group, Commands):
             group.require_known(arguments[1:], before)
             return
-        options = _options(group)
+        options, hints = ["--help"], get_type_hints(group, include_extras=True)
+        for field in fields(group):
+            hint, option = hints[field.name], field.name.replace("_", "-")
+            if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
+                options += [f"--{option}", f"--no-{option}"] if hint is bool else [f"--{option}"]
         for word in arguments[1:]:
             option = word.partition("=")[0].replace("_", "-")
             if len(option) > 2 and option.startswith("--") and option not in options:
@@ -68,13 +72,3 @@ def _nearest(name: str, names: Iterable[str]) -> str:
     """What may have been meant, or else all names."""
     close = get_close_matches(name, names, 1)
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"
-
-
-def _options(kind: type[Any]) -> list[str]:
-    """All options of a command."""
-    found, hints = ["--help"], get_type_hints(kind, include_extras=True)
-    for field in fields(kind):
-        hint, option = hints[field.name], field.name.replace("_", "-")
-        if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
-            found += [f"--{option}", f"--no-{option}"] if hint is bool else [f"--{option}"]
-    return found

@@ -1,6 +1,5 @@
 """Compiled kernels: which there are, whether they are in the cache, and compiling them with a word of warning."""
 
-import os
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
@@ -52,7 +51,7 @@ def compile_kernels(every: bool = False) -> list[str]:
         say(f"compiling {len(missing)} of {len(modules)} kernels: this takes some minutes and is done once …")
     work: list[Callable[[], object]] = [partial(import_module, name) for name in (modules if every else missing)]
     if work:
-        work += [_search_patches, _measure_motion, _filter_log]
+        work.append(_first_calls)
         with progress() as bar:
             report = bar("compiling" if missing else "trying the kernels")
             report(0, len(work))
@@ -60,13 +59,6 @@ def compile_kernels(every: bool = False) -> list[str]:
                 part()
                 report(done, len(work))
     return missing
-
-
-def require_threads() -> None:
-    """Refuses a number of threads in the environment with which Numba cannot be imported, or would run what it likes."""
-    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
-    if not (threads.isdecimal() and int(threads) >= 1):
-        raise InputError(f"the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got {threads!r}")
 
 
 def use_threads(threads: int | None) -> None:
@@ -80,36 +72,30 @@ def use_threads(threads: int | None) -> None:
     numba.set_num_threads(threads)
 
 
-def _search_patches() -> None:
-    """Calls what is compiled at its first call, as the systems call it, on a few numbers; so do those below."""
+def _first_calls() -> None:
+    """Calls what is compiled at its first call, as the systems call it, on a few numbers."""
+    from rbpf.motion.stereo_geometry import Matches
+    from rbpf.motion.stereo_vo import estimate_motion
+    from rbpf.runs.recordings import RobotRecording, filter_recording
+    from rbpf.sensors.camera import Pinhole, RectifiedStereo
     from rbpf.sensors.features import CornerDetector
     from rbpf.sensors.patches.search import cut, search, warp
+    from rbpf.systems.range_bearing.config import RangeBearingConfig
+    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
+    # A search for patches.
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (30, 40)).repeat(5, axis=0).repeat(5, axis=1).astype(np.uint8)
     px = CornerDetector().detect(image, 4).px
     windows = [window for place in px if (window := cut(image, place)) is not None]
     templates = warp(np.array(windows), np.tile(np.eye(2), (len(windows), 1, 1)))
     search(image, templates, px[: len(windows)], np.tile(4.0 * np.eye(2), (len(windows), 1, 1)))
-
-
-def _measure_motion() -> None:
-    from rbpf.motion.stereo_geometry import Matches
-    from rbpf.motion.stereo_vo import estimate_motion
-    from rbpf.sensors.camera import Pinhole, RectifiedStereo
-
-    rng = np.random.default_rng(0)
+    # The motion of a stereo pair.
     rig = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
     before = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 5.0], (40, 3))
     z_prev, z_now = rig.project(before), rig.project(before + np.array([0.02, 0.0, 0.05]))
     estimate_motion(Matches.checked(rig, z_prev, z_now, np.eye(3), np.eye(3)), rng)
-
-
-def _filter_log() -> None:
-    from rbpf.runs.recordings import RobotRecording, filter_recording
-    from rbpf.systems.range_bearing.config import RangeBearingConfig
-    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-
+    # A robot's log.
     with TemporaryDirectory() as folder:
         simulate_robot(RobotWorld(5, 20, False), Path(folder) / "log", 0)
         filter_recording(RobotRecording(Path(folder) / "log"), RangeBearingConfig(particles=10))

@@ -42,14 +42,3 @@ def patient(report: OnProgress) -> Iterator[OnProgress]:
         yield listening
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def finishing() -> Iterator[None]:
-    """Work after the filter: what Ctrl-C leaves of it is said."""
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        raise StoppedError(
-            "stopped while the results were written; the same command with --resume filters only what is missing"
-        ) from error

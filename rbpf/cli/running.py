@@ -1,7 +1,6 @@
 """`rbpf run`: one class per system, and the same run again."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,7 +9,7 @@ import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels, use_threads
-from rbpf.cli.interrupts import finishing, patient
+from rbpf.cli.interrupts import StoppedError, patient
 from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
 from rbpf.cli.showing import answer, progress, say
 from rbpf.errors import InputError
@@ -256,40 +255,37 @@ def _run(
 
     `filtered` is called in between.
     """
+    from rbpf.runs.files import holds_run, numbered, own_folder
     from rbpf.runs.recordings import filter_recording
     from rbpf.validation.finish import finish_run
 
-    with _prepared(options) as out, progress() as bar:
+    # Threads as asked for, and the folder for the results, which nobody else writes to.
+    if options.resume and options.overwrite:
+        raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
+    kept = options.resume or options.overwrite
+    out = numbered(Path("run"), last=kept) if options.out is None else options.out
+    use_threads(options.threads)
+    with own_folder(out), progress() as bar:
+        if holds_run(out) and not kept:
+            raise InputError(
+                f"{out} holds a run already: name another folder with --out, go on with --resume, or write over it "
+                "with --overwrite"
+            )
         with patient(bar("filtering")) as report:
             listeners = [lambda run, _: report(len(run.log), run.expected or 0)]
             run = filter_recording(recording, config, out, options.resume, listeners)
         filtered(run)
         solving = bar("batch")
         made |= {"on_frame": bar("drawing"), "on_iteration": lambda count, _error: solving(count, None)}
-        with finishing():
+        try:
             entries = finish_run(run, out, recording.sources(), **made)
+        except KeyboardInterrupt as error:
+            raise StoppedError(
+                "stopped while the results were written; the same command with --resume filters only what is missing"
+            ) from error
     problems = entries.get("problems", ())
     odd = [f"{len(problems)} remarks on single frames, the first: {problems[0]}"] if problems else []
     where = f"pictures and report.html are in {out}, all figures in its summary.json"
     answer(entries | {"out": str(out)}, options.json, *entries["sentences"], *odd, where)
     if run.failure is not None:
         raise InputError(f"{run.failure}; what was computed before it is in {out}")
-
-
-@contextmanager
-def _prepared(options: RunOptions) -> Iterator[Path]:
-    """Threads as asked for, and the folder for the results, which nobody else writes to."""
-    from rbpf.runs.files import holds_run, numbered, own_folder
-
-    if options.resume and options.overwrite:
-        raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
-    kept = options.resume or options.overwrite
-    out = numbered(Path("run"), last=kept) if options.out is None else options.out
-    use_threads(options.threads)
-    with own_folder(out):
-        if holds_run(out) and not kept:
-            raise InputError(
-                f"{out} holds a run already: name another folder with --out, go on with --resume, or write over it "
-                "with --overwrite"
-            )
-        yield out
