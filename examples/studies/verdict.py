@@ -36,9 +36,8 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import compare_with_batch
 from rbpf.validation.consistency.against_groundtruth import LANDMARKS, NEES, compare_with_truth, truth_errors
-from rbpf.validation.consistency.comparison import Verdict, compare_with_itself
+from rbpf.validation.consistency.comparison import Verdict, compare_with_itself, verdict_of
 from rbpf.validation.consistency.statistic import STATE_FACTOR
-from rbpf.validation.report.validate import verdict_of
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
 

@@ -317,13 +317,6 @@ def lost_frames(found: RunFolder) -> np.ndarray:
     return table.get("lost", table.get("assumed", np.zeros(len(found.trajectory)))) > 0
 
 
-def tracking_losses(found: RunFolder) -> tuple[int | None, int]:
-    """In how many frames a run was lost, and their number; None of a system that cannot be."""
-    table = found.table("diagnostics.csv")
-    able = "lost" in table or "assumed" in table
-    return (int(lost_frames(found).sum()) if able else None), len(found.trajectory)
-
-
 @dataclass(frozen=True)
 class Views:
     """From where a world is drawn: from above and, in space, from the side; each the axes to the right and up the page.

@@ -20,9 +20,9 @@ from rbpf.validation.consistency.comparison import (
     innovation_statistics,
     judge,
     noise_advice,
+    verdict_of,
 )
 from rbpf.validation.consistency.statistic import coverage, step_ratio, variance_ratio, whitened_errors
-from rbpf.validation.report.validate import verdict_of
 from tests.validation.fixes import Receiver, Walk
 
 ALIKE = {

@@ -21,7 +21,7 @@ The second follows from the statistics of `rbpf.validation.consistency.statistic
 import json
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +29,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
+from rbpf.runs.plots import lost_frames
 from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.statistic import Statistic, motion_statistics, step_ratio
 
@@ -114,12 +115,6 @@ def compare_with_itself(record: RunFolder) -> Comparison:
     statistics = innovation_statistics(table["nis"], table["nis_dof"], correction, cov)
     figures = {statistic.name: statistic.value for statistic in statistics if np.isfinite(statistic.value)}
     return Comparison("itself", "", figures, statistics)
-
-
-def independent_names(comparisons: Sequence[Comparison]) -> list[str]:
-    """Names of the statistics that compare poses or landmarks with what the filter did not compute itself."""
-    found = [s.name for comparison in comparisons if comparison.accuracy for s in comparison.statistics]
-    return [name for name in found if name != RESIDUALS]
 
 
 def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
@@ -255,6 +250,30 @@ def judge(statistics: Sequence[Statistic], independent: Sequence[str] = (), path
     else:
         reason = "nothing in the run says how large its errors are beside what it claims"
     return Verdict(path, "cannot tell", reason)
+
+
+def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
+    """The verdict on a run from all its comparisons, the truth's first and its own statistics among them."""
+    statistics = [statistic for comparison in comparisons for statistic in comparison.statistics]
+    by_name = {comparison.against: comparison for comparison in comparisons if comparison.accuracy}
+    accuracy, figures, key = PathGrade().sentence, {}, "position_rmse_m"
+    if "groundtruth" in by_name:
+        accuracy, figures = by_name["groundtruth"].accuracy, by_name["groundtruth"].figures
+    elif by_name:
+        best = by_name.get("relations", by_name.get("gtsam", next(iter(by_name.values()))))
+        accuracy = best.accuracy
+        if best.against != "relations":
+            accuracy += " How far it is from the truth is not known."
+        figures, key = best.figures, "filter_minus_batch_rmse_m"
+    lost, frames = None, 0
+    with suppress(InputError):
+        able = {"lost", "assumed"} & record.table("diagnostics.csv").keys()
+        lost, frames = int(lost_frames(record).sum()) if able else None, len(record.trajectory)
+    path = grade_path(accuracy, figures.get(key), figures.get("path_spread_m"), lost, frames)
+    # Those that compare poses or landmarks with what the filter did not compute itself.
+    independent = [s.name for c in comparisons if c.accuracy for s in c.statistics if s.name != RESIDUALS]
+    verdict = judge(statistics, independent, path)
+    return replace(verdict, advice=noise_advice(record, statistics))
 
 
 def described(statistic: Statistic) -> str:

@@ -16,21 +16,11 @@ from typing import TYPE_CHECKING
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder, write_text
 from rbpf.runs.folder import write_summary
-from rbpf.runs.plots import World, tracking_losses
+from rbpf.runs.plots import World
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import associate, read_tum
-from rbpf.validation.consistency.comparison import (
-    Comparison,
-    PathGrade,
-    Verdict,
-    compare_with_itself,
-    grade_path,
-    independent_names,
-    judge,
-    noise_advice,
-    read_comparisons,
-    write_comparison,
-)
+from rbpf.validation.consistency import comparison as verdicts
+from rbpf.validation.consistency.comparison import Comparison, Verdict
 from rbpf.validation.metrics.accuracy import ate, rpe
 
 if TYPE_CHECKING:
@@ -60,7 +50,7 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
 
     comparison, found = compare_with_batch(record, optimum)
     comparison = replace(comparison, pictures=plot_against_batch(found, record.folder, World.of(record)))
-    write_comparison(record.folder, comparison)
+    verdicts.write_comparison(record.folder, comparison)
     return comparison
 
 
@@ -143,10 +133,10 @@ def validate(folder: Path, against: str, out: Path | None = None, file: Path | N
     except InputError as error:
         write_report(folder, [f"Not compared with {against}: {error}."])
         raise
-    write_comparison(folder, comparison)
+    verdicts.write_comparison(folder, comparison)
     if out is not None:
         prepare_folder(out)
-        write_comparison(out, comparison)
+        verdicts.write_comparison(out, comparison)
     return write_report(folder)
 
 
@@ -161,14 +151,14 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     # Comparisons in the folder, the truth's first, and the run's own statistics.
     comparisons: list[Comparison] = []
     try:
-        comparisons = sorted(read_comparisons(folder), key=lambda c: (c.against != "groundtruth", c.against))
+        comparisons = sorted(verdicts.read_comparisons(folder), key=lambda c: (c.against != "groundtruth", c.against))
     except InputError as error:
         problems.append(f"{error}.")
     try:
-        comparisons.append(compare_with_itself(record))
+        comparisons.append(verdicts.compare_with_itself(record))
     except InputError as error:
         problems.append(f"{error}.")
-    verdict = verdict_of(record, comparisons)
+    verdict = verdicts.verdict_of(record, comparisons)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
     drawn |= {own for name, own in _SAME.items() if name in drawn}
     own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
@@ -196,28 +186,6 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     )
     write_text(folder / PAGE, page)
     return verdict
-
-
-def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
-    """The verdict on a run from all its comparisons, the truth's first and its own statistics among them."""
-    statistics = [statistic for comparison in comparisons for statistic in comparison.statistics]
-    by_name = {comparison.against: comparison for comparison in comparisons if comparison.accuracy}
-    accuracy, figures, key = PathGrade().sentence, {}, "position_rmse_m"
-    if "groundtruth" in by_name:
-        accuracy, figures = by_name["groundtruth"].accuracy, by_name["groundtruth"].figures
-    elif by_name:
-        best = by_name.get("relations", by_name.get("gtsam", next(iter(by_name.values()))))
-        accuracy = best.accuracy
-        if best.against != "relations":
-            accuracy += " How far it is from the truth is not known."
-        figures, key = best.figures, "filter_minus_batch_rmse_m"
-    try:
-        lost, frames = tracking_losses(record)
-    except InputError:
-        lost, frames = None, 0
-    path = grade_path(accuracy, figures.get(key), figures.get("path_spread_m"), lost, frames)
-    verdict = judge(statistics, independent_names(comparisons), path)
-    return replace(verdict, advice=noise_advice(record, statistics))
 
 
 def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
