@@ -27,7 +27,7 @@ from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
+from rbpf.runs.recordings import LogSource, Opened, filter_opened, open_robot_log
 from rbpf.runs.trajectory import Alignment, Trajectory, in_space
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera.points import CameraRay
@@ -37,6 +37,7 @@ from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.validation.gtsam import robot
@@ -182,8 +183,10 @@ def camera_causes(
     changes[f"{MANY}× particles"] = log, replace(config, particles=MANY * config.particles), None
     for name, (measured, settings, wrapped) in changes.items():
         on_change(name)
-        more = {} if wrapped is None else {"wrapped": wrapped}
-        runs = [filter_features(measured, replace(settings, seed=seed), **more) for seed in seeds]
+        of_seed = [replace(settings, seed=seed) for seed in seeds]
+        slams = [MonoSlam(measured.camera, one, measured.known, wrapped=wrapped) for one in of_seed]
+        opened = [Opened(slam, LogSource(measured), measured.stamps_ns, measured.truth) for slam in slams]
+        runs = [filter_opened(one) for one in opened]
         out.append(Cause(name, tuple(error(whole, run.log.poses) for run in runs), found))
     return out
 

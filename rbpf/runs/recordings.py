@@ -1,6 +1,6 @@
 """What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from rbpf.core.models import Sensor
 from rbpf.errors import InputError
 from rbpf.motion.odometry import Odometry
 from rbpf.runs.files import CHECKPOINT, prepare_folder
@@ -245,9 +244,7 @@ def open_pairs(sequence: readers.ImageSequence, config: StereoConfig) -> Opened:
     return Opened(StereoSlam(sequence.rig, config), sequence, sequence.stamps_ns, sequence.truth)
 
 
-def open_features(
-    log: FeatureLog, config: MonoConfig | StereoConfig, wrapped: Callable[[Sensor], Sensor] | None = None
-) -> Opened:
+def open_features(log: FeatureLog, config: MonoConfig | StereoConfig) -> Opened:
     """A log of named features, of one camera or of a rectified pair, as the settings are.
 
     A pair's log without times, whose stamps count its frames, is taken as one frame per second.
@@ -263,7 +260,7 @@ def open_features(
     else:
         if not isinstance(log.camera, Pinhole):
             raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
-        system = MonoSlam(log.camera, config, log.known, wrapped=wrapped)
+        system = MonoSlam(log.camera, config, log.known)
     return Opened(system, LogSource(log), stamps, log.truth)
 
 
@@ -314,14 +311,9 @@ def filter_opened(
     return run
 
 
-def filter_features(
-    log: FeatureLog,
-    config: MonoConfig | StereoConfig,
-    wrapped: Callable[[Sensor], Sensor] | None = None,
-    listeners: Iterable[Listener] = (),
-) -> Run:
+def filter_features(log: FeatureLog, config: MonoConfig | StereoConfig, listeners: Iterable[Listener] = ()) -> Run:
     """A log of named features, filtered to its end; a frame that cannot be filtered is an error."""
-    run = filter_opened(open_features(log, config, wrapped), listeners)
+    run = filter_opened(open_features(log, config), listeners)
     if run.failure is not None:
         raise InputError(run.failure)
     return run

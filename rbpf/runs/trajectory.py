@@ -147,7 +147,14 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
     spread_x, spread_y = (float(np.sqrt(np.square(d).sum(1).mean())) for d in (dx, dy))
     noise = float(np.abs(x).max()) * spread_y + float(np.abs(y).max()) * spread_x
     rank = int((singular > 32.0 * float(np.finfo(float).eps) * noise).sum())
-    rotation = _closest_rotation(u, vt.T, rank)
+    # Within the null spaces every orthogonal matrix fits; the one of largest trace turns least.
+    v = vt.T
+    left, _, right_t = np.linalg.svd(np.einsum("ki,kj->ij", u[:, rank:], v[:, rank:]))
+    u = np.concatenate([u[:, :rank], np.einsum("ij,jk->ik", u[:, rank:], left)], axis=1)
+    v = np.concatenate([v[:, :rank], np.einsum("ij,kj->ik", v[:, rank:], right_t)], axis=1)
+    signs = np.ones(len(u))
+    signs[-1] = np.sign(np.linalg.det(u) * np.linalg.det(v))
+    rotation = np.asarray(np.einsum("ij,j,kj->ik", u, signs, v))
     variance = np.square(dx).sum() / len(x)
     scale = float((rotation * cov_yx).sum() / variance) if with_scale and rank else 1.0
     translation = centre_y - scale * np.einsum("ij,j->i", rotation, centre_x)
@@ -173,16 +180,6 @@ def _checked(estimate_points: ArrayLike, reference_points: ArrayLike) -> tuple[A
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise InputError("Expected points with finite coordinates to align.")
     return x, y
-
-
-def _closest_rotation(u: Array, v: Array, rank: int) -> Array:
-    # Within the null spaces every orthogonal matrix fits; the one of largest trace turns least.
-    left, _, right_t = np.linalg.svd(np.einsum("ki,kj->ij", u[:, rank:], v[:, rank:]))
-    u = np.concatenate([u[:, :rank], np.einsum("ij,jk->ik", u[:, rank:], left)], axis=1)
-    v = np.concatenate([v[:, :rank], np.einsum("ij,kj->ik", v[:, rank:], right_t)], axis=1)
-    signs = np.ones(len(u))
-    signs[-1] = np.sign(np.linalg.det(u) * np.linalg.det(v))
-    return np.asarray(np.einsum("ij,j,kj->ik", u, signs, v))
 
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
