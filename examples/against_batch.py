@@ -6,12 +6,12 @@ Works for a run in memory (`compare_run`) and for a folder that `rbpf run` left 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rbpf.runs.files import write_table
 from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import compare_run
 from rbpf.validation.report.comparison_pictures import plot_against_batch
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.tables import write_table
 
 
 def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:

@@ -6,6 +6,7 @@ The reconstruction shares the images and the calibration with the filter and not
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rbpf.runs.files import write_table
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import MonoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole
@@ -16,7 +17,6 @@ from rbpf.validation.exports import export_colmap, export_ply
 from rbpf.validation.report.comparison_pictures import plot_against_colmap
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.tables import write_table
 
 
 def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:

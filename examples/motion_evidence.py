@@ -25,8 +25,8 @@ from target_tracking import (
 )
 
 from rbpf import SE2, Filter, KalmanSubstate, MotionModel, Transition
+from rbpf.runs.files import write_table
 from rbpf.validation.consistency.model_comparison import EvidenceDifference, evidence_difference
-from rbpf.validation.tables import write_table
 
 TURN_RATES = {"turns": 0.02, "goes straight on": 0.0}  # true mean turn rate [rad/s]
 SPEED = 4.0  # [m/s]

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import tyro
 
+from rbpf.runs.files import write_table
 from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.finish import finish_run
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.tables import write_table
 
 FIGURES = ("odometry_path_rmse_m", "path_rmse_m", "batch_path_rmse_m", "nis_per_dof", "ess_mean")
 

@@ -11,9 +11,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from rbpf.runs.files import write_table
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.sweep import SweepFile, plan, sweep
-from rbpf.validation.tables import write_table
 
 OPTIONS = {
     "bootstrap": {"proposal.kind": "prior"},

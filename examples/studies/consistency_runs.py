@@ -24,6 +24,7 @@ from rbpf.core.diagnostics import Band, ancestors_by_step, chi_square_band, coal
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.run import Run
 from rbpf.runs.truth import truth_at
@@ -35,7 +36,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.statistic import PROBABILITIES, whitened_errors
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
-from rbpf.validation.tables import write_csv, write_table
 
 
 @dataclass(frozen=True)
@@ -426,7 +426,7 @@ def main(
     rows.sort(key=lambda row: str(row[0]))
     write_table(out / "consistency.csv", header, rows)
     steps_of = [[t, *(float(curve[t]) for curve in curves.values())] for t in range(steps)]
-    write_csv(out / "nees.csv", ["step", *curves], steps_of)
+    write_table(out / "nees.csv", ["step", *curves], steps_of, shown=False)
     out.mkdir(parents=True, exist_ok=True)
     figure.savefig(out / "consistency.png", dpi=110)
     print(f"picture and tables in {out}")

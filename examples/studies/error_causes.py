@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import RunFolder
@@ -46,7 +47,6 @@ from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.gtsam.self_calibration import adjust_near, refine_calibration
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.tables import write_table
 
 AS_IT_IS, BATCH, FROM_FILTER = "as it is", "batch", "batch started from the filter"
 ONLINE = "batch of what was measured until then"

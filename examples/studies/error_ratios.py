@@ -17,6 +17,7 @@ import numpy as np
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.runs.files import write_table
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import (
@@ -40,7 +41,6 @@ from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.tables import write_table
 
 HEADER = ("recording", "particles", "seeds", "filter_m", "least_m", "most_m", "batch_m", "ratio")
 """Of a table of `ErrorRatio.row`."""

@@ -33,6 +33,7 @@ from examples.studies.image_faults import (
 from examples.studies.mono_blackouts import pose_differences
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.recordings import filter_opened, open_mono, open_pairs
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
@@ -41,7 +42,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.tables import write_csv, write_table
 
 NONE = "none"
 RIGHT_M, RIGHT_DEG = 0.03, 2.0
@@ -238,7 +238,12 @@ def main(frames: int = 150, kills: int = 5, out: Path = Path("demo/faults"), qui
     cells = [[o.system, o.fault, o.verdict, o.lost, 1e3 * o.rmse_m, 1e3 * o.last_m, o.last_deg] for o in outcomes]
     header = ["system", "fault", "outcome", "frames lost", "error [mm]", "at the end [mm]", "[deg]"]
     write_table(out / "images.csv", header, cells)
-    write_csv(out / "said.csv", ["system", "fault", "what is said"], [[o.system, o.fault, o.said] for o in outcomes])
+    write_table(
+        out / "said.csv",
+        ["system", "fault", "what is said"],
+        [[o.system, o.fault, o.said] for o in outcomes],
+        shown=False,
+    )
     draw(outcomes, out / "faults.png")
     machine = of_machine(desk, out, kills, quick)
     write_table(out / "machine.csv", MACHINE, [[name, e.code, str(e.traceback), e.said] for name, e in machine.items()])

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from examples.studies.consistency_runs import Mean
 from examples.studies.joint_map import JOINT, PARTICLES, RECORDINGS, loops
 from rbpf.lie import SE2
+from rbpf.runs.files import write_table
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.runs.run import Run
@@ -27,7 +28,6 @@ from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.metrics.scores import score_estimate
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
-from rbpf.validation.tables import write_table
 
 SPACING = 4.0
 """Between the two doors, metres."""

@@ -20,6 +20,7 @@ from examples.studies.joint_ekf import joint_ekf
 from examples.studies.parallel import in_parallel
 from examples.studies.point_worlds import STEREO, Measuring, RoomWorld, simulate_features
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.truth import truth_at
@@ -32,7 +33,6 @@ from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.metrics.scores import score_estimate
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
-from rbpf.validation.tables import write_table
 
 JOINT = RangeBearingConfig(map="joint")
 PARTICLES = RangeBearingConfig(map="particles", likelihood=LikelihoodConfig("gaussian"))

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 
 from examples.studies.parallel import in_parallel
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.plots import save_figures
 from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
@@ -38,7 +39,6 @@ from rbpf.systems.mono.relocalisation import Attempt
 from rbpf.systems.system import Tracked
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.tables import Cell, write_csv, write_table
 
 SETTLED_S = 1.0
 """The pose is judged when the camera has been tracked again for so long."""
@@ -331,7 +331,7 @@ def simulated(out: Path, frames: int, quick: bool) -> list[Path]:
     return [out / name for name in worlds]
 
 
-def line(series: Series) -> list[Cell]:
+def line(series: Series) -> list[str | int | float]:
     """Of the first table."""
     verdicts = [series.verdict(one) for one in series.outcomes]
     fair = [one.visible >= LEAST_VISIBLE for one in series.outcomes]
@@ -343,7 +343,7 @@ def line(series: Series) -> list[Cell]:
     return [series.name, len(verdicts), *counts, float(np.mean(right)), float(in_view), typical]
 
 
-def details(series: Series, number: int) -> list[Cell]:
+def details(series: Series, number: int) -> list[str | int | float]:
     """Of one blackout."""
     one = series.outcomes[number]
     metres, degrees = series.error(one)
@@ -422,7 +422,7 @@ def main(
         "sequence", "frame", "verdict", "way [m]", "in view", "found after [s]", "error [m]", "undisturbed [m]",
         "error [°]", "pairs", "agreeing", "lost frame [ms]",
     ]  # fmt: skip
-    write_csv(out / "blackouts.csv", header, rows)
+    write_table(out / "blackouts.csv", header, rows, shown=False)
     if any(row[2] != "rightly" for row in rows):
         write_table(out / "failures.csv", header, [row for row in rows if row[2] != "rightly"])
     save_figures({"mono_blackouts.png": draw(all_series)}, out)

@@ -22,11 +22,11 @@ from examples.studies.parallel import in_parallel
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.core.diagnostics import Band, chi_square_band, chi_square_quantile
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.recordings import filter_features as run
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.tables import write_csv, write_table
 
 SETTINGS = {
     "50 particles": MonoConfig(particles=50),
@@ -114,7 +114,7 @@ def main(
         worst = f"{of_name.mean():.2f} (worst {of_name.max():.2f})"
         print(f"{name}: {times:.2f} times the batch's error, NEES / 6 {worst}, {fraction:.0f} % in the 95 % region")
     mean = nees.mean(axis=0)
-    write_csv(out / "nees.csv", ["frame", *names], [[t, *mean[:, t].tolist()] for t in range(frames)])
+    write_table(out / "nees.csv", ["frame", *names], [[t, *mean[:, t].tolist()] for t in range(frames)], shown=False)
     draw(names, mm, mean, band, out / "mono_desk.png")
     print(f"picture and tables in {out}")
     return {

@@ -20,6 +20,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from rbpf.runs.files import write_table
 from rbpf.runs.plots import save_figures
 from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
@@ -30,7 +31,6 @@ from rbpf.systems.system import Tracked
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.textured_scene import ImageWorld
-from rbpf.validation.tables import write_table
 
 SMOOTH_FRACTION = 0.05
 """The noise is read off this fraction of an image's blocks, the smoothest."""

@@ -20,7 +20,8 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
-from rbpf.validation.simulation.paths import HandHeld, frame_stamps, looking
+from rbpf.validation.simulation.paths import HandHeld, looking
+from rbpf.validation.simulation.textured_scene import EPOCH_NS, stamps_ns
 
 SURFACE = 1e-6
 """Fraction of the line of sight that may lie in a block: a point on a block's face is seen from the front."""
@@ -145,7 +146,7 @@ class DeskWorld(Ranged):
         draw = outside(lambda count: half * [0, 0, 1] + rng.uniform(-half, half, (count, 3)), blocks)
         points, present = populated(draw, self.points, self.frames, self.renewal / self.rate_hz, rng)
         path = self.hand.poses(np.arange(self.frames) / self.rate_hz, self.size_m, rng)
-        return Scene("desk", frame_stamps(self.frames, self.rate_hz), path, points, present, blocks)
+        return Scene("desk", stamps_ns(self.frames, self.rate_hz) - EPOCH_NS, path, points, present, blocks)
 
 
 PRINTED = {textures.picture, textures.page, textures.carton, textures.spines}
@@ -189,7 +190,7 @@ class LabWorld(Ranged):
 
         points = outside(draw, blocks)(self.points)
         path = world_from_camera(self.drive.travelled().world_from_robot)[images]
-        stamps = frame_stamps(int(images[-1]) + 1, RATE_HZ)[images]
+        stamps = stamps_ns(int(images[-1]) + 1, RATE_HZ)[images] - EPOCH_NS
         present = np.tile([0, len(images)], (self.points, 1))
         return Scene("lab", stamps, path, points, present, blocks)
 
@@ -219,7 +220,7 @@ class RoomWorld(Ranged):
         angle = 2.0 * np.pi * self.laps * np.arange(self.frames) / self.frames
         place = np.stack([2.5 * np.cos(angle), 2.5 * np.sin(angle), 0.15 * np.sin(3.0 * angle)], axis=-1)
         ahead = np.stack([np.cos(angle + np.pi / 4), np.sin(angle + np.pi / 4), 0.1 * np.sin(5.0 * angle)], axis=-1)
-        path, stamps = looking(place, ahead), frame_stamps(self.frames, self.rate_hz)
+        path, stamps = looking(place, ahead), stamps_ns(self.frames, self.rate_hz) - EPOCH_NS
         present, blocks = np.tile([0, self.frames], (self.points, 1)), np.zeros((0, 2, 3))
         return Scene("room", stamps, path, points, present, blocks)
 

@@ -23,7 +23,7 @@ import tyro
 from examples.studies.e06 import depth_from_images, long_run, loop, many_landmarks, new_landmarks, plane, still_camera
 from examples.studies.e06.setting import Row, Setting
 from rbpf.errors import InputError
-from rbpf.validation.tables import write_table
+from rbpf.runs.files import write_table
 
 FIGURES: dict[int, Callable[[Setting], list[Row]]] = {
     2: depth_from_images.reproduce,

@@ -21,8 +21,8 @@ from examples.studies.s05.pictures import draw_errors, draw_maps, draw_time
 from examples.studies.s05.record import Paths, Record, best_particle, errors, paths_of
 from examples.studies.s05.sweeps import HEADER, sweep
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.run import Run
-from rbpf.validation.tables import write_table
 
 PAPER = {191: (812, 0.62, 2109), 400: (1542, 4.02, 4194), 600: (2206, 6.87, 6264), 800: (2625, 11.48, 7674),
          997: (3103, 14.98, 9399), 1200: (3773, 18.69, 11424), 1396: (4353, 22.22, 13254),

@@ -25,13 +25,13 @@ from rbpf.core.filter import Filter
 from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.runs.files import write_table
 from rbpf.runs.folder import peak_memory_mb
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
-from rbpf.validation.tables import write_csv, write_table
 
 Step = Callable[[Any, int], np.ndarray]
 """Filters a frame, the first one being number 0, and tells the position (D,) that it estimates."""
@@ -212,7 +212,7 @@ def run(job: Job) -> list[Window]:
         done = soak(robot, *robot_steps(robot, config), job.frames, job.every)
     for window in done:
         windows.append(window)
-        write_csv(job.out / f"{job.system}.csv", COLUMNS, [list(astuple(row)) for row in windows])
+        write_table(job.out / f"{job.system}.csv", COLUMNS, [list(astuple(row)) for row in windows], shown=False)
     return windows
 
 

@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.recordings import filter_features
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.simulation.lab import LabDrive
-from rbpf.validation.tables import write_table
 
 DIM = 6
 """Of a pose: what the NEES of an honest filter is on the average."""

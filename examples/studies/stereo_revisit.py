@@ -20,6 +20,7 @@ from examples.studies.feature_cache import cache_features, filter_cached
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
+from rbpf.runs.files import write_table
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.recordings import filter_features
 from rbpf.runs.run import Run
@@ -31,7 +32,6 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.scores import score_path
 from rbpf.validation.simulation.lab import LabDrive
-from rbpf.validation.tables import write_table
 
 
 @final

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.runs.files import write_table
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import new_axes, save_figures
 from rbpf.runs.reading import RunFolder
@@ -32,7 +33,6 @@ from rbpf.validation.gtsam.batch_problem import connected_frames
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.observations import ObservationTable, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import BatchSolution
-from rbpf.validation.tables import write_table
 
 LEAST_HELD = 3
 """Held points, not on a line, that fix the gauge."""

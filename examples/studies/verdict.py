@@ -24,6 +24,7 @@ import tyro
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.core.models import Jacobians
 from rbpf.lie import SE2, SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.folder import write_run
 from rbpf.runs.plots import new_axes, save_figures
 from rbpf.runs.reading import RunFolder
@@ -39,7 +40,6 @@ from rbpf.validation.consistency.against_groundtruth import LANDMARKS, NEES, com
 from rbpf.validation.consistency.comparison import Verdict, compare_with_itself, verdict_of
 from rbpf.validation.consistency.statistic import STATE_FACTOR
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
-from rbpf.validation.tables import write_table
 
 
 def scale_sensor_noise(log: RobotLog, factor: float) -> RobotLog:

@@ -131,3 +131,19 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
     writer.writerow(header)
     writer.writerows(rows)
     write_text(path, buffer.getvalue())
+
+
+def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]], shown: bool = True) -> None:
+    """A table of figures as CSV, numbers with six digits; `shown` also prints it in columns, with three. Makes the folder."""
+
+    def text(cell: Any, digits: int) -> str:
+        if isinstance(cell, float):
+            return f"{cell:.0f}" if 1000 <= abs(cell) < 1e6 else f"{cell:.{digits}g}"
+        return str(cell)
+
+    prepare_folder(path.parent)
+    write_csv(path, header, [[text(cell, 6) for cell in row] for row in rows])
+    lines = [list(header), *([text(cell, 3) for cell in row] for row in rows)] if shown else []
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for first, *others in lines:
+        print("  ".join([first.ljust(widths[0]), *(c.rjust(w) for c, w in zip(others, widths[1:], strict=True))]))

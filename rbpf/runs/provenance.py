@@ -5,6 +5,7 @@ import json
 import platform
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -65,10 +66,8 @@ def library_versions() -> dict[str, str]:
     """Python, the libraries that compute, and the processor's instructions that they choose among."""
     found = {"python": platform.python_version(), "instructions": instruction_set()}
     for name in LIBRARIES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 

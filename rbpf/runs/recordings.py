@@ -98,12 +98,10 @@ class MonoRecording:
     def __post_init__(self) -> None:
         if len(self.topics.images) > 1:
             raise InputError(f"one camera has one topic of images: give one of {' and '.join(self.topics.images)}")
-        starts = self.known_points, self.board, self.markers
-        if self.known_points is not None and self.board is not None:
-            raise InputError("a run starts from known points or from a chessboard: give one of the two")
-        if self.markers is not None and any(start is not None for start in starts[:2]):
+        starts = sum(start is not None for start in (self.known_points, self.board, self.markers))
+        if starts > 1:
             raise InputError("a run starts from markers, a chessboard or known points: give one of the three")
-        if self.map is not None and any(start is not None for start in starts):
+        if self.map is not None and starts:
             raise InputError("in a known map a run starts from the map: leave out known points and chessboard")
 
     def open(self, config: MonoConfig) -> Opened:
@@ -179,9 +177,8 @@ class LaserRecording:
     """A laser scanner's log."""
 
     log: Path  #: file or folder of a known kind.
-    options: readers.LaserOptions = field(
-        default_factory=readers.LaserOptions
-    )  #: what it leaves open, and which of its scans.
+    #: what it leaves open, and which of its scans.
+    options: readers.LaserOptions = field(default_factory=readers.LaserOptions)
 
     def open(self, config: LaserConfig) -> Opened:
         log = readers.read_laser_log(self.log, self.options)

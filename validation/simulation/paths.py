@@ -9,7 +9,7 @@ W = 10 x³ - 15 x⁴ + 6 x⁵: the curvature, its first derivative and those of 
 agree at both ends.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -49,11 +49,6 @@ class Wave:
         return (self.amplitude * np.sin(angle)).sum(axis=-1)
 
 
-def frame_stamps(frames: int, rate_hz: float) -> np.ndarray:
-    """(T,) int64 nanoseconds of the frames, the first at 0."""
-    return np.round(np.arange(frames) * 1e9 / rate_hz).astype(np.int64)
-
-
 def eased(seconds: np.ndarray, start_s: float) -> np.ndarray:
     """Time (T,) of a camera that is held still at first and reaches its pace after `start_s`.
 
@@ -72,17 +67,6 @@ def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
     columns = np.stack([right, np.cross(forward, right), forward, eye], axis=-1)
     return SE3.from_matrix(columns)
-
-
-def slowed(
-    path: Callable[[np.ndarray], np.ndarray], seconds: np.ndarray, speed_m_s: float, turn_rad_s: float
-) -> Callable[[np.ndarray], np.ndarray]:
-    """The path, poses (T, 7) at times (T,), as slow as it takes that neither limit is passed at the `seconds` (T,)."""
-    poses = path(seconds)
-    step = SE3.local(poses[:-1], poses[1:]) / np.diff(seconds)[:, None]
-    turn, speed = (float(np.linalg.norm(part, axis=1).max()) for part in (step[:, :3], step[:, 3:]))
-    pace = min(1.0, 1.0 / max(turn / turn_rad_s, speed / speed_m_s))
-    return lambda time: path(pace * time)
 
 
 def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np.ndarray:
@@ -140,8 +124,12 @@ class HandHeld:
             target = wave[:, :3] - start
             return shaken(looking(target + distance * away, -away), wrist, time)
 
-        time = eased(seconds, self.start_s)
-        return shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
+        # As slow as it takes that neither limit is passed.
+        poses, time = sweep(seconds), eased(seconds, self.start_s)
+        step = SE3.local(poses[:-1], poses[1:]) / np.diff(seconds)[:, None]
+        turn_rad_s, speed_m_s = (float(np.linalg.norm(part, axis=1).max()) for part in (step[:, :3], step[:, 3:]))
+        pace = min(1.0, 1.0 / max(turn_rad_s / self.turn_rad_s, speed_m_s / self.speed_m_s))
+        return shaken(sweep(pace * time), tremor, time)
 
 
 KNOTS = 257  #: Of the table that gives the fraction of a bend for the way along it.

@@ -28,7 +28,6 @@ from rbpf.lie import SE3
 from rbpf.ranges import NotNegative, check_ranges
 from rbpf.sensors.calibration import Board
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
-from rbpf.validation.simulation.paths import frame_stamps
 from rbpf.validation.simulation.textures import Paint, chessboard, faded
 
 #: Stamp of the first image: all stamps have as many digits, so that file names sort by time.
@@ -90,8 +89,8 @@ class ImageWorld(Protocol):
 
 
 def stamps_ns(frames: int, rate_hz: float) -> np.ndarray:
-    """(T,) int64 nanoseconds of the frames."""
-    return EPOCH_NS + frame_stamps(frames, rate_hz)
+    """(T,) int64 nanoseconds of the frames, the first at `EPOCH_NS`."""
+    return EPOCH_NS + np.round(np.arange(frames) * 1e9 / rate_hz).astype(np.int64)
 
 
 def sides(rectangles: Sequence[Rectangle]) -> np.ndarray:

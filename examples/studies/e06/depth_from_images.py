@@ -6,6 +6,7 @@ from examples.studies.e06.depth_curves import Passing, Shape, draw_curves, shape
 from examples.studies.e06.setting import Row, Setting, true_poses
 from examples.studies.e06.worlds import SidewaysDesk
 from rbpf.lie import SE3
+from rbpf.runs.files import write_table
 from rbpf.runs.plots import save_figures
 from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut, search, warp
@@ -13,7 +14,6 @@ from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX
 from rbpf.validation.simulation.textured_scene import cast
-from rbpf.validation.tables import write_csv
 
 NEAREST_M, FARTHEST_M = 0.2, 20.0
 FEATURES = 40
@@ -65,7 +65,9 @@ def reproduce(setting: Setting) -> list[Row]:
     medians = np.median(divergence, axis=1), np.median(skewness, axis=1)
     header = ["observations", "KL depth", "KL inverse", "skewness depth", "skewness inverse"]
     table = np.concatenate(medians).T.tolist()
-    write_csv(setting.out / "figure_2.csv", header, [[k, *line] for k, line in enumerate(table, start=1)])
+    write_table(
+        setting.out / "figure_2.csv", header, [[k, *line] for k, line in enumerate(table, start=1)], shown=False
+    )
     return _rows(*medians, px.shape[0])
 
 
