@@ -20,7 +20,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -43,7 +43,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate, score_path
+from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate
 
 ROWS = "rows.jsonl"
 TABLE = "table.csv"
@@ -264,12 +264,11 @@ def _figures(run: Run) -> Row:
     """What a run's summary and scores say, without writing them."""
     figures, log, truth = summarise(run), run.log, run.truth
     if truth is not None:
-        anonymous = getattr(run.system.config, "association", "") == "ml"
-        figures |= score_estimate(PathAndMap.of_run(run), truth, anonymous)
+        anonymous, others = getattr(run.system.config, "association", "") == "ml", {}
         if "odometry" in log:
-            reference = in_space(log.stamps_ns[truth.rows], truth.poses)
             prefix = ODOMETRY_PREFIX.get(run.system.name, "odometry_")
-            figures |= score_path(in_space(log.stamps_ns, log["odometry"]), reference, truth, prefix)
+            others[prefix] = in_space(log.stamps_ns, log["odometry"])
+        figures |= score_estimate(PathAndMap.of_run(run), truth, anonymous, others)
     if truth is not None and truth.alignment == "none":
         # Mean over the steps, of d degrees of freedom; nothing where the truth is not given in the filter's world.
         errors = whitened_errors(run.system.space, log.poses[truth.rows], log.covs[truth.rows], truth.poses)
@@ -284,30 +283,21 @@ def _results(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterat
 
     if not jobs:
         return
-    with _cluster(scheduler):
-        backend = {"n_jobs": workers} if scheduler is None else {"backend": "dask"}
-        with parallel_config(**backend):
-            parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
-            with closing(parallel(delayed(run_job)(job) for job in jobs)) as rows:
-                yield from rows
+    backend: dict[str, Any] = {"n_jobs": workers}
+    client: Any = nullcontext()
+    if scheduler is not None:
+        try:
+            from distributed import Client
 
-
-@contextmanager
-def _cluster(scheduler: str | None) -> Iterator[None]:
-    """A connection to a Dask scheduler, if one is named."""
-    if scheduler is None:
-        yield
-        return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError("a sweep on a cluster needs Dask: pip install 'rbpf[cluster]'") from error
-    try:
-        client = Client(scheduler, timeout=SECONDS)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise InputError(f"no Dask scheduler answers at {scheduler} within {SECONDS} s: {error}") from error
-    with client:
-        yield
+            backend, client = {"backend": "dask"}, Client(scheduler, timeout=SECONDS)
+        except ImportError as error:
+            raise InputError("a sweep on a cluster needs Dask: pip install 'rbpf[cluster]'") from error
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError(f"no Dask scheduler answers at {scheduler} within {SECONDS} s: {error}") from error
+    with client, parallel_config(**backend):
+        parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+        with closing(parallel(delayed(run_job)(job) for job in jobs)) as rows:
+            yield from rows
 
 
 def _flat(row: Row) -> Row:

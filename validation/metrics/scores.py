@@ -57,15 +57,13 @@ def score_run(found: RunFolder) -> dict[str, Any]:
 
     Those of the odometry begin with `odometry_` (in a stereo run with `vo_`), those of the optimum with `batch_`.
     """
-    entries: dict[str, Any] = {}
-    if (found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST:
-        truth = found.truth
-        entries |= {"alignment": truth.alignment} | score_estimate(found.estimate, truth, is_anonymous(found))
-        reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
-        for name, prefix in ((ODOMETRY, ODOMETRY_PREFIX.get(found.system, "odometry_")), (BATCH, "batch_")):
-            if (found.folder / name).is_file():
-                entries |= score_path(read_tum(found.folder / name), reference, truth, prefix)
-    return entries
+    if not ((found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST):
+        return {}
+    files = {ODOMETRY_PREFIX.get(found.system, "odometry_"): ODOMETRY, "batch_": BATCH}
+    there = {prefix: found.folder / name for prefix, name in files.items() if (found.folder / name).is_file()}
+    others = {prefix: read_tum(path) for prefix, path in there.items()}
+    scores = score_estimate(found.estimate, found.truth, is_anonymous(found), others)
+    return {"alignment": found.truth.alignment} | scores
 
 
 def is_anonymous(found: RunFolder) -> bool:
@@ -73,14 +71,22 @@ def is_anonymous(found: RunFolder) -> bool:
     return found.config.get("association") == "ml"
 
 
-def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
-    """Errors of a path with a pose for every frame, and of its map; `anonymous` landmarks have no names."""
+def score_estimate(
+    estimate: PathAndMap, truth: RunTruth, anonymous: bool = False, others: Mapping[str, Trajectory] | None = None
+) -> dict[str, float]:
+    """Errors of a path with a pose for every frame, and of its map; `anonymous` landmarks have no names.
+
+    `others` are further paths of the run, by what the names of their errors begin with.
+    """
     reference = in_space(estimate.stamps_ns[truth.rows], truth.poses)
     ours = estimate.at(truth.rows).trajectory
     entries: dict[str, float] = {}
     for merit in MERITS:
         entries |= merit(ours, reference, truth)
-    return entries | score_landmarks(estimate, truth, anonymous)
+    entries |= score_landmarks(estimate, truth, anonymous)
+    for prefix, path in (others or {}).items():
+        entries |= score_path(path, reference, truth, prefix)
+    return entries
 
 
 def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth, prefix: str = "") -> dict[str, float]:
