@@ -23,6 +23,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_ranges
+from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import model_of
 from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
@@ -254,8 +255,8 @@ def write_sensor(
     stamps_ns = scene.stamps_ns
     place = folder / "mav0" / sensor
     (place / "data").mkdir(parents=True)
-    rows = "".join(f"{stamp},{stamp}{suffix}\n" for stamp in stamps_ns.tolist())
-    (place / "data.csv").write_text("#timestamp [ns],filename\n" + rows, encoding="utf-8")
+    rows = ([stamp, f"{stamp}{suffix}"] for stamp in stamps_ns.tolist())
+    write_csv(place / "data.csv", ["#timestamp [ns]", "filename"], rows)
     seconds = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
     rate = (len(stamps_ns) - 1) / seconds if seconds else 0.0
     matrix = np.eye(4)
@@ -331,13 +332,11 @@ def simulate_images(
     renderer = Renderer(scene.rectangles, left, imaging.grid)
     shutter, suffix = Shutter(scene, imaging, left, renderer, rng), ".jpg" if imaging.jpeg else ".png"
     with whole_folder(folder) as partial:
-        sensors = {"cam0": 0.0}
+        write_sensor(partial, "cam0", scene, left, 0.0, suffix)
         if baseline_m is not None:
-            sensors["cam1"] = baseline_m
+            write_sensor(partial, "cam1", scene, left, baseline_m, suffix)
         if imaging.depth:
-            sensors["depth0"] = 0.0
-        for sensor, offset_m in sensors.items():
-            write_sensor(partial, sensor, scene, left, offset_m, ".png" if sensor == "depth0" else suffix)
+            write_sensor(partial, "depth0", scene, left, 0.0, ".png")
         # camera.yaml: the (left) camera, and the baseline of a stereo pair.
         lens = ", ".join(left.lens.coefficient_names)
         intrinsics = zip(("fx", "fy", "cx", "cy"), left.params[:4].tolist(), strict=True)
@@ -350,31 +349,24 @@ def simulate_images(
             f"distortion: {coefficients}  # {lens} (OpenCV)",
             *([] if baseline_m is None else [f"baseline_m: {float(baseline_m)}"]),
         ]
-        (partial / "camera.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_text(partial / "camera.yaml", "\n".join(lines) + "\n")
         # Ground truth: poses and velocities in the world [m/s]; there is no gyroscope: its biases are 0.
         place, poses = partial / "mav0" / "state_groundtruth_estimate0", scene.world_from_camera
         place.mkdir(parents=True)
         wxyz, biases = np.roll(poses[:, :4], 1, axis=1), np.zeros((len(poses), 6))
         table = np.concatenate([SE3.translation(poses), wxyz, shutter.velocities, biases], axis=1)
-        rows = [
-            ",".join([str(stamp), *(f"{x:.12g}" for x in row)])
-            for stamp, row in zip(scene.stamps_ns.tolist(), table, strict=True)
-        ]
-        text = "\n".join([",".join(TRUTH_COLUMNS), *rows]) + "\n"
-        (place / "data.csv").write_text(text, encoding="utf-8")
+        rows = zip(scene.stamps_ns.tolist(), table, strict=True)
+        write_csv(place / "data.csv", TRUTH_COLUMNS, ([stamp, *(f"{x:.12g}" for x in row)] for stamp, row in rows))
         if imaging.known:
             px, positions = known_corners(scene, renderer, left, imaging.known)
             positions = positions + imaging.known_std_m / np.sqrt(3.0) * rng.standard_normal(positions.shape)
-            lines = ["id,u_px,v_px,x_m,y_m,z_m,sigma_m"]
-            for name, (uv, xyz) in enumerate(zip(px, positions, strict=True), start=1):
-                numbers = [f"{x:.4f}" for x in uv] + [f"{x:.6f}" for x in xyz]
-                lines.append(",".join([str(name), *numbers, f"{imaging.known_std_m:g}"]))
-            (partial / "known_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+            header, std = ["id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m"], f"{imaging.known_std_m:g}"
+            texts = np.hstack([np.char.mod("%.4f", px), np.char.mod("%.6f", positions)]).tolist()
+            write_csv(partial / "known_points.csv", header, ([k, *row, std] for k, row in enumerate(texts, start=1)))
         if scene.boards:
             # Poses as [qx, qy, qz, qw, x, y, z].
             boards = [vars(board) | {"world_from_board": pose.tolist()} for board, pose in scene.boards]
-            text = yaml.safe_dump(boards, sort_keys=False)
-            (partial / "chessboard.yaml").write_text(text, encoding="utf-8")
+            write_text(partial / "chessboard.yaml", yaml.safe_dump(boards, sort_keys=False))
         if scene.odometry is not None:
             write_wheel_odometry(partial, scene.odometry)
 
