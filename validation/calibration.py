@@ -121,7 +121,7 @@ def _draw(found: BoardCalibration) -> Any:
     length = 0.02 * found.camera.width
     enlarged = length / max(found.rms_px, np.finfo(float).eps)
     title = (
-        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; residuals enlarged {enlarged:.0f} times"
+        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; residuals {enlarged:.0f} times enlarged"
     )
     label(image, title, "u [px]", "v [px]", equal=False)
     image.set_aspect("equal")

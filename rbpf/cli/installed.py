@@ -41,13 +41,8 @@ class Doctor(Printed):
             "kernels_missing": missing,
             "works": not broken,
         }
-        marks = {
-            (True, True): "works",
-            (True, False): "BROKEN",
-            (False, True): "works",
-            (False, False): "not installed",
-        }
-        lines = {part.name: f"{marks[part.needed, part.works]}: {part.says}" for part in tried}
+        fails = {True: "BROKEN", False: "not installed"}
+        lines = {part.name: f"{'works' if part.works else fails[part.needed]}: {part.says}" for part in tried}
         known = {name: number or "missing" for name, number in libraries.items()}
         kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"
         answer(entries, self.json, *table({**found, **known, **lines, "kernels": kernels}, 26))

@@ -42,9 +42,7 @@ def given_board(size: str | None, square_m: float | None) -> "Board | None":
     if size is None and square_m is None:
         return None
     if size is None or square_m is None:
-        raise InputError(
-            "a chessboard needs both its inner corners and the side of its squares: --board 9x6 --square 0.024"
-        )
+        raise InputError("a chessboard needs its inner corners and the side of its squares: --board 9x6 --square 0.024")
     from rbpf.sensors.calibration import Board
 
     return Board.parse(size, square_m)

@@ -185,9 +185,7 @@ class RunMono(ImageRunOptions):
         if self.localize != (self.map is not None):
             raise InputError("a camera is found in a known map with both: --map RUN --localize")
         if (self.aruco is None) != (self.marker is None):
-            raise InputError(
-                "a board of markers needs their number and their side: --aruco 5x7 --marker 0.04 --gap 0.01"
-            )
+            raise InputError("a board of markers needs number and side of them: --aruco 5x7 --marker 0.04 --gap 0.01")
         markers = None
         if self.aruco is not None and self.marker is not None:
             markers = MarkerBoard.parse(self.aruco, self.marker, self.gap, self.dictionary)

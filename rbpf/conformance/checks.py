@@ -511,9 +511,8 @@ def conditional_checks(
             called(part.resample, ancestors, repeat=False)
             corrected(between)
             seen.append(corrected(alike).all)
-        require_close(
-            f"{name}: descendants of one particle weigh the same differently", seen[0], seen[0][:1].repeat(n), 1e-9
-        )
+        what = f"{name}: descendants of one particle weigh the same differently"
+        require_close(what, seen[0], seen[0][:1].repeat(n), 1e-9)
         what = f"{name}: copies share memory, what one particle sees changes another"
         require_close(what, seen[1][:1], seen[0][:1], 1e-9)
 

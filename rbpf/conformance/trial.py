@@ -193,10 +193,8 @@ def require_type(what: str, value: Any, *allowed: type) -> None:
 def require_shape(what: str, array: Any, *allowed: tuple[int | None, ...]) -> None:
     """An array of one of the allowed shapes, None for any length, without NaN and infinity."""
     require(isinstance(array, np.ndarray), f"{what} is a {type(array).__name__}, expected a NumPy array")
-    fits = any(
-        len(shape) == array.ndim and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
-        for shape in allowed
-    )
+    alike = [shape for shape in allowed if len(shape) == array.ndim]
+    fits = any(all(a in (None, b) for a, b in zip(shape, array.shape, strict=True)) for shape in alike)
     expected = " or ".join(str(shape).replace("None", "any") for shape in allowed)
     require(fits, f"{what} has shape {array.shape}, expected {expected}")
     require(array.dtype.kind in "fiub", f"{what} holds {array.dtype}, expected real numbers")

@@ -147,14 +147,9 @@ class FrameLog:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """The inverse of `arrays`, into an empty log of the same system; errors as `rbpf.core.checkpoint.read`."""
         dim = self.space.dim
-        path = {
-            "stamps_ns": integers("frames"),
-            "poses": elements(self.space, "frames"),
-            "covs": numbers("frames", dim, dim),
-        }
-        columns = {
-            column.name: numbers("frames", *column.shape, dtype=column.kind, values="any") for column in self.columns
-        }
+        covs = numbers("frames", dim, dim)
+        path = {"stamps_ns": integers("frames"), "poses": elements(self.space, "frames"), "covs": covs}
+        columns = {c.name: numbers("frames", *c.shape, dtype=c.kind, values="any") for c in self.columns}
         columns["state"] = integers("frames", least=0, below="states")
         found = read(arrays, path | columns, "log/", states=len(_STATES))
         for held in (self._path, self._rows):

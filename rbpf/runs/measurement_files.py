@@ -63,12 +63,8 @@ FRAMES = "observations_frames.csv"
 KNOWN = "observations_known_points.csv"
 PLAIN = "radial-tangential"  #: The lens that is meant where none is named.
 
-_TITLES = {
-    OBSERVATIONS: "rbpf observations 1",
-    ODOMETRY: "rbpf odometry 1",
-    FRAMES: "rbpf frames 1",
-    KNOWN: "rbpf known points 1",
-}
+_FILES = {OBSERVATIONS: "observations", ODOMETRY: "odometry", FRAMES: "frames", KNOWN: "known points"}
+_TITLES = {name: f"rbpf {what} 1" for name, what in _FILES.items()}
 _HINT = "a file that every filter run writes into its folder"
 _COVARIANCE = "a positive semi-definite covariance"
 _SPACES: dict[str, SE2Group | SE3Group] = {"SE2": SE2, "SE3": SE3}

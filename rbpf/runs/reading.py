@@ -35,10 +35,8 @@ from rbpf.systems.map_estimate import MapEstimate
 
 MOST_BYTES = 1 << 30  #: No file of a run folder is larger.
 _PATH = {"stamps_ns": integers("frames"), "mean": numbers("frames", "size"), "cov": numbers("frames", "dim", "dim")}
-_CORRECTIONS = {
-    "correction": numbers("frames", "r", values="any"),
-    "cov_correction": numbers("frames", "r", "r", values="any"),
-}
+_MOVED = numbers("frames", "r", values="any"), numbers("frames", "r", "r", values="any")
+_CORRECTIONS = dict(zip(("correction", "cov_correction"), _MOVED, strict=True))
 _MAP = {
     "id": integers("landmarks"),
     "mean": numbers("landmarks", "axes", values="any"),

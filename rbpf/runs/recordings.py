@@ -125,9 +125,7 @@ class MonoRecording:
         sequence: readers.ImageSequence | LiveCamera
         if self.live is not None:
             if self.part != WHOLE:
-                raise InputError(
-                    "of a live camera all images are used, as they are: leave out start, end, every and resize"
-                )
+                raise InputError("a live camera's images are used as they are: leave out start, end, every and resize")
             sequence = LiveCamera(self.live, self.calibration)
         else:
             sequence = whole = readers.open_images(self.images, self.calibration, self.topics)

@@ -115,9 +115,7 @@ def read_truth(folder: Path, steps: int, size: int) -> RunTruth:
     """Reads truth.npz of a run of `steps` steps with poses of `size` numbers; refused where there is none for it."""
     path = folder / TRUTH
     if not path.is_file():
-        raise InputError(
-            f"{folder} has no ground truth: its recording has none; compare it with its batch optimum instead"
-        )
+        raise InputError(f"{folder} has no ground truth: its recording has none; compare it with its batch optimum")
     arrays = load_arrays(path)
     with fitting(path):
         if arrays["rows"].size and arrays["rows"].max() >= steps:

@@ -87,9 +87,7 @@ def compare_folder_with_colmap(
     """Reconstructs the images that a run folder's config.yaml names, which must still lie where they were, and compares."""
     config = read_config(folder)
     if config["system"] not in OVER_IMAGES:
-        raise InputError(
-            f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
-        )
+        raise InputError(f"{folder} is a run of the system {config['system']}; COLMAP needs a run over images.")
     sequence = recorded_images(config)
     if config["system"] == "mono" and sequence.camera.lens.is_identity:
         # Where the recording is a rectified pair, of which the run saw the left images, both take part.

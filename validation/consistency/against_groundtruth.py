@@ -70,9 +70,7 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     """
     path, truth = record.path, record.truth
     if truth.rows.size < LEAST:
-        raise InputError(
-            f"{record.folder}: {truth.rows.size} steps of the run have a true pose, a comparison needs {LEAST}"
-        )
+        raise InputError(f"{record.folder}: {truth.rows.size} steps have a true pose, a comparison needs {LEAST}")
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     positions = ate(path.at(truth.rows).trajectory, reference, truth.alignment)
     turns = 1 if path.space.dim == SE2.dim else 3

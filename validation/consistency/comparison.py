@@ -82,7 +82,7 @@ def read_comparisons(folder: Path) -> list[Comparison]:
             )
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
-                f"{path} is not a comparison of this version of rbpf: delete it and validate again"
+                f"{path} is no comparison of this version of rbpf: delete it and validate again"
             ) from error
         found.append(comparison)
     return found

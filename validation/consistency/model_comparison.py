@@ -175,12 +175,9 @@ def compare_runs(
             raise InputError(f"{record.folder}: runs of the system {record.system!r} cannot be compared by evidence")
     one, other = (RobotRecording(Path(str(record.config["recording"])), Part.of(record.config)) for record in records)
     if one != other:
-        raise InputError(
-            f"{run_a} and {run_b} are runs over different recordings, or parts of one: evidences say nothing about them"
-        )
-    configs = [
-        load_settings(RangeBearingConfig, "range-bearing", record.folder / "config.yaml", (), {}) for record in records
-    ]
+        raise InputError(f"{run_a} and {run_b} are of different recordings, or parts: evidences say nothing about them")
+    files = [record.folder / "config.yaml" for record in records]
+    configs = [load_settings(RangeBearingConfig, "range-bearing", file, (), {}) for file in files]
     return compare_evidence(configs[0], configs[1], one, range(seeds), workers, on_run)
 
 

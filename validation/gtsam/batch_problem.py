@@ -100,9 +100,7 @@ def solve_problem(
         if on_iteration is not None:
             on_iteration(done, error)
         if done > limit:
-            raise InputError(
-                f"the batch adjustment was given up after {limit} iterations: allow more with --batch-limit"
-            )
+            raise InputError(f"batch adjustment given up after {limit} iterations: allow more with --batch-limit")
 
     tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else FINE
     solve = partial(solve_features, part, robust=robust, on_iteration=watch, tolerance=tolerance)

@@ -172,10 +172,8 @@ def resect(table: observations.ObservationTable, known: Known, near: Array, info
         points = np.array([known[name][0] for name in part.names.tolist()])
         state = CameraState(start[None], points)
         graph = problem.graph(state, np.zeros(len(points), dtype=bool), state.path)
-        prior = gtsam.PriorFactorPose3(
-            problem.pose_keys[0], solvers.SPATIAL.pose(near), solvers.noise(np.asarray(np.linalg.inv(info)))
-        )
-        graph.push_back(prior)
+        weak = solvers.noise(np.asarray(np.linalg.inv(info)))
+        graph.push_back(gtsam.PriorFactorPose3(problem.pose_keys[0], solvers.SPATIAL.pose(near), weak))
         values, _, _ = solvers.levenberg_marquardt(graph, problem.values(state), _FOUND)
         return graph, values, problem
 

@@ -137,9 +137,8 @@ class CameraProblem:
 
     def explaining(self) -> AbstractContextManager[None]:
         """GTSAM's complaints in words."""
-        return solvers.explaining(
-            self.name, "frame", self.table.names, "check the measurements there, or add known points"
-        )
+        advice = "check the measurements there, or add known points"
+        return solvers.explaining(self.name, "frame", self.table.names, advice)
 
     def observation_factors(self) -> list[Any]:
         """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
@@ -184,9 +183,8 @@ class CameraProblem:
             cov = self.table.cov_z[row]
             code = cov.tobytes()
             if code not in models:
-                models[code] = solvers.huber(
-                    solvers.noise(cov if order is None else cov[np.ix_(order, order)]), self.robust
-                )
+                ordered = cov if order is None else cov[np.ix_(order, order)]
+                models[code] = solvers.huber(solvers.noise(ordered), self.robust)
             out.append(make(row, models[code], self.pose_keys[step], self.point_keys[index]))
         return out
 
@@ -278,9 +276,8 @@ def covariances(found: Adjusted) -> tuple[Array, dict[int, Array]]:
     problem = found.problem
     poses, points, names = problem.pose_keys, problem.point_keys, problem.table.names.tolist()
     if not problem.scaled and len(poses) <= solvers.MOST_POSES:
-        of_poses, of_points = solvers.marginals_by_schur(
-            found.graph, found.values, poses, points, problem.held_keys, problem.name
-        )
+        keys = poses, points, problem.held_keys
+        of_poses, of_points = solvers.marginals_by_schur(found.graph, found.values, *keys, problem.name)
         return of_poses, dict(zip(names, of_points, strict=True))
     with problem.explaining():
         blocks = solvers.marginals(found.graph, found.values, [*poses, *points])

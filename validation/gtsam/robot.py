@@ -157,10 +157,8 @@ class Sensor:
         planar, slope = at.shape[-1] == 2, self._turn
         if self._polar:
             x, y, flat, far = at[..., 0], at[..., 1], np.hypot(at[..., 0], at[..., 1]), np.linalg.norm(at, axis=-1)
-            rows = [
-                at / far[..., None],
-                np.stack([-y, x] if planar else [-y, x, 0 * x], axis=-1) / flat[..., None] ** 2,
-            ]
+            turn = np.stack([-y, x] if planar else [-y, x, 0 * x], axis=-1)
+            rows = [at / far[..., None], turn / flat[..., None] ** 2]
             if not planar:
                 high = at[..., 2] / flat
                 rows.append(self._sign * np.stack([-x * high, -y * high, flat], axis=-1) / far[..., None] ** 2)

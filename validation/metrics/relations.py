@@ -60,10 +60,8 @@ class RelationErrors:
 def read_relations(path: Path) -> Relations:
     """Relations of a file. An InputError names file and line."""
     table = read_columns(path, _COLUMNS, "a table of relations, " + " ".join(_COLUMNS))
-    ends = [
-        [parse_time(path, line, word) for word in row.split()[:2]]
-        for line, row in zip(table.lines, table.rows, strict=True)
-    ]
+    rows = zip(table.lines, table.rows, strict=True)
+    ends = [[parse_time(path, line, word) for word in row.split()[:2]] for line, row in rows]
     poses = SE3.from_ypr(table.block("x", "z"), table["yaw"], table["pitch"], table["roll"])
     return np.array(ends, dtype=np.int64), poses
 

@@ -46,10 +46,8 @@ def relative_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth
 
 
 #: Figures of merit of a path: the estimate and the truth at the same frames, and how they are brought together.
-MERITS: tuple[Callable[[Trajectory, Trajectory, RunTruth], Mapping[str, float]], ...] = (
-    absolute_errors,
-    relative_errors,
-)
+Merit = Callable[[Trajectory, Trajectory, RunTruth], Mapping[str, float]]
+MERITS: tuple[Merit, ...] = (absolute_errors, relative_errors)
 
 
 def score_run(found: RunFolder) -> dict[str, Any]:

@@ -125,10 +125,8 @@ def validate(folder: Path, against: str, out: Path | None = None, file: Path | N
                 raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
             compare = known.get(record.system, known.get(ANY))
             if compare is None:
-                able = ", ".join(sorted(known))
-                raise InputError(
-                    f"a run of the system {record.system!r} cannot be compared with {against} (possible: {able})"
-                )
+                able = f"(possible: {', '.join(sorted(known))})"
+                raise InputError(f"a run of the system {record.system!r} cannot be compared with {against} {able}")
             comparison = compare(record)
     except InputError as error:
         write_report(folder, [f"Not compared with {against}: {error}."])
@@ -181,10 +179,8 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     video = VIDEO if (folder / VIDEO).is_file() else None
     loader = PackageLoader("rbpf.validation.report", "templates")
     template = Environment(loader=loader, autoescape=select_autoescape()).get_template(PAGE)
-    page = template.render(
-        title=record.name, verdict=verdict, world=world, problems=problems, sections=sections, video=video
-    )
-    write_text(folder / PAGE, page)
+    told = {"verdict": verdict, "world": world, "problems": problems, "sections": sections, "video": video}
+    write_text(folder / PAGE, template.render(title=record.name, **told))
     return verdict
 
 

@@ -62,9 +62,7 @@ class Imaging:
         if 0 < self.known < 4:
             raise InputError(f"known must be at least 4 points, or 0 for none, got {self.known}")
         if self.known and 0 in self.blackout:
-            raise InputError(
-                "blackout names frame 0, in which the known points are seen: leave it out or set known = 0"
-            )
+            raise InputError("blackout names frame 0, where the known points are seen: leave it out or set known = 0")
 
 
 class Shutter:
@@ -176,9 +174,8 @@ def known_corners(
     top, left = (round(MIDDLE * size) for size in planes.shape)
     middle[top:-top, left:-left] = True
     usable = np.asarray(flat & middle & (planes >= 0)).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(
-        renderer.image(pose), CANDIDATES, QUALITY, FLAT * camera.width, mask=usable, blockSize=5
-    )
+    image, least = renderer.image(pose), FLAT * camera.width
+    found = cv2.goodFeaturesToTrack(image, CANDIDATES, QUALITY, least, mask=usable, blockSize=5)
     px = np.zeros((0, 2)) if found is None else np.asarray(found, dtype=float).reshape(-1, 2)
     if len(px) < count:
         raise InputError(
@@ -193,9 +190,7 @@ def known_corners(
     px = px[np.argsort(-stronger.min(axis=1), kind="stable")[:count]]
     extent = np.linalg.svd(px - px.mean(axis=0), compute_uv=False)
     if count > 2 and extent[1] < LEAST_SPREAD * extent[0]:
-        raise InputError(
-            f"the known points of the {scene.name} lie on a line in the first image: use another seed or more points"
-        )
+        raise InputError(f"the known points of the {scene.name} lie on a line: use another seed or more points")
     uv = camera.unproject(px)
     depth, _ = cast(rectangles, pose, uv)
     local = depth[:, None] * np.concatenate([uv, np.ones((count, 1))], axis=1)

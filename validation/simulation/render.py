@@ -103,9 +103,8 @@ class Renderer:
             fraction = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
             cut = local + fraction * (following - local)
             outline = np.concatenate([local, cut], axis=1)
-            seen = np.concatenate(
-                [local[..., 2] >= NEAR_M, (fraction[..., 0] >= 0.0) & (fraction[..., 0] <= 1.0)], axis=1
-            )
+            crossed = (fraction[..., 0] >= 0.0) & (fraction[..., 0] <= 1.0)
+            seen = np.concatenate([local[..., 2] >= NEAR_M, crossed], axis=1)
             depth = np.where(seen, np.maximum(outline[..., 2], NEAR_M), np.nan)[..., None]
             uv = outline[..., :2] / depth
         return _extent(uv.reshape(len(uv), -1, 2))
