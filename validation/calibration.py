@@ -6,14 +6,13 @@ calibration.png    where corners were found, and by how much the camera misses t
 """
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.runs.files import prepare_folder, write_text
+from rbpf.runs.files import OnDone, prepare_folder, write_text
 from rbpf.runs.plots import COLOURS, label, save_figures
 from rbpf.sensors.calibration import Board, BoardCalibration, BoardView, board_corners, calibrate
 from rbpf.sensors.camera import Pinhole
@@ -27,7 +26,7 @@ _INTRINSICS = "fx", "fy", "cx", "cy"
 
 
 def calibrate_images(
-    images: Path, board: Board, on_image: Callable[[int, int], None] | None = None, model: str = "pinhole"
+    images: Path, board: Board, on_image: OnDone | None = None, model: str = "pinhole"
 ) -> tuple[BoardCalibration, int]:
     """The camera, pinhole or fisheye, that took pictures of a board, a folder or a video, and how many were looked at.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
+from rbpf.runs.files import OnDone
 from rbpf.runs.folder import write_run, write_summary
 from rbpf.runs.plots import draw_run
 from rbpf.runs.provenance import left_out
@@ -35,7 +36,7 @@ def finish_run(
     video: bool = True,
     rerun: Path | None = None,
     batch: bool = True,
-    on_frame: Callable[[int, int], None] | None = None,
+    on_frame: OnDone | None = None,
     on_iteration: Callable[[int, float], None] | None = None,
     most_iterations: int | None = None,
 ) -> dict[str, Any]:

@@ -31,7 +31,7 @@ import msgspec
 from rbpf import __version__
 from rbpf.errors import InputError
 from rbpf.runs import recordings
-from rbpf.runs.files import prepare_folder, write_csv
+from rbpf.runs.files import OnDone, prepare_folder, write_csv
 from rbpf.runs.folder import summarise
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.run import Run
@@ -51,6 +51,7 @@ SECONDS = 20  #: That a scheduler may take to answer.
 MOST_RUNS = 100_000
 Value = str | int | float | bool | None
 Row = dict[str, Any]
+Named = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Job:
     """One run of a sweep."""
 
     system: str  #: which one.
-    sequence: tuple[tuple[str, str], ...]  #: the system's fields and their paths, as (name, path).
+    sequence: Named  #: the system's fields and their paths, as (name, path).
     option: str  #: name of the option.
     settings: tuple[str, ...]  #: as key=value, the option's after those of all runs.
     particles: int | None  #: how many; None for the system's own.
@@ -165,9 +166,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     return jobs
 
 
-def _sequence(
-    given: str | Mapping[str, str], fields: tuple[str, ...], folder: Path, where: str
-) -> tuple[tuple[str, str], ...]:
+def _sequence(given: str | Mapping[str, str], fields: tuple[str, ...], folder: Path, where: str) -> Named:
     named = {"recording": given} if isinstance(given, str) else dict(given)
     wrong = sorted(set(named) - set(fields))
     if wrong or "recording" not in named:
@@ -180,11 +179,7 @@ def _sequence(
 
 
 def sweep(
-    jobs: Sequence[Job],
-    out: Path,
-    workers: int = -1,
-    scheduler: str | None = None,
-    on_run: Callable[[int, int], None] | None = None,
+    jobs: Sequence[Job], out: Path, workers: int = -1, scheduler: str | None = None, on_run: OnDone | None = None
 ) -> list[Row]:
     """Runs what is not done yet and writes the table; returns the rows in the order of the jobs.
 

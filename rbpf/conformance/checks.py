@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from rbpf import gaussian
 from rbpf.conformance.trial import (
@@ -47,9 +48,7 @@ _MARK = 1.5e300
 _OUTPUTS = ("nu", "jac_state", "jac_landmark")
 
 
-def motion_checks(
-    model: models.MotionModel, space: LieGroup, rng: np.random.Generator, example: Example
-) -> list[Check]:
+def motion_checks(model: models.MotionModel, space: LieGroup, rng: Generator, example: Example) -> list[Check]:
     """Shapes, membership of the group, and independence of the particles."""
     name, states = named(model.transition), example.states(space, rng)
 
@@ -282,9 +281,7 @@ def check_initialise(model: models.ObservationModel, scene: Scene, landmark: mod
         require(distance <= STD, f"{what}, expected less than its standard deviation {STD}")
 
 
-def landmark_checks(
-    landmark: models.Landmark, space: LieGroup | None, rng: np.random.Generator, example: Example
-) -> list[Check]:
+def landmark_checks(landmark: models.Landmark, space: LieGroup | None, rng: Generator, example: Example) -> list[Check]:
     """Sizes, world points, readiness and promotion."""
 
     def tried() -> models.Records:
@@ -332,7 +329,7 @@ def landmark_checks(
     return [world_points, readiness, promotion]
 
 
-def likelihood_checks(likelihood: models.Likelihood, rng: np.random.Generator) -> list[Check]:
+def likelihood_checks(likelihood: models.Likelihood, rng: Generator) -> list[Check]:
     """Shapes, mass, and the compiled twin."""
     log_density, inlier = likelihood.log_density, likelihood.inlier
 
@@ -439,9 +436,7 @@ def sensor_checks(sensor: models.Sensor, example: Example) -> list[Check]:
     return [observed, started]
 
 
-def conditional_checks(
-    part: models.Conditional, space: LieGroup, rng: np.random.Generator, example: Example
-) -> list[Check]:
+def conditional_checks(part: models.Conditional, space: LieGroup, rng: Generator, example: Example) -> list[Check]:
     """A few steps of what is marginalised: shapes, what a prediction may change, copies, and the checkpoint."""
     states, groups = example.states(space, rng), example.groups
     n, d = states.shape[0], space.dim

@@ -5,6 +5,7 @@ from dataclasses import dataclass, is_dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from rbpf.core.models import Belief, Landmark, ObservationModel, Observations, Part, Records, Transition
 from rbpf.errors import InputError
@@ -30,7 +31,7 @@ class Example:
     groups: Sequence[Observations] = ()  #: what a conditional is updated by.
     transition: Transition | None = None  #: of the states, for a conditional that drives the motion.
 
-    def states(self, space: LieGroup, rng: np.random.Generator) -> np.ndarray:
+    def states(self, space: LieGroup, rng: Generator) -> np.ndarray:
         """(N, E), drawn around the origin where none are given."""
         if self.state is not None:
             return self.state
@@ -48,7 +49,7 @@ class Scene:
     substate: np.ndarray | None = None
 
     @classmethod
-    def draw(cls, model: ObservationModel, space: LieGroup, rng: np.random.Generator, example: Example) -> "Scene":
+    def draw(cls, model: ObservationModel, space: LieGroup, rng: Generator, example: Example) -> "Scene":
         """Random states and, around the origin, landmarks that are visible from them. Raises InputError: too few are."""
         scene = cls(space, example.states(space, rng)[:, None, :])
         if Part.SUBSTATE in model.reads:
@@ -108,7 +109,7 @@ class Scene:
         assert state is not None
         return Scene(self.space, state, *others)
 
-    def _landmark_dim(self, model: ObservationModel, rng: np.random.Generator) -> int:
+    def _landmark_dim(self, model: ObservationModel, rng: Generator) -> int:
         """The dimension of a point that the model can predict: that of the space first, else the lowest."""
         first = self.space.groups[0] if isinstance(self.space, Product) else self.space
         known = {SE2Group: 2, SE3Group: 3}.get(type(first), self.space.dim)
@@ -124,7 +125,7 @@ class Scene:
 
 
 def random_constants(
-    landmark: Landmark, space: LieGroup | None, rng: np.random.Generator, shape: tuple[int, ...]
+    landmark: Landmark, space: LieGroup | None, rng: Generator, shape: tuple[int, ...]
 ) -> np.ndarray | None:
     """(*shape, A): elements of the group where they have its size, as anchor poses do; else normal."""
     if landmark.constants == 0:

@@ -4,7 +4,7 @@ import csv
 import errno
 import fcntl
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import StringIO
 from itertools import count
@@ -18,6 +18,7 @@ CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajec
 POSTERIOR, GRID = "posterior.npz", "grid.npz"
 LOCK = ".lock"  #: In a run's folder while somebody writes there; with the number of that process.
 VERSION = 1  #: Of trajectory.npz.
+OnDone = Callable[[int, int], None]  #: Called with how many parts of some work are done, and of how many.
 
 
 @contextmanager

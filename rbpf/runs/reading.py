@@ -127,10 +127,8 @@ class RunFolder:
         try:
             with fitting(file):
                 found = PathAndMap(*read(arrays, _PATH).values())
-                if (
-                    found.world_from_body.shape[1] not in (SE2.size, SE3.size)
-                    or found.cov_poses.shape[1] != found.space.dim
-                ):
+                sizes = found.world_from_body.shape[1], found.cov_poses.shape[1]
+                if sizes not in [(space.size, space.dim) for space in (SE2, SE3)]:
                     raise InputError("the poses are neither in the plane nor in space")
         except InputError as error:
             raise InputError(f"{file} does not hold the poses of a run ({error}); {again}") from error

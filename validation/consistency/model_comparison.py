@@ -14,7 +14,7 @@ draws from the batch posterior (`rbpf.validation.gtsam.path_sampling`), one part
 magnitude than by particles, and in one pass.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ import numpy as np
 
 from rbpf.core.likelihoods import Gaussian
 from rbpf.errors import InputError
+from rbpf.runs.files import OnDone
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import RobotRecording, filter_features, filter_opened, filter_recording, open_robot_log
 from rbpf.runs.run import Run
@@ -84,12 +85,7 @@ def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> Evi
 
 
 def compare_evidence(
-    config_a: Config,
-    config_b: Config,
-    data: Data,
-    seeds: Sequence[int],
-    workers: int = 1,
-    on_run: Callable[[int, int], None] | None = None,
+    config_a: Config, config_b: Config, data: Data, seeds: Sequence[int], workers: int = 1, on_run: OnDone | None = None
 ) -> EvidenceDifference:
     """Compares how two configurations of one system explain the same data: filtered once per seed, or in batch.
 
@@ -157,7 +153,7 @@ def compare_evidence(
 
 
 def compare_runs(
-    run_a: Path, run_b: Path, seeds: int = 5, workers: int = 1, on_run: Callable[[int, int], None] | None = None
+    run_a: Path, run_b: Path, seeds: int = 5, workers: int = 1, on_run: OnDone | None = None
 ) -> EvidenceDifference:
     """The same for the settings of two finished runs over one recording, which are repeated with several seeds.
 

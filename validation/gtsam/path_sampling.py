@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.sparse import block_array, bsr_array, csc_array, diags_array, hstack
 from scipy.sparse.linalg import splu
@@ -72,9 +73,7 @@ class PosteriorDraws:
         return float(1.0 / np.square(self.weights).sum())
 
 
-def draw_posterior(
-    m: Measurements, optimum: InitialEstimate, rng: np.random.Generator, draws: int = DRAWS
-) -> PosteriorDraws:
+def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, draws: int = DRAWS) -> PosteriorDraws:
     """Draws whole paths and maps from the posterior of a robot's measurements, given their batch optimum.
 
     Args:

@@ -1,6 +1,5 @@
 """A camera calibrated by what a run measured: the focal length and k1 that its batch adjustment prefers."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.files import prepare_folder, write_text
+from rbpf.runs.files import OnDone, prepare_folder, write_text
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
@@ -26,7 +25,6 @@ from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
 
 ITERATIONS = 200  #: Most of the adjustment.
 _STEP = 1e-6  #: Of focal length and k1, for the residuals' derivatives by them.
-OnRound = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Calibrated:
     std: np.ndarray
 
 
-def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnRound | None = None) -> Calibrated:
+def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None = None) -> Calibrated:
     """Focal length and k1 adjusted together with all poses and landmarks, from the optimum with the given camera.
 
     `on_round` is called with the iterations done, and the most that there can be. Errors as of `solve_problem`.
@@ -96,7 +94,7 @@ def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
     return solve_problem(log, path, HUBER, marginals=False, twice=False)
 
 
-def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tuple[dict[str, Any], Calibrated]:
+def recalibrate(folder: Path, out: Path, on_round: OnDone | None = None) -> tuple[dict[str, Any], Calibrated]:
     """Calibrates the camera of a finished monocular run; writes camera.yaml; returns what changed, and the camera."""
     record = RunFolder.open(folder)
     problem = record.measurements

@@ -21,7 +21,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.files import prepare_folder, whole
+from rbpf.runs.files import OnDone, prepare_folder, whole
 from rbpf.runs.plots import SIGMAS, outline
 from rbpf.runs.run import Run
 from rbpf.sensors.readers import ImageFrame
@@ -184,7 +184,7 @@ def annotated_frames(run: Run) -> Iterator[np.ndarray]:
         yield draw(run, t, frame)
 
 
-def write_annotated(run: Run, path: Path, on_frame: Callable[[int, int], None] | None = None) -> None:
+def write_annotated(run: Run, path: Path, on_frame: OnDone | None = None) -> None:
     """Writes an MP4 of all frames that were filtered of a run of a system in `PICTURES`; see `write_video`."""
     first = next(frames := annotated_frames(run))
     write_video(chain([first], frames), first.shape[1::-1], run.log.stamps_ns, path, on_frame)
@@ -201,7 +201,7 @@ def write_video(
     size: tuple[int, int],
     stamps_ns: np.ndarray,
     path: Path,
-    on_frame: Callable[[int, int], None] | None = None,
+    on_frame: OnDone | None = None,
 ) -> None:
     """Writes an MP4 of pictures (H, W, 3) uint8 of one size (width, height), even numbers, as fast as their stamps (T,).
 

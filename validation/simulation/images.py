@@ -11,7 +11,7 @@ The sequence is an EuRoC ASL folder (M. Burri et al., The EuRoC micro aerial veh
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from typing import Annotated
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
+from rbpf.lie import SE3, Array
 from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_ranges
-from rbpf.runs.files import write_csv, write_text
+from rbpf.runs.files import OnDone, write_csv, write_text
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import model_of
 from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
@@ -147,9 +147,7 @@ STRONGEST = 0.5  #: Fraction of the corners found that are strong enough, if the
 LEAST_SPREAD = 0.05
 
 
-def known_corners(
-    scene: TexturedScene, renderer: Renderer, camera: Pinhole, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, count: int) -> tuple[Array, Array]:
     """`count` strong corners spread over the middle of the first image; the first few of them spread as well as all.
 
     Pixels (M, 2) in the first image, and positions (M, 3) in the world, m; an InputError where they are too few or on a line.
@@ -243,9 +241,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def write_sensor(
-    folder: Path, sensor: str, scene: TexturedScene, camera: Pinhole, offset_m: float, suffix: str
-) -> None:
+def write_sensor(folder: Path, sensor: str, scene: TexturedScene, camera: Pinhole, x_m: float, suffix: str) -> None:
     """A sensor's folder (cam0, cam1 or depth0) with calibration and index; it stands so far along the body's x axis."""
     stamps_ns = scene.stamps_ns
     place = folder / "mav0" / sensor
@@ -255,7 +251,7 @@ def write_sensor(
     seconds = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
     rate = (len(stamps_ns) - 1) / seconds if seconds else 0.0
     matrix = np.eye(4)
-    matrix[0, 3] = offset_m
+    matrix[0, 3] = x_m
     # EuRoC has four coefficients; a fifth is written only where it says something.
     distortion = camera.distortion if any(camera.distortion[4:]) else camera.distortion[:4]
     lines = [
@@ -283,7 +279,7 @@ def simulate_images(
     camera: Pinhole | RectifiedStereo,
     folder: Path,
     seed: int,
-    on_frame: Callable[[int, int], None] | None = None,
+    on_frame: OnDone | None = None,
     baseline_m: float | None = None,
 ) -> None:
     """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.

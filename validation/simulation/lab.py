@@ -14,7 +14,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
+from rbpf.lie import SE3, Array
 from rbpf.ranges import MOST, Count, NotNegative, Positive, Range, Ranged, check_ranges
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdometer, along_corners
@@ -54,9 +54,7 @@ class Wall:
         corners[:, 2] = high
         return corners
 
-    def sheet(
-        self, along: Sequence[float], deep: float, high: Sequence[float]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sheet(self, along: Sequence[float], deep: float, high: Sequence[float]) -> tuple[Array, Array, Array]:
         """Corner, across and down of a sheet that hangs parallel to the wall and faces the room."""
         left, right = along if self.inwards == (1 if self.axis else -1) else along[::-1]
         corner, across = np.zeros(3), np.zeros(3)

@@ -24,7 +24,7 @@ from typing import Protocol
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
+from rbpf.lie import SE3, Array
 from rbpf.ranges import NotNegative, check_ranges
 from rbpf.sensors.calibration import Board
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
@@ -109,9 +109,7 @@ def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarra
     return np.where(flat[:, None, None], 0.0, np.linalg.inv(m))
 
 
-def cast(
-    rectangles: Sequence[Rectangle], world_from_camera: np.ndarray, uv: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def cast(rectangles: Sequence[Rectangle], world_from_camera: Array, uv: Array) -> tuple[np.ndarray, np.ndarray]:
     """What single rays (u, v) (K, 2) meet first: the same as a whole picture's depth, for a few pixels.
 
     Returns:

@@ -6,14 +6,15 @@ Every function takes a shape (rows, columns) of texels and a generator, and retu
 from collections.abc import Callable
 
 import numpy as np
+from numpy.random import Generator
 
 Shape = tuple[int, int]
-Paint = Callable[[Shape, np.random.Generator], np.ndarray]  #: Draws a texture of that shape.
+Paint = Callable[[Shape, Generator], np.ndarray]  #: Draws a texture of that shape.
 GLYPH = 7, 5  #: Cells of a mark, rows and columns.
 FINE = 4  #: Fractional bits of the corners of what is drawn.
 
 
-def clouds(shape: Shape, rng: np.random.Generator, exponent: float = 1.0) -> np.ndarray:
+def clouds(shape: Shape, rng: Generator, exponent: float = 1.0) -> np.ndarray:
     """(H, W) float32 noise of mean 0 and variance 1 whose amplitude falls as f^-exponent (D. Field 1987)."""
     from scipy import fft
 
@@ -35,14 +36,14 @@ def grey_levels(texture: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(texture), 0, 255).astype(np.uint8)
 
 
-def plaster(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def plaster(shape: Shape, rng: Generator) -> np.ndarray:
     """A painted wall with stains, cracks and nail holes."""
     wall = grey_levels(rng.uniform(150, 190) + 8.0 * clouds(shape, rng, 1.2))
     _scatter(wall, rng, per_texel=4e-5, size=(2.0, 12.0), contrast=40.0)
     return wall
 
 
-def wallpaper(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def wallpaper(shape: Shape, rng: Generator) -> np.ndarray:
     """Ornaments on a grid, no two alike, on a mottled ground."""
     paper = plaster(shape, rng)
     step = 90
@@ -53,7 +54,7 @@ def wallpaper(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     return paper
 
 
-def wood(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def wood(shape: Shape, rng: Generator) -> np.ndarray:
     """Grain along the rows, knots and stains."""
     import cv2
 
@@ -64,14 +65,14 @@ def wood(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     return top
 
 
-def carpet(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def carpet(shape: Shape, rng: Generator) -> np.ndarray:
     """A coarse weave with patches."""
     floor = grey_levels(95.0 + 16.0 * clouds(shape, rng, 0.6) + 10.0 * clouds(shape, rng, 1.3))
     _scatter(floor, rng, per_texel=1.5e-4, size=(5.0, 30.0), contrast=50.0)
     return floor
 
 
-def picture(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def picture(shape: Shape, rng: Generator) -> np.ndarray:
     """A print in a frame: clouds, overlapping shapes, a line of marks."""
     image = grey_levels(rng.uniform(80, 170) + 35.0 * clouds(shape, rng, 1.2))
     extent = float(np.hypot(*shape))
@@ -85,7 +86,7 @@ def picture(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     return image
 
 
-def page(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def page(shape: Shape, rng: Generator) -> np.ndarray:
     """A printed sheet: a headline, lines of text, a figure."""
     sheet = grey_levels(215.0 + 4.0 * clouds(shape, rng))
     high = max(GLYPH[0], shape[0] // 12)
@@ -103,7 +104,7 @@ def page(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     return sheet
 
 
-def edges_of_pages(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def edges_of_pages(shape: Shape, rng: Generator) -> np.ndarray:
     """The cut side of a book: fine lines along the longer side, and thumb marks."""
     along_rows = shape[1] >= shape[0]
     lines = rng.normal(0.0, 16.0, (shape[0], 1) if along_rows else (1, shape[1]))
@@ -112,7 +113,7 @@ def edges_of_pages(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     return side
 
 
-def spines(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def spines(shape: Shape, rng: Generator) -> np.ndarray:
     """Backs of books that stand side by side, each with bands and a title."""
     row = grey_levels(60.0 + 6.0 * clouds(shape, rng))
     column = 0
@@ -128,7 +129,7 @@ def spines(shape: Shape, rng: np.random.Generator) -> np.ndarray:
     return row
 
 
-def carton(shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def carton(shape: Shape, rng: Generator) -> np.ndarray:
     """A printed box: panels, marks and shapes."""
     side = grey_levels(rng.uniform(60, 200) + 10.0 * clouds(shape, rng))
     extent = float(np.hypot(*shape))
@@ -146,9 +147,7 @@ def chessboard(squares: Shape, texels: int, margin: int) -> np.ndarray:
     return np.pad(cells.repeat(texels, axis=0).repeat(texels, axis=1), margin, constant_values=235)
 
 
-def _scatter(
-    image: np.ndarray, rng: np.random.Generator, per_texel: float, size: tuple[float, float], contrast: float
-) -> None:
+def _scatter(image: np.ndarray, rng: Generator, per_texel: float, size: tuple[float, float], contrast: float) -> None:
     """Draws polygons and discs at random, most of them small, each so much brighter or darker than what it covers."""
     for _ in range(rng.poisson(per_texel * image.size)):
         place = rng.uniform(0.0, 1.0, 2) * image.shape[::-1]
@@ -159,7 +158,7 @@ def _scatter(
         draw(image, place, radius, float(np.clip(level, 0.0, 255.0)), rng)
 
 
-def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: np.random.Generator) -> None:
+def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: Generator) -> None:
     """Three to six corners about a place (column, row)."""
     import cv2
 
@@ -170,7 +169,7 @@ def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, 
     cv2.fillPoly(image, [fixed], level, cv2.LINE_AA, FINE)
 
 
-def _disc(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: np.random.Generator) -> None:
+def _disc(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: Generator) -> None:
     """An ellipse about a place (column, row)."""
     import cv2
 
@@ -180,7 +179,7 @@ def _disc(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng
     cv2.ellipse(image, centre, axes, turn, 0.0, 360.0, level, -1, cv2.LINE_AA, FINE)
 
 
-def _write(image: np.ndarray, rng: np.random.Generator, top: int, high: int, ink: float) -> None:
+def _write(image: np.ndarray, rng: Generator, top: int, high: int, ink: float) -> None:
     """A line of words: marks `high` texels high, ragged at the right."""
     import cv2
 
