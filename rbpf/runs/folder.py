@@ -65,14 +65,13 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
     files.prepare_folder(out)
     log, system = run.log, run.system
     write_tum(out / "trajectory.tum", in_space(log.stamps_ns, log.poses))
-    corrections = (log["correction"], log["cov_correction"]) if "correction" in log else None
-    particles = system.particle_poses(), system.filter.particles.weights
-    write_trajectory(out, log.stamps_ns, log.poses, log.covs, corrections, particles)
+    more = {name: log[name] for name in ("correction", "cov_correction") if name in log}
+    more |= {"particles": system.particle_poses(), "weights": system.filter.particles.weights}
+    write_trajectory(out, log.stamps_ns, log.poses, log.covs, **more)
     write_truth(out, run.truth)
     if "odometry" in log:
         write_tum(out / "odometry.tum", in_space(log.stamps_ns, log["odometry"]))
-    landmarks = system.map()
-    write_map(out, landmarks)
+    write_map(out, system.map())
     write_measurements(out, system.measurements(run.name, log))
     for table in (TIMINGS, DIAGNOSTICS):
         header, columns = log.table(table)
@@ -105,10 +104,9 @@ def summarise(run: Run) -> dict[str, Any]:
         "frames": len(log),
         "particles": config.particles,
         "seed": config.seed,
-        "ms_per_frame": {
-            "median": round(float(np.median(milliseconds)), 3),
-            "p95": round(float(np.percentile(milliseconds, 95)), 3),
-        },
+        "ms_per_frame": dict(
+            zip(("median", "p95"), np.percentile(milliseconds, [50, 95]).round(3).tolist(), strict=True)
+        ),
         "resamplings": int(log["resampled"].sum()),
         "ess_mean": float(log["ess"].mean()),
         "log_evidence": float(np.sum(evidence)) if np.isfinite(evidence).all() else None,
@@ -187,29 +185,10 @@ def peak_memory_mb() -> float:
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
-def write_trajectory(
-    out: Path,
-    stamps_ns: np.ndarray,
-    mean: np.ndarray,
-    cov: np.ndarray,
-    corrections: tuple[np.ndarray, np.ndarray] | None = None,
-    particles: tuple[np.ndarray, np.ndarray] | None = None,
-) -> None:
-    """trajectory.npz: poses (T, E), covariances (T, d, d), and what `rbpf.runs.reading` says of them.
-
-    Corrections of the motions (T, r) and their covariances (T, r, r); the last frame's particles (N, E) and weights (N,).
-    """
-    steps = len(mean)
-    correction, cov_correction = corrections or (np.zeros((steps, 0)), np.zeros((steps, 0, 0)))
-    poses, weights = particles or (np.zeros((0, mean.shape[1])), np.zeros(0))
-    arrays = {
-        "version": np.array(files.VERSION),
-        "stamps_ns": stamps_ns,
-        "mean": mean,
-        "cov": cov,
-        "correction": correction,
-        "cov_correction": cov_correction,
-        "particles": poses,
-        "weights": weights,
-    }
-    save_arrays(out / files.TRAJECTORY, arrays)
+def write_trajectory(out: Path, stamps_ns: np.ndarray, mean: np.ndarray, cov: np.ndarray, **more: np.ndarray) -> None:
+    """trajectory.npz: poses (T, E), covariances (T, d, d), and what more `rbpf.runs.reading` says of them; none by default."""
+    steps, size = mean.shape
+    path = {"version": np.array(files.VERSION), "stamps_ns": stamps_ns, "mean": mean, "cov": cov}
+    corrections = {"correction": np.zeros((steps, 0)), "cov_correction": np.zeros((steps, 0, 0))}
+    particles = {"particles": np.zeros((0, size)), "weights": np.zeros(0)}
+    save_arrays(out / files.TRAJECTORY, path | corrections | particles | more)

@@ -5,7 +5,7 @@ system declares a column once, with name, unit, shape and meaning; tables, check
 follow from that.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, final
 
@@ -13,8 +13,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import elements, integers, numbers, read, split
 from rbpf.errors import InputError
-from rbpf.lie import SE2Group, SE3Group
-from rbpf.systems.system import DIAGNOSTICS, TIMINGS, Column, Ragged, System, Tracked, TrackingState
+from rbpf.systems.system import DIAGNOSTICS, TIMINGS, Column, System, Tracked, TrackingState
 
 #: Columns of every system; times are written in milliseconds.
 COMMON = (
@@ -29,36 +28,19 @@ _STATES = list(TrackingState)
 
 @final
 class FrameLog:
-    """One row per frame.
+    """One row per frame that a system takes.
 
     `log["ess"]` is a column (T, …); `log.poses`, `log.covs` and `log.stamps_ns` are the path as it is known now;
     `log.observed(t)` is what frame t showed.
-
-    Args:
-        space: group of the poses.
-        columns: what the system says of every frame besides `COMMON`.
-        ragged: what it says of what every frame showed.
-        waiting: how `WAITING` is called in timings.csv; None leaves it out there.
     """
 
-    def __init__(
-        self,
-        space: SE2Group | SE3Group,
-        columns: Sequence[Column],
-        ragged: Sequence[Ragged] = (),
-        waiting: str | None = None,
-    ) -> None:
-        self.space = space
-        table = None if waiting is None else TIMINGS
-        self.columns = (*COMMON, *columns, replace(WAITING, table=table, heading=waiting))
-        self.ragged = tuple(ragged)
+    def __init__(self, system: System) -> None:
+        self.space, self.ragged = system.space, tuple(system.observed)
+        waiting = replace(WAITING, table=None if system.waiting is None else TIMINGS, heading=system.waiting)
+        self.columns = (*COMMON, *system.columns, waiting)
         self._path: dict[str, list[Any]] = {"stamps_ns": [], "poses": [], "covs": []}
         self._rows: dict[str, list[Any]] = {column.name: [] for column in self.columns}
         self._observed: dict[str, list[np.ndarray]] = {field.name: [] for field in self.ragged}
-
-    @classmethod
-    def of(cls, system: System) -> "FrameLog":
-        return cls(system.space, system.columns, system.observed, system.waiting)
 
     def __len__(self) -> int:
         return len(self._path["stamps_ns"])
@@ -98,9 +80,6 @@ class FrameLog:
     def observed(self, t: int) -> dict[str, np.ndarray]:
         """What frame t showed, arrays by name."""
         return {name: frames[t] for name, frames in self._observed.items()}
-
-    def all_observed(self) -> list[dict[str, np.ndarray]]:
-        return [self.observed(t) for t in range(len(self))]
 
     def append(self, tracked: Tracked, seconds: float, waiting: float = 0.0) -> None:
         own = {"seconds": seconds, "seconds_waiting": waiting, "state": _STATES.index(tracked.state)}

@@ -57,7 +57,7 @@ class Run(Generic[SystemT]):
     failure: str | None = None  #: why the run ended before the recording did, in words; None where it did not.
 
     def __post_init__(self) -> None:
-        self.log = FrameLog.of(self.system)
+        self.log = FrameLog(self.system)
         if self.expected is not None:
             self.system.keep_paths(self.expected)
 

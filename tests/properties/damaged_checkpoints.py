@@ -152,7 +152,7 @@ def tried(case: Case, path: Path) -> str:
         for frame in case.after:
             run.take(frame)
         run.system.map(), run.system.summary(run.log), run.system.files(run.log)
-        run.system.measurements("listed", run.log), run.log.states, run.log.all_observed()
+        run.system.measurements("listed", run.log), run.log.states, [*map(run.log.observed, range(len(run.log)))]
     except InputError as error:
         return "refused" if "\n" not in str(error) and len(str(error)) > 10 else f"unclear: {error}"
     except Exception:

@@ -39,7 +39,7 @@ def test_images_from_anywhere_give_the_bytes_of_a_run_over_a_recording():
     """Though a driver writes all of them into the same memory."""
     run = filter_opened(open_mono(sequence(10), CONFIG))
     slam, buffer = MonoSlam(CAMERA, CONFIG), np.empty_like(DARK)
-    log = FrameLog.of(slam)
+    log = FrameLog(slam)
     for frame in images(10):
         buffer[:] = frame.image
         tracked = slam.track(buffer, frame.stamp_ns)

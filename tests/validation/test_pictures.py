@@ -27,7 +27,7 @@ def run() -> Run:
 
 def test_what_each_feature_was(run):
     """New ones in the first pair, candidates in the second, landmarks from the third on; as many as were counted."""
-    kinds = [np.bincount(seen["kind"], minlength=4) for seen in run.log.all_observed()]
+    kinds = [np.bincount(seen["kind"], minlength=4) for seen in map(run.log.observed, range(len(run.log)))]
     assert len(kinds) == COUNT and [kind.sum() for kind in kinds] == run.log["features"].tolist()
     assert kinds[0][FeatureKind.NEW] > 5 and kinds[0][FeatureKind.LANDMARK] == kinds[0][FeatureKind.CANDIDATE] == 0
     assert kinds[1][FeatureKind.CANDIDATE] > 3 and kinds[1][FeatureKind.LANDMARK] == 0

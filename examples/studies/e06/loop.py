@@ -68,8 +68,8 @@ def reproduce(setting: Setting) -> list[Row]:
     sequence, known = round_a_desk(setting)
     run = filter_opened(open_mono(sequence, setting.config(), known))
     mapped = run.system.map()
-    first = started_until(run.log.all_observed(), START)
-    closure = find_closure(run.log.all_observed(), first)
+    first = started_until([*map(run.log.observed, range(len(run.log)))], START)
+    closure = find_closure([*map(run.log.observed, range(len(run.log)))], first)
     truth = true_poses(sequence)[: run.log.stamps_ns.size]
     error = np.linalg.norm(SE3.translation(run.log.poses) - SE3.translation(truth), axis=1)
     save_figures({"figure_5.png": _draw(run, mapped, truth, error, closure)}, setting.out)
