@@ -50,8 +50,7 @@ _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
     """Writes a run, the folder that `rbpf run` left, in some of the `FORMATS` to a folder; returns the files.
 
-    Raises:
-        InputError: it is no run folder, a format is not known, or its library is not installed.
+    Raises InputError: it is no run folder, a format is not known, or its library is not installed.
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
@@ -127,8 +126,7 @@ def export_colmap(
     out. Without a camera the poses are those of `NOMINAL` on the robot; without a problem, which has the camera and the
     tracks, points have no tracks.
 
-    Raises:
-        InputError: path and measurements are not of one run.
+    Raises InputError: path and measurements are not of one run.
     """
     colours, ids = colours_by_sigma(standard_deviations(estimate.landmarks.cov)), estimate.landmarks.ids
     if isinstance(problem, FeatureLog):

@@ -55,8 +55,7 @@ def finish_run(
         on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
         most_iterations: of the batch adjustment, after which it is given up, see `solve_problem`.
 
-    Raises:
-        InputError: a file cannot be written.
+    Raises InputError: a file cannot be written.
     """
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
     if run.system.name not in COMPARISONS["gtsam"]:  # it measures nothing that a batch optimiser takes

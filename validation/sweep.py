@@ -120,8 +120,7 @@ class Job:
 def read_plan(path: Path) -> list[Job]:
     """All runs of a sweep, checked before the first one starts.
 
-    Raises:
-        InputError: the file is unreadable, names something unknown, or a sequence is not there.
+    Raises InputError: the file is unreadable, names something unknown, or a sequence is not there.
     """
     values = read_plain_yaml(path)
     if not isinstance(values, dict):
@@ -192,8 +191,7 @@ def sweep(
         scheduler: address of a Dask scheduler, whose workers run the jobs instead; they need the same paths.
         on_run: called with the runs done and their number.
 
-    Raises:
-        InputError: the folder cannot be written, a former row is damaged or no scheduler answers.
+    Raises InputError: the folder cannot be written, a former row is damaged or no scheduler answers.
     """
     prepare_folder(out)
     done = read_rows(out / ROWS)

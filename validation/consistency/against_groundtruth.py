@@ -65,8 +65,7 @@ class LandmarkErrors:
 def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
     """Errors of a run; the truth's own standard deviations per axis are `std_m` and `std_rad`.
 
-    Raises:
-        InputError: the run has no truth, or too little.
+    Raises InputError: the run has no truth, or too little.
     """
     path, truth = record.path, record.truth
     if truth.rows.size < LEAST:

@@ -97,9 +97,8 @@ def compare_evidence(
         workers: processes; −1 for one per core.
         on_run: called with the runs done and their number; not in batch.
 
-    Raises:
-        InputError: the configurations are of different systems, differ in what is data, do not fit the data, or one has no
-            evidence: its likelihood is not a density, or what it measures is not counted once.
+    Raises InputError: the configurations are of different systems, differ in what is data, do not fit the data, or one
+    has no evidence: its likelihood is not a density, or what it measures is not counted once.
     """
     from joblib import Parallel, delayed
 
@@ -157,8 +156,7 @@ def compare_runs(
 ) -> EvidenceDifference:
     """The same for the settings of two finished runs over one recording, which are repeated with several seeds.
 
-    Raises:
-        InputError: they are runs of different systems or recordings, or of images, or have no evidence.
+    Raises InputError: they are runs of different systems or recordings, or of images, or have no evidence.
     """
     records = RunFolder.open(run_a), RunFolder.open(run_b)
     for record in records:

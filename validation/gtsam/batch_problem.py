@@ -80,9 +80,8 @@ def solve_problem(
         twice: start a camera's adjustment from its known points alone, too, and take the better optimum, so that it does
             not hang on where the filter went; not needed near the optimum.
 
-    Raises:
-        InputError: the measurements do not determine everything, too few frames are connected, it takes too many
-            iterations, or it does not converge.
+    Raises InputError: the measurements do not determine everything, too few frames are connected, it takes too many
+    iterations, or it does not converge.
     """
     if not isinstance(problem, FeatureLog):
         steps = np.arange(len(problem.stamps_ns))

@@ -66,10 +66,9 @@ def solve_features(
             what it raises ends it all.
         tolerance: fraction of the error that is no gain any more; at the default far landmarks creep for long.
 
-    Raises:
-        InputError: a number makes no sense, the first frame sees too few known points and there is no initial
-            estimate, the estimate puts a landmark behind its camera, a frame sees too few landmarks or none that
-            connect it, the known points are fewer than three or on a line, or the optimiser does not converge.
+    Raises InputError: a number makes no sense, the first frame sees too few known points and there is no initial
+    estimate, the estimate puts a landmark behind its camera, a frame sees too few landmarks or none that connect it,
+    the known points are fewer than three or on a line, or the optimiser does not converge.
     """
     full = observations.observation_table(log)
     known = observations.known_by_name(log.known, full.names)

@@ -82,8 +82,7 @@ def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, dr
         rng: of the draws.
         draws: their number S, two or more.
 
-    Raises:
-        InputError: a measurement's covariance is singular, or the optimum lacks something.
+    Raises InputError: a measurement's covariance is singular, or the optimum lacks something.
     """
     problem, path, size = Problem(m), optimum.world_from_body, m.z.shape[1]
     places = np.array([optimum.landmarks[name] for name in problem.names.tolist()]).reshape(-1, size)

@@ -51,9 +51,8 @@ def solve(
         initial: where to start; by default dead reckoning and first observations.
         incremental: start from ISAM2 instead, for recordings whose dead reckoning is far off.
 
-    Raises:
-        InputError: an observation has no noise, the measurements do not determine a variable, or the optimiser
-            does not converge.
+    Raises InputError: an observation has no noise, the measurements do not determine a variable, or the optimiser does
+    not converge.
     """
     problem = Problem(m, robust)
     with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):

@@ -74,8 +74,7 @@ def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Simi
 
     An alignment is fitted to all positions before, or a similarity applied.
 
-    Raises:
-        InputError: the lengths differ or are 0, or the alignment is unknown.
+    Raises InputError: the lengths differ or are 0, or the alignment is unknown.
     """
     _require_pairs(estimate, reference)
     applied = fit(alignment, estimate.positions, reference.positions)
@@ -101,8 +100,8 @@ def rpe(
         unit: of `delta`.
         alignment: as for `ate`; a rigid one changes nothing, a similarity the scale.
 
-    Raises:
-        InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the path is shorter than a pair.
+    Raises InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the path is shorter than a
+    pair.
     """
     _require_pairs(estimate, reference)
     moved = estimate.transformed(fit(alignment, estimate.positions, reference.positions))
@@ -133,8 +132,7 @@ def landmark_errors(
 
     A similarity is fitted to the common landmarks before, or a given one applied.
 
-    Raises:
-        InputError: no landmark is in both maps, or the alignment is unknown.
+    Raises InputError: no landmark is in both maps, or the alignment is unknown.
     """
     names = sorted(estimate.keys() & truth.keys())
     if not names:

@@ -276,8 +276,7 @@ def require_rerun() -> Any:
 def write_rerun(run: Run, path: Path) -> None:
     """Writes the recording (.rrd) of a run over images, whose source is read once more.
 
-    Raises:
-        InputError: Rerun is not installed, or the file cannot be written.
+    Raises InputError: Rerun is not installed, or the file cannot be written.
     """
     log, (log_seen, plots) = run.log, DRAWN[run.system.name]
     stamps, poses, plotted = log.stamps_ns, log.poses, {name: log[name] for name in plots}

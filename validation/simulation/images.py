@@ -297,9 +297,8 @@ def simulate_images(
         on_frame: called after every image, in order, with how many are done, and how many there will be.
         baseline_m: to a second camera like a `Pinhole`, to its right; a `RectifiedStereo` has its own.
 
-    Raises:
-        InputError: the folder exists, an option asks for frames that there are not, too few points can be known, or
-            the baseline is not positive.
+    Raises InputError: the folder exists, an option asks for frames that there are not, too few points can be known, or
+    the baseline is not positive.
 
     Example:
         >>> import tempfile

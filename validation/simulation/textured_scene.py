@@ -40,8 +40,7 @@ class Rectangle:
 
     The centre of texel (row i, column j) of a texture (H, W) lies at corner + (j + ½)/W across + (i + ½)/H down.
 
-    Raises:
-        InputError: the sides span no area, the texture is no grey image, or the gain is negative.
+    Raises InputError: the sides span no area, the texture is no grey image, or the gain is negative.
     """
 
     corner: np.ndarray  #: (3,) position of the texture's top left corner in the world, m.
