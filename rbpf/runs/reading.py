@@ -19,7 +19,7 @@ from typing import Any, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf.core.checkpoint import fitting, integers, load_arrays, numbers, read
+from rbpf.core.checkpoint import Schema, fitting, integers, load_arrays, numbers, read
 from rbpf.errors import InputError, printable
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.maps.grid import Picture
@@ -116,7 +116,6 @@ class RunFolder:
     @cached_property
     def path(self) -> PathAndMap:
         """The filtered poses, without landmarks."""
-        return self._poses[0]
         file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
         if not file.is_file():
             raise InputError(f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}")
@@ -147,10 +146,7 @@ class RunFolder:
     @cached_property
     def corrections(self) -> tuple[Array, Array]:
         """Corrections (T, r) of the motions and their covariances (T, r, r); r = 0 where the system does not report them."""
-        file = self.folder / TRAJECTORY
-        arrays = load_arrays(file)
-        with fitting(file):
-            correction, cov = read(arrays, _CORRECTIONS).values()
+        correction, cov = self._arrays(TRAJECTORY, _CORRECTIONS).values()
         return correction, cov
 
     @cached_property
@@ -178,20 +174,19 @@ class RunFolder:
     @cached_property
     def grid(self) -> Picture:
         """The occupancy grid of a laser scanner's run."""
-        file = self.folder / GRID
-        arrays = load_arrays(file)
-        with fitting(file):
-            found = read(arrays, _GRID)
+        found = self._arrays(GRID, _GRID)
         return Picture(found["log_odds"], float(found["cell_m"]), found["corner"])
 
     @cached_property
     def particles(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (N, E) of the last frame's particles in the reported world, and their weights (N,)."""
-        file = self.folder / TRAJECTORY
-        arrays = load_arrays(file)
-        with fitting(file):
-            poses, weights = read(arrays, _PARTICLES, size=self.path.space.size).values()
+        poses, weights = self._arrays(TRAJECTORY, _PARTICLES, size=self.path.space.size).values()
         return poses, weights
+
+    def _arrays(self, name: str, schema: Schema, **sizes: int) -> dict[str, np.ndarray]:
+        arrays = load_arrays(self.folder / name)
+        with fitting(self.folder / name):
+            return read(arrays, schema, **sizes)
 
     @cached_property
     def measurements(self) -> FeatureLog | Measurements:

@@ -1,8 +1,7 @@
 """Batch solution of a run's measurements by GTSAM: the trajectory and map that explain all of them best.
 
-The same measurements, the same models and the same noise as the filter had, without its samples and without
-its order in time: what the filter approximates.
-F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
+The same measurements, the same models and the same noise as the filter had, without its samples and without its order
+in time: what the filter approximates. F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 
     start:        x₀ = the known pose, a hard constraint
     odometry:     Log(δ_t⁻¹ x_{t−1}⁻¹ x_t) ~ N(0, Q_t)
