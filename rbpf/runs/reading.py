@@ -31,9 +31,9 @@ from rbpf.runs.trajectory import Trajectory, in_space
 from rbpf.runs.truth import RunTruth, read_truth
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
+from rbpf.sensors.readers.text import read_text
 from rbpf.systems.map_estimate import MapEstimate
 
-MOST_BYTES = 1 << 30  #: No file of a run folder is larger.
 _PATH = {"stamps_ns": integers("frames"), "mean": numbers("frames", "size"), "cov": numbers("frames", "dim", "dim")}
 _MOVED = numbers("frames", "r", values="any"), numbers("frames", "r", "r", values="any")
 _CORRECTIONS = dict(zip(("correction", "cov_correction"), _MOVED, strict=True))
@@ -97,7 +97,7 @@ class RunFolder:
                 raise InputError(f"{folder} has no {name}: expected the folder that a finished `rbpf run` left")
         config, path = read_config(folder), folder / "summary.json"
         try:
-            summary = json.loads(_text(path))
+            summary = json.loads(read_text(path))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
         if not isinstance(summary, dict):
@@ -202,7 +202,7 @@ class RunFolder:
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table of numbers by its columns' names: diagnostics.csv, timings.csv."""
         path = self.folder / name
-        rows = list(csv.reader(StringIO(_text(path))))
+        rows = list(csv.reader(StringIO(read_text(path))))
         if not rows or any(len(row) != len(rows[0]) for row in rows):
             raise InputError(f"{path}: expected a table whose rows have as many cells as its header")
         try:
@@ -210,12 +210,3 @@ class RunFolder:
         except ValueError as error:
             raise InputError(f"{path}: expected numbers below the header: {error}") from error
         return dict(zip(rows[0], values.T, strict=True))
-
-
-def _text(path: Path) -> str:
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path} is larger than any file of a run")
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
