@@ -22,7 +22,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.consistency.comparison import clear_comparisons
 from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
 from rbpf.validation.report.validate import COMPARISONS, VIDEO, compare_gtsam, validate, write_report
-from rbpf.validation.report.video import PICTURES, write_annotated, write_rerun
+from rbpf.validation.report.video import PICTURES, annotated_frames, write_rerun, write_video
 
 #: Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
 #: who asks for it.
@@ -73,7 +73,7 @@ def finish_run(
     found = RunFolder.open(out)
     draw_run(found)
     if video and run.system.name in PICTURES:
-        write_annotated(run, out / VIDEO, on_frame)
+        write_video(annotated_frames(run), run.log.stamps_ns, out / VIDEO, on_frame)
     else:
         (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:

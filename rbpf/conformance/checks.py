@@ -52,32 +52,26 @@ def motion_checks(model: models.MotionModel, space: LieGroup, rng: Generator, ex
     """Shapes, membership of the group, and independence of the particles."""
     name, states = named(model.transition), example.states(space, rng)
 
-    def drawn() -> None:
-        """From the generator that is given, and from nothing else."""
-        nonlocal states
-        name = named(model.sample)
-        if models.draws(model):
-            twice = [
-                called(model.sample, states, example.control, example.dt, np.random.default_rng(1), repeat=False)
-                for _ in range(2)
-            ]
-            require_shape(f"{name}: states", twice[0], states.shape)
-            same = np.array_equal(*twice)
-            require(same, f"{name} draws from something else than the generator that it is given")
-            what = f"{name} leaves the group {space!r}, use its compose or retract"
-            require_close(what, twice[0], space.normalise(twice[0]), 1e-9)
-            states = twice[0]
-
     def transition(state: np.ndarray) -> Any:
         return called(model.transition, state, example.control, example.dt)
 
     def shapes() -> None:
-        drawn()
+        nonlocal states
+        if models.draws(model):
+            drawing, given = named(model.sample), (states, example.control, example.dt)
+            first, again = (called(model.sample, *given, np.random.default_rng(1), repeat=False) for _ in range(2))
+            require_shape(f"{drawing}: states", first, states.shape)
+            same = np.array_equal(first, again)
+            require(same, f"{drawing} draws from something else than the generator that it is given")
+            what = f"{drawing} leaves the group {space!r}, use its compose or retract"
+            require_close(what, first, space.normalise(first), 1e-9)
+            states = first
         n, d, m, found = states.shape[0], space.dim, 0, transition(states)
         require_type(name, found, models.Transition)
-        given = [part is not None for part in (found.coupling, found.dynamics, found.drift)]
-        together = all(given) or not any(given)
-        require(together, f"{name} must give coupling, dynamics and drift together, or none of them")
+        there = [part is not None for part in (found.coupling, found.dynamics, found.drift)]
+        require(
+            all(there) or not any(there), f"{name} must give coupling, dynamics and drift together, or none of them"
+        )
         require_shape(f"{name}: mean", found.mean, (n, space.size))
         if found.coupling is not None:
             require_shape(f"{name}: coupling", found.coupling, (n, d, None), (1, d, None))

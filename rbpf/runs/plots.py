@@ -60,7 +60,7 @@ def draw_run(found: RunFolder) -> list[str]:
 def path_figure(found: RunFolder) -> Any:
     """The path, beside what there is to compare it with."""
     world = World.of(found)
-    path = world.of_filter(found)
+    path = world.brought(found.trajectory)
     figure, shown = Views.of(found.system, path).axes(f"{found.name}: path in {world.name}")
     curves = [] if world.truth is None else [("truth", world.truth.positions, "truth", "--")]
     for name, label_ in (("odometry", "odometry alone"), ("batch", "batch optimum")):
@@ -82,7 +82,7 @@ def path_figure(found: RunFolder) -> Any:
 def map_figure(found: RunFolder) -> Any:
     """Path and map: points with 3σ ellipses, rays, known points."""
     world = World.of(found)
-    path, motion = world.of_filter(found), world.motion(found.trajectory)
+    path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
     if (found.folder / GRID).is_file():
         return _grid_figure(found, world, path, motion)
     figure, shown = Views.of(found.system, path).axes(f"{found.name}: {SIGMAS:g}σ map in {world.name}")
@@ -136,7 +136,7 @@ def particles_figure(found: RunFolder) -> Any:
     """Particles of the last frame, and mean and covariance of the position."""
     poses, weights = found.particles
     world = World.of(found)
-    path, motion = world.of_filter(found), world.motion(found.trajectory)
+    path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
     title = f"{found.name}: {len(poses)} particles at the last frame"
     figure, shown = Views.of(found.system, path).axes(title)
     at = motion.transform(in_space(np.zeros(len(poses), dtype=np.int64), poses).positions)
@@ -286,9 +286,6 @@ class World:
 
     def brought(self, estimate: Trajectory) -> Trajectory:
         return estimate.transformed(self.motion(estimate))
-
-    def of_filter(self, found: RunFolder) -> Trajectory:
-        return self.brought(found.trajectory)
 
 
 def moved_map(found: MapEstimate, motion: Similarity) -> MapEstimate:

@@ -15,7 +15,7 @@ STAMPS = 100_000_000 * np.arange(4)
 def test_such_a_video_is_written_and_read(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     path = type(tmp_path)(name)
-    write_video(iter(PICTURES), (64, 64), STAMPS, path)
+    write_video(iter(PICTURES), STAMPS, path)
     assert [place.name for place in tmp_path.iterdir()] == [name]
     with opened(path) as capture:
         found, image = capture.read()
@@ -24,7 +24,7 @@ def test_such_a_video_is_written_and_read(tmp_path, monkeypatch, name):
 
 def test_another_protocol_is_not_followed(tmp_path):
     """A playlist that names another file."""
-    write_video(iter(PICTURES), (64, 64), STAMPS, tmp_path / "base.mp4")
+    write_video(iter(PICTURES), STAMPS, tmp_path / "base.mp4")
     (tmp_path / "list.mp4").write_text("#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/base.ts\n#EXT-X-ENDLIST\n")
     with pytest.raises(InputError), opened(tmp_path / "list.mp4"):
         pass

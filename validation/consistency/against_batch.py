@@ -146,8 +146,9 @@ def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = No
     if optimum is None:
         optimum = solve_problem(problem, filtered.world_from_body)
     floats = floats_in_scale(problem)
-    scale = gaussians.scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
-    scaled = gaussians.rescaled(filtered, scale)
+    scaled, scale = filtered, 1.0
+    if floats:
+        scaled, scale = gaussians.scaled_onto(filtered, optimum.steps, optimum.estimate, name)
     shared = np.intersect1d(scaled.landmarks.ids, optimum.estimate.landmarks.ids)
     ours = scaled.at(optimum.steps)
     return AgainstBatch(

@@ -17,6 +17,7 @@ magnitude than by particles, and in one pass.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,6 @@ from rbpf.sensors.readers import Part, RobotLog
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
@@ -202,7 +202,9 @@ def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
     return [float(np.logaddexp.reduce(part) - np.log(part.size)) for part in logs]
 
 
-def _filtered(config: RangeBearingConfig, data: Path | RobotRecording | RobotLog) -> Run[RangeBearingSlam]:
+def _filtered(config: Any, data: Data) -> Run[Any]:
+    if isinstance(data, FeatureLog):
+        return filter_features(data, config)
     if not isinstance(data, RobotLog):
         return filter_recording(RobotRecording(data) if isinstance(data, Path) else data, config)
     if config.noise.given():
@@ -211,8 +213,4 @@ def _filtered(config: RangeBearingConfig, data: Path | RobotRecording | RobotLog
 
 
 def _evidence(config: Config, data: Data) -> float:
-    if isinstance(config, RangeBearingConfig):
-        assert not isinstance(data, FeatureLog)
-        return float(_filtered(config, data).system.filter.log_evidence)
-    assert isinstance(data, FeatureLog)
-    return float(filter_features(data, config).system.filter.log_evidence)
+    return float(_filtered(config, data).system.filter.log_evidence)

@@ -94,7 +94,7 @@ def solve_features(
         across = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
         if across[1] <= LINE * across[0]:
             raise InputError(f"The known points that {name} sees lie on a line; add one beside it.")
-    start = begin(problem, initial or from_scratch(problem, on_iteration))
+    start = begin(problem, initial or _Growth(problem, on_iteration).grown())
     found = adjust(problem, start, tolerance, on_iteration)
     if not found.converged:
         raise InputError(
@@ -185,22 +185,12 @@ def resect(table: observations.ObservationTable, known: Known, near: Array, info
     return problem.state(values).path[0], solvers.marginals(graph, values, problem.pose_keys)[0]
 
 
-def from_scratch(problem: CameraProblem, on_iteration: solvers.OnIteration | None = None) -> InitialEstimate:
-    """Path and landmarks from the known points, or for a stereo pair without any, from the first frame.
-
-    `on_iteration` as of `solve_features`. An InputError says where the path cannot begin, or breaks.
-    """
-    growth = _Growth(problem, on_iteration)
-    for step in range(problem.frames):
-        growth.add(step)
-    # Landmarks never placed are missing.
-    names, placed = problem.table.names.tolist(), np.flatnonzero(growth.placed).tolist()
-    return InitialEstimate(growth.path, {names[index]: growth.points[index] for index in placed})
-
-
 @final
 class _Growth:
-    """A path that grows frame by frame, and the landmarks placed so far."""
+    """A path that grows frame by frame, and the landmarks placed so far.
+
+    It begins at the known points, or for a stereo pair without any, at the first frame.
+    """
 
     def __init__(self, problem: CameraProblem, on_iteration: solvers.OnIteration | None) -> None:
         self.problem, self.on_iteration = problem, on_iteration
@@ -217,7 +207,14 @@ class _Growth:
         self.adjusted = _EARLIEST
         self.blind = 0
 
-    def add(self, step: int) -> None:
+    def grown(self) -> InitialEstimate:
+        """The whole path, and all landmarks that were ever placed. An InputError says where it cannot begin, or breaks."""
+        for step in range(self.problem.frames):
+            self._add(step)
+        names, placed = self.table.names.tolist(), np.flatnonzero(self.placed).tolist()
+        return InitialEstimate(self.path, {names[index]: self.points[index] for index in placed})
+
+    def _add(self, step: int) -> None:
         """Pose of the next frame, and the landmarks it adds."""
         name, first, last = self.problem.name, *np.searchsorted(self.table.steps, [step, step + 1])
         rows = np.arange(first, last)

@@ -4,7 +4,7 @@ The difference of the means is given in units of one's standard deviations; S. K
 A. Bhattacharyya (1943) compare the whole densities, in natural units of information.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
@@ -105,30 +105,23 @@ def away_from_first(poses: Array) -> Array:
     return np.concatenate([np.zeros((len(poses), 3)), along[..., 0]], axis=1)
 
 
-def scale_onto(ours: PathAndMap, other: PathAndMap, name: str) -> float:
-    """The factor that brings our positions, taken from the first one, closest to the other's; a path must move."""
-    mine, theirs = (one.trajectory.positions - one.trajectory.positions[0] for one in (ours, other))
+def scaled_onto(estimate: PathAndMap, rows: NDArray[np.intp], other: PathAndMap, name: str) -> tuple[PathAndMap, float]:
+    """Path and map of SE(3), multiplied about the first pose so that some positions come closest to another's; the factor.
+
+    Raises InputError: the path does not move.
+    """
+    mine, theirs = (one.positions - one.positions[0] for one in (estimate.at(rows).trajectory, other.trajectory))
     square = float(np.square(mine).sum())
     if square <= _TINY**2:
         raise InputError(f"The gauge of {name} is not observable: the camera of the run stays where it began.")
-    return float((mine * theirs).sum() / square)
-
-
-def rescaled(estimate: PathAndMap, scale: float) -> PathAndMap:
-    """Path and map, multiplied about the first pose of SE(3)."""
-    if scale == 1.0:
-        return estimate
+    scale = float((mine * theirs).sum() / square)
     origin, landmarks = estimate.world_from_body[0, 4:], estimate.landmarks
     poses = estimate.world_from_body.copy()
     poses[:, 4:] = origin + scale * (poses[:, 4:] - origin)
     by = np.repeat([1.0, scale], 3)
     mean = origin + scale * (landmarks.mean - origin)
-    return replace(
-        estimate,
-        world_from_body=poses,
-        cov_poses=estimate.cov_poses * np.outer(by, by),
-        landmarks=MapEstimate(landmarks.ids, mean, scale**2 * landmarks.cov),
-    )
+    moved = MapEstimate(landmarks.ids, mean, scale**2 * landmarks.cov)
+    return PathAndMap(estimate.stamps_ns, poses, estimate.cov_poses * np.outer(by, by), moved), scale
 
 
 def _differences(

@@ -33,7 +33,7 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
         found = errors.landmarks
         title = f"{name}: landmarks against the truth"
         figures["groundtruth_landmarks.png"] = landmark_figure(title, found.squares, found.white.shape[1])
-        ours, (mean, cov) = world.of_filter(record).positions, found.map.in_space()
+        ours, (mean, cov) = world.brought(record.trajectory).positions, found.map.in_space()
         true = np.pad(found.truth, ((0, 0), (0, 3 - found.truth.shape[1])))
         title = f"{name}: map over the truth, in {world.name}"
         figures["groundtruth_map.png"] = map_figure(title, ours, mean, cov, {"truth": true}, wide_axes(ours[rows]))

@@ -11,7 +11,7 @@ world/map                      the final map: points with 3σ ellipsoids, rays a
 plots/…                        figures over the frames
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from itertools import chain
 from pathlib import Path
@@ -184,12 +184,6 @@ def annotated_frames(run: Run) -> Iterator[np.ndarray]:
         yield draw(run, t, frame)
 
 
-def write_annotated(run: Run, path: Path, on_frame: OnDone | None = None) -> None:
-    """Writes an MP4 of all frames that were filtered of a run of a system in `PICTURES`; see `write_video`."""
-    first = next(frames := annotated_frames(run))
-    write_video(chain([first], frames), first.shape[1::-1], run.log.stamps_ns, path, on_frame)
-
-
 #: Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps.
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
 RATE_FACTOR = "23"  #: Constant rate factor of H.264: 18 is nearly without loss, 28 poor.
@@ -197,23 +191,20 @@ ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact
 
 
 def write_video(
-    pictures: Iterable[np.ndarray],
-    size: tuple[int, int],
-    stamps_ns: np.ndarray,
-    path: Path,
-    on_frame: OnDone | None = None,
+    pictures: Iterator[np.ndarray], stamps_ns: np.ndarray, path: Path, on_frame: OnDone | None = None
 ) -> None:
-    """Writes an MP4 of pictures (H, W, 3) uint8 of one size (width, height), even numbers, as fast as their stamps (T,).
+    """Writes an MP4 of pictures (H, W, 3) uint8, one or more of one size, even numbers, as fast as their stamps (T,).
 
     It appears under its name when it is complete; an InputError says that the place cannot be written to. `on_frame` is called
     with the pictures written and their number.
     """
     import imageio_ffmpeg
 
+    first = next(pictures)
     with whole(path) as partial:
         encoder = imageio_ffmpeg.write_frames(
             str(partial.absolute()),
-            size,
+            first.shape[1::-1],
             fps=frame_rate(stamps_ns),
             codec="libx264",
             quality=None,
@@ -224,7 +215,7 @@ def write_video(
         )
         with closing(encoder):
             encoder.send(None)
-            for t, picture in enumerate(pictures):
+            for t, picture in enumerate(chain([first], pictures)):
                 encoder.send(np.ascontiguousarray(picture))
                 if on_frame is not None:
                     on_frame(t + 1, stamps_ns.size)
