@@ -1,7 +1,7 @@
 """From a run to its report: files, batch optimum, scores, pictures, video, verdict. It drives no run.
 
-Everything after the files of the run itself is made from its folder, so that it can be made again without the recording;
-only the annotated video needs the images once more.
+Everything after the files of the run itself is made from its folder, so that it can be made again without the
+recording; only the annotated video needs the images once more.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,19 +42,10 @@ def finish_run(
 ) -> dict[str, Any]:
     """Writes everything that a run leaves; returns the entries of summary.json and the verdict.
 
-    The run's own files are complete before the batch adjustment begins.
-
-    Args:
-        run: what was filtered.
-        out: the run's folder.
-        sources: what it was filtered from, for config.yaml; `recording` is one of them.
-        video: also write the annotated video, of a run over images.
-        rerun: file of a recording for the Rerun viewer; None writes none.
-        batch: also solve for the batch optimum of the same measurements, and score it.
-        on_frame: called with the frames drawn and their number.
-        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
-        most_iterations: of the batch adjustment, after which it is given up, see `solve_problem`.
-
+    The run's own files are complete before the batch adjustment begins. `sources` is what was filtered, for
+    config.yaml; `recording` is one of them. `video` and `batch` also make the annotated video, of a run over images,
+    and the batch optimum of the same measurements; `rerun` is the file of a recording for the Rerun viewer. `on_frame`
+    is called with the frames drawn and their number; `on_iteration` and `most_iterations` are as of `solve_problem`.
     Raises InputError: a file cannot be written.
     """
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}

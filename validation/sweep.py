@@ -180,16 +180,11 @@ def _sequence(given: str | Mapping[str, str], fields: tuple[str, ...], folder: P
 def sweep(
     jobs: Sequence[Job], out: Path, workers: int = -1, scheduler: str | None = None, on_run: OnDone | None = None
 ) -> list[Row]:
-    """Runs what is not done yet and writes the table; returns the rows in the order of the jobs.
+    """Runs the jobs of `read_plan` that are not done yet, writes rows and table; returns the rows in the order of the jobs.
 
-    A run that was not possible has its `failure` in words.
-
-    Args:
-        jobs: of `read_plan`.
-        out: folder for rows and table.
-        workers: processes of this machine; −1 for one per core.
-        scheduler: address of a Dask scheduler, whose workers run the jobs instead; they need the same paths.
-        on_run: called with the runs done and their number.
+    A run that was not possible has its `failure` in words. `workers` are processes of this machine, −1 for one per
+    core; `scheduler` is the address of a Dask scheduler whose workers run the jobs instead; they need the same paths.
+    `on_run` is called with the runs done and their number.
 
     Raises InputError: the folder cannot be written, a former row is damaged or no scheduler answers.
     """

@@ -122,17 +122,12 @@ def drive(
 ) -> Run:
     """Takes all frames of the run's source that it has not taken yet, and calls the listeners after each.
 
-    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A disk that
-    is full ends no run; it goes on with the last checkpoint that could be written. A KeyboardInterrupt from a listener leaves
-    a checkpoint behind, too.
+    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A
+    disk that is full ends no run; it goes on with the last checkpoint that could be written. A KeyboardInterrupt from a
+    listener leaves a checkpoint behind, too.
 
-    Args:
-        run: new, or as far as it has come.
-        listeners: called with the run and what `track` returned.
-        checkpoint: file of checkpoints; None writes none.
-        every: frames between checkpoints.
-        resume: go on from the checkpoint, if there is one.
-        stamps_ns: (T,) times of all frames, where they are known: a checkpoint must be of the same.
+    A `checkpoint` is written after `every` so many frames; with `resume` the run goes on from it, if it is there.
+    `stamps_ns` (T,) are the times of all frames, where they are known: a checkpoint must be of the same.
     """
     if resume and checkpoint is not None and checkpoint.exists():
         run.load(checkpoint)

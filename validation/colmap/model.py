@@ -4,8 +4,8 @@ COLMAP writes poses as camera-from-world and puts the centre of the top-left pix
 world-from-camera and it is at (0, 0). The half pixel is added and taken away in this module and nowhere else.
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 
-In a reconstruction, image t + 1 is frame t (of a stereo pair, images 2t + 1 and 2t + 2 on one rig), point j + 1 is row j
-of the map.
+In a reconstruction, image t + 1 is frame t (of a stereo pair, images 2t + 1 and 2t + 2 on one rig), point j + 1 is row
+j of the map.
 """
 
 from collections.abc import Mapping
@@ -71,14 +71,11 @@ def build_model(
     colours: NDArray[np.uint8] | None = None,
     names: Names | None = None,
 ) -> Any:
-    """A `pycolmap.Reconstruction`.
+    """A `pycolmap.Reconstruction` of observations of T frames, of which the right pixel of a pair becomes one of its own.
 
-    Args:
-        table: observations of T frames; the right pixel of a stereo pair becomes an observation of its own.
-        world_from_camera: (T, 7) of the (left) camera.
-        points: (L, 3), in the order of the table's names.
-        colours: (L, 3) RGB; by default grey.
-        names: of the images, by frame and side; others are left out. By default all, as `image_name` calls them.
+    `world_from_camera` (T, 7) is of the (left) camera; `points` (L, 3), in the order of the table's names, are grey
+    unless they have `colours` (L, 3) RGB. Images without a name, by frame and side, are left out; by default
+    `image_name` names all.
     """
     import pycolmap
 
@@ -155,8 +152,8 @@ def recorded_images(config: Mapping[str, Any]) -> ImageSequence:
 def lay_out(sequence: ImageSequence, folder: Path, count: int) -> Names:
     """Links to the files of the first images of a recording, or the images as they were filtered, as PNG files.
 
-    A file is linked to under its own name where the system saw it as it is: not one of a video or a bag, rectified, resized
-    or turned. A missing one is left out. Returned are the names as paths below `folder`.
+    A file is linked to under its own name where the system saw it as it is: not one of a video or a bag, rectified,
+    resized or turned. A missing one is left out. Returned are the names as paths below `folder`.
     """
     stereo = sequence.baseline_m is not None
     prefixes = {LEFT: "left/", RIGHT: "right/"} if stereo else {LEFT: ""}

@@ -10,8 +10,8 @@ That law is of no use where s is large: then log Z is taken as the logarithm of 
 carry, with s for its error.
 
 Where a robot's landmarks are named and its likelihood is Gaussian, the filter's model is the batch's, and Ẑ is that of
-draws from the batch posterior (`rbpf.validation.gtsam.path_sampling`), one part of them for each seed: closer by orders of
-magnitude than by particles, and in one pass.
+draws from the batch posterior (`rbpf.validation.gtsam.path_sampling`), one part of them for each seed: closer by orders
+of magnitude than by particles, and in one pass.
 """
 
 from collections.abc import Sequence
@@ -89,13 +89,8 @@ def compare_evidence(
 ) -> EvidenceDifference:
     """Compares how two configurations of one system explain the same data: filtered once per seed, or in batch.
 
-    Args:
-        config_a: the first; its own seed is not used.
-        config_b: the second.
-        data: a log, or where one lies.
-        seeds: two or more.
-        workers: processes; −1 for one per core.
-        on_run: called with the runs done and their number; not in batch.
+    Their own seeds are not used; `seeds` are two or more. `workers` are processes, −1 for one per core. `on_run` is
+    called with the runs done and their number; not in batch.
 
     Raises InputError: the configurations are of different systems, differ in what is data, do not fit the data, or one
     has no evidence: its likelihood is not a density, or what it measures is not counted once.

@@ -70,15 +70,12 @@ def solve_problem(
 ) -> Optimum:
     """GTSAM's optimum: of a robot's run, or of all frames of a camera's that landmarks connect with the first one.
 
-    Args:
-        problem: T steps.
-        start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
-        robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
-        most: iterations of a camera's adjustment, after which it is given up; by default as many as `WORK` allows.
-        on_iteration: called with the number of an iteration of a camera's adjustment and the error before it.
-        marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
-        twice: start a camera's adjustment from its known points alone, too, and take the better optimum, so that it does
-            not hang on where the filter went; not needed near the optimum.
+    A camera's adjustment begins at `start` (T, E), poses of the filter, a robot's at its odometry. With `twice` it
+    begins at the known points alone, too, and the better optimum is taken, so that it does not hang on where the filter
+    went; not needed near the optimum. `robust` is Huber's threshold in standard deviations; None takes all as Gaussian,
+    as the filter does. After `most` iterations, by default as many as `WORK` allows, a camera's is given up;
+    `on_iteration` is called with the number of each and the error before it. Without `marginals` the optimum has no
+    covariances of poses, NaN of landmarks.
 
     Raises InputError: the measurements do not determine everything, too few frames are connected, it takes too many
     iterations, or it does not converge.
@@ -123,7 +120,8 @@ def solve_problem(
 def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> dict[str, float]:
     """How well an estimate's own poses and landmarks explain the observations of the named landmarks.
 
-    Σ log N(z − h(x̂, m̂); 0, R) [nats], root mean square of a whitened residual per measured number, number of observations.
+    Σ log N(z − h(x̂, m̂); 0, R) [nats], root mean square of a whitened residual per measured number, number of
+    observations.
     """
     places = estimate.landmarks.named()
     if isinstance(problem, FeatureLog):

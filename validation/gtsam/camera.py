@@ -4,9 +4,9 @@ The same measurements and the same noise as a filter had, without its samples an
 B. Triggs et al., "Bundle adjustment: a modern synthesis" (2000);
 F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 
-An initial estimate from scratch has the first camera from known points, then goes frame by frame: a frame's pose is found
-from the landmarks placed so far; then the landmarks that it sees are triangulated, and placed once their parallax tells
-their distance. From time to time all is adjusted, because errors would grow else.
+An initial estimate from scratch has the first camera from known points, then goes frame by frame: a frame's pose is
+found from the landmarks placed so far; then the landmarks that it sees are triangulated, and placed once their parallax
+tells their distance. From time to time all is adjusted, because errors would grow else.
 """
 
 from dataclasses import replace
@@ -56,15 +56,11 @@ def solve_features(
     starts, and for a single camera, whose pixels do not tell the scale, its distance from the camera that starts
     farthest from it; the covariances then are relative to these.
 
-    Args:
-        log: the measurements.
-        initial: where to start; landmarks that it lacks are triangulated. By default it is found frame by frame,
-            from four known points in the first frame, or for a stereo pair without any, from the identity.
-        robust: as of `rbpf.validation.gtsam.robot.solve`, like `marginals`.
-        marginals: compute covariances.
-        on_iteration: given the error before each iteration, also of adjustments on the way to an initial estimate;
-            what it raises ends it all.
-        tolerance: fraction of the error that is no gain any more; at the default far landmarks creep for long.
+    Landmarks that the `initial` estimate lacks are triangulated. By default it is found frame by frame, from four known
+    points in the first frame, or for a stereo pair without any, from the identity. `robust` and `marginals` are as of
+    `rbpf.validation.gtsam.robot.solve`. `on_iteration` is given the error before each iteration, also of adjustments on
+    the way to an initial estimate; what it raises ends it all. `tolerance` is the fraction of the error that is no gain
+    any more.
 
     Raises InputError: a number makes no sense, the first frame sees too few known points and there is no initial
     estimate, the estimate puts a landmark behind its camera, a frame sees too few landmarks or none that connect it,
@@ -117,7 +113,8 @@ def solve_features(
 def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
     """A state near an estimate: its landmarks, known points, and the others triangulated from its poses.
 
-    Landmarks that come out behind a camera are placed on their first rays; an InputError names one that has no place there.
+    Landmarks that come out behind a camera are placed on their first rays; an InputError names one that has no place
+    there.
     """
     table, path = problem.table, np.asarray(start.world_from_body, dtype=float)
     if path.shape != (problem.frames, 7) or not np.isfinite(path).all():
@@ -162,8 +159,8 @@ def locate(table: observations.ObservationTable, known: Known) -> tuple[Array, A
 def resect(table: observations.ObservationTable, known: Known, near: Array, info: Array) -> tuple[Array, Array]:
     """Pose (7,) with Huber's loss, once more without the outliers, whose pull Huber only limits; covariance (6, 6).
 
-    From observations of one frame and where its landmarks are. A weak prior stands in for what the image leaves open: it
-    has its mean at `near` (7,) world_from_camera, where it starts, and the information (6, 6).
+    From observations of one frame and where its landmarks are. A weak prior stands in for what the image leaves open:
+    it has its mean at `near` (7,) world_from_camera, where it starts, and the information (6, 6).
     """
 
     def solve(part: observations.ObservationTable, start: Array) -> tuple[Any, Any, CameraProblem]:

@@ -1,11 +1,11 @@
 """Whole paths and maps drawn from the batch's posterior, and the evidence of the measurements.
 
-At the optimum the posterior is nearly Gaussian: in the right charts of the poses there, Laplace's approximation is
-N(0, H⁻¹), H = JᵀJ with J the whitened Jacobian of the least-squares problem. A draw is what the problem answers when
-all of its residuals are noise, ξ = H⁻¹ Jᵀ η with η ~ N(0, I): no root of H⁻¹ is needed (G. Papandreou, A. Yuille,
-"Gaussian sampling by local perturbations", 2010). A draw's weight is the true joint density of path, map and
-measurements over its own, Mathematics (batch-weight): the mean weight is the evidence, without bias, and the weighted draws
-are the posterior, whatever H leaves out. Nearer to the posterior than draws of N(0, H⁻¹), at no cost in exactness:
+At the optimum the posterior is nearly Gaussian: in the right charts of the poses there, Laplace's approximation is N(0,
+H⁻¹), H = JᵀJ with J the whitened Jacobian of the least-squares problem. A draw is what the problem answers when all of
+its residuals are noise, ξ = H⁻¹ Jᵀ η with η ~ N(0, I): no root of H⁻¹ is needed (G. Papandreou, A. Yuille, "Gaussian
+sampling by local perturbations", 2010). A draw's weight is the true joint density of path, map and measurements over
+its own, Mathematics (batch-weight): the mean weight is the evidence, without bias, and the weighted draws are the
+posterior, whatever H leaves out. Nearer to the posterior than draws of N(0, H⁻¹), at no cost in exactness:
 
 - Densities of motions are those of e_t, so that each pose comes with |J_r(ξ_t)| / |J_r(e_t)|. A robot that hardly slips
   sideways follows a curve that no chart of single poses follows: where e_t bends by more than `BENT` of its noise, the linear
@@ -74,14 +74,9 @@ class PosteriorDraws:
 
 
 def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, draws: int = DRAWS) -> PosteriorDraws:
-    """Draws whole paths and maps from the posterior of a robot's measurements, given their batch optimum.
+    """Draws S whole paths and maps, two or more, from the posterior of a robot's measurements, taken as Gaussian.
 
-    Args:
-        m: the measurements, taken as Gaussian.
-        optimum: poses (T, E) and position of every landmark; far from it the weights scatter.
-        rng: of the draws.
-        draws: their number S, two or more.
-
+    `optimum` has poses (T, E) and the position of every landmark; far from the batch optimum the weights scatter.
     Raises InputError: a measurement's covariance is singular, or the optimum lacks something.
     """
     problem, path, size = Problem(m), optimum.world_from_body, m.z.shape[1]

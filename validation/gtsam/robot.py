@@ -40,15 +40,12 @@ def solve(
     initial: InitialEstimate | None = None,
     incremental: bool = False,
 ) -> solvers.BatchSolution:
-    """Solve for all poses and landmarks at once.
+    """Solve for all poses and landmarks at once; nothing of the measurements is left out.
 
-    Args:
-        m: the measurements; nothing of them is left out.
-        robust: threshold of Huber's loss on the norm of each whitened observation, in standard deviations (1.345
-            is usual); None takes all as Gaussian. The covariances then are those of the reweighted problem.
-        marginals: compute covariances.
-        initial: where to start; by default dead reckoning and first observations.
-        incremental: start from ISAM2 instead, for recordings whose dead reckoning is far off.
+    `robust` is the threshold of Huber's loss on the norm of each whitened observation, in standard deviations (1.345 is
+    usual); None takes all as Gaussian. The covariances, which `marginals` asks for, then are those of the reweighted
+    problem. It starts from `initial`, by default dead reckoning and first observations; `incremental` starts from ISAM2
+    instead, for recordings whose dead reckoning is far off.
 
     Raises InputError: an observation has no noise, the measurements do not determine a variable, or the optimiser does
     not converge.

@@ -89,16 +89,11 @@ def rpe(
     unit: Literal["frames", "metres"] = "frames",
     alignment: Alignment | Similarity = "none",
 ) -> RelativeError:
-    """Relative pose error, the difference of the motions between consecutive poses `delta` apart.
+    """Relative pose error, the difference of the motions between consecutive poses `delta` apart, of T poses each.
 
-    The first pair starts at the first pose and each further pair where the one before ends.
-
-    Args:
-        estimate: T poses.
-        reference: the T poses that belong to them.
-        delta: length of a pair, a whole number of frames or metres along the estimated path once aligned.
-        unit: of `delta`.
-        alignment: as for `ate`; a rigid one changes nothing, a similarity the scale.
+    The first pair starts at the first pose and each further pair where the one before ends. `delta` is a whole number
+    of frames, or metres along the estimated path once aligned; of an alignment, as for `ate`, only the scale changes
+    anything.
 
     Raises InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the path is shorter than a
     pair.

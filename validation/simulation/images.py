@@ -40,8 +40,8 @@ class Imaging:
     """How pictures are taken, and what is given along with them.
 
     The defaults are those of a small camera indoors: an exposure of a hundredth of a second, the noise of a raised
-    gain, an automatic exposure, a lens that is darker in the corners. `examples/studies/mono_realism.py` compares what active
-    search finds with them with real recordings.
+    gain, an automatic exposure, a lens that is darker in the corners. `examples/studies/mono_realism.py` compares what
+    active search finds with them with real recordings.
     """
 
     noise_std: NotNegative = 3.0  #: of the sensor, grey levels.
@@ -150,7 +150,8 @@ LEAST_SPREAD = 0.05
 def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, count: int) -> tuple[Array, Array]:
     """`count` strong corners spread over the middle of the first image; the first few of them spread as well as all.
 
-    Pixels (M, 2) in the first image, and positions (M, 3) in the world, m; an InputError where they are too few or on a line.
+    Pixels (M, 2) in the first image, and positions (M, 3) in the world, m; an InputError where they are too few or on a
+    line.
     """
     import cv2
 
@@ -285,17 +286,10 @@ def simulate_images(
     """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.
 
     Beside mav0 there are camera.yaml; known_points.csv, if points are known; chessboard.yaml, if there is a board; and
-    odometry.csv with odometry.yaml, if the camera stands on a robot.
-    The folder appears when it is complete: an interrupted run leaves nothing there.
-
-    Args:
-        world: what there is to see, and the camera's path.
-        imaging: how the pictures are taken.
-        camera: that takes them; the path is the left one's.
-        folder: to write; must not exist, or be empty.
-        seed: of all that is random.
-        on_frame: called after every image, in order, with how many are done, and how many there will be.
-        baseline_m: to a second camera like a `Pinhole`, to its right; a `RectifiedStereo` has its own.
+    odometry.csv with odometry.yaml, if the camera stands on a robot. The folder must not exist, or be empty; it appears
+    when it is complete: an interrupted run leaves nothing there. The world's path is that of the left camera;
+    `baseline_m` is that of a second one like a `Pinhole`, to its right; a `RectifiedStereo` has its own. `on_frame` is
+    called after every image, in order, with how many are done, and how many there will be.
 
     Raises InputError: the folder exists, an option asks for frames that there are not, too few points can be known, or
     the baseline is not positive.
