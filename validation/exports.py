@@ -57,59 +57,49 @@ def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
         raise InputError(f"a run is exported as {', '.join(FORMATS)}, not as {unknown[0]}")
     estimate = RunFolder.open(run).estimate
     prepare_folder(out)
-    return [out / file for name in dict.fromkeys(formats) for file in FORMATS[name](run, estimate, out)]
+    chosen = [FORMATS[name] for name in dict.fromkeys(formats)]
+    for files, write in chosen:
+        write(run, estimate, out / files[0])
+    return [out / file for files, _ in chosen for file in files]
 
 
-def _tum(_run: Path, estimate: PathAndMap, out: Path) -> list[str]:
-    write_tum(out / "trajectory.tum", estimate.trajectory)
-    return ["trajectory.tum"]
-
-
-def _kitti(_run: Path, estimate: PathAndMap, out: Path) -> list[str]:
-    write_kitti(out / "trajectory_kitti.txt", estimate.trajectory)
-    return ["trajectory_kitti.txt"]
-
-
-def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[str]:
+def _colmap(run: Path, estimate: PathAndMap, path: Path) -> None:
     problem = RunFolder.open(run).measurements if (run / OBSERVATIONS).exists() else None
     names: Names | None = None
     if (config := read_config(run))["system"] in OVER_IMAGES:
         try:
-            names = lay_out(recorded_images(config), out / MODEL / "images", len(estimate.stamps_ns))
+            names = lay_out(recorded_images(config), path / "images", len(estimate.stamps_ns))
         except InputError as error:
             _log.warning("%s: the images of the run are not exported: %s", run, error)
-    export_colmap(estimate, problem, out / MODEL / "sparse" / "0", names=names)
-    return [MODEL]
+    export_colmap(estimate, problem, path / "sparse" / "0", names=names)
 
 
-def _npz(_run: Path, estimate: PathAndMap, out: Path) -> list[str]:
+def _npz(_run: Path, estimate: PathAndMap, path: Path) -> None:
     landmarks = estimate.landmarks
     arrays = {name: getattr(estimate, name) for name in ("stamps_ns", "world_from_body", "cov_poses")}
     arrays |= {"landmark_ids": landmarks.ids, "landmarks": landmarks.mean, "cov_landmarks": landmarks.cov}
-    save_arrays(out / "run.npz", arrays)
-    return ["run.npz"]
+    save_arrays(path, arrays)
 
 
-def _rerun(run: Path, estimate: PathAndMap, out: Path) -> list[str]:
+def _rerun(run: Path, estimate: PathAndMap, path: Path) -> None:
     trajectory = estimate.trajectory
-    with recording(out / "run.rrd", run.resolve().name) as (rr, stream):
+    with recording(path, run.resolve().name) as (rr, stream):
         stream.log("world/path", rr.LineStrips3D([trajectory.positions]), static=True)
         stream.log("world/map", ellipsoids(rr, estimate.landmarks), static=True)
         for t, pose in enumerate(trajectory.world_from_body):
             log_time(stream, t, int(estimate.stamps_ns[t] - estimate.stamps_ns[0]))
             log_pose(rr, stream, "body", pose)
             stream.log("world/body", rr.TransformAxes3D(AXIS_M))
-    return ["run.rrd"]
 
 
-#: How each is written; the names of the files are returned.
-FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[str]]] = {
-    "tum": _tum,
-    "kitti": _kitti,
-    "ply": lambda _run, estimate, out: export_ply(estimate, out),
-    "colmap": _colmap,
-    "rerun": _rerun,
-    "npz": _npz,
+#: The files of each, and how they are written: from the run's folder, its path and map, to the first of them.
+FORMATS: dict[str, tuple[tuple[str, ...], Callable[[Path, PathAndMap, Path], object]]] = {
+    "tum": (("trajectory.tum",), lambda _run, estimate, path: write_tum(path, estimate.trajectory)),
+    "kitti": (("trajectory_kitti.txt",), lambda _run, estimate, path: write_kitti(path, estimate.trajectory)),
+    "ply": ((MAP, PATH), lambda _run, estimate, path: export_ply(estimate, path.parent)),
+    "colmap": ((MODEL,), _colmap),
+    "rerun": (("run.rrd",), _rerun),
+    "npz": (("run.npz",), _npz),
 }
 
 
@@ -148,8 +138,8 @@ def export_colmap(
     return model
 
 
-def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
-    """Writes map.ply and path.ply; returns their names."""
+def export_ply(estimate: PathAndMap, folder: Path) -> None:
+    """Writes map.ply and path.ply."""
     prepare_folder(folder)
     std = standard_deviations(estimate.landmarks.cov)
     write_ply(folder / MAP, estimate.landmarks.in_space()[0], colours_by_sigma(std), std)
@@ -157,7 +147,6 @@ def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
     steps = np.arange(max(len(at) - 1, 0))
     edges = np.stack([steps, steps + 1], axis=1)
     write_ply(folder / PATH, at, np.repeat(_PATH_COLOUR, len(at), axis=0), edges=edges)
-    return [MAP, PATH]
 
 
 def standard_deviations(cov: Array) -> Array:

@@ -19,7 +19,7 @@ from rbpf.runs.trajectory import write_tum
 from rbpf.runs.truth import LEAST, TRUTH
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.consistency.comparison import clear_comparisons
+from rbpf.validation.consistency.comparison import COMPARISON
 from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
 from rbpf.validation.report.validate import COMPARISONS, VIDEO, compare_gtsam, validate, write_report
 from rbpf.validation.report.video import PICTURES, annotated_frames, write_rerun, write_video
@@ -53,7 +53,9 @@ def finish_run(
         wanted, batch = {}, False
     entries = write_run(run, out, dict(sources) | left_out(**wanted))
     (out / BATCH).unlink(missing_ok=True)
-    clear_comparisons(out)
+    for path in out.glob(f"{COMPARISON}*.json"):  # of an earlier run, with their pictures
+        for old in (path, *out.glob(f"{path.stem.removeprefix(COMPARISON)}_*.png")):
+            old.unlink()
     if batch:
         try:
             entries |= add_batch(RunFolder.open(out), most_iterations, on_iteration)

@@ -10,7 +10,6 @@ import numpy as np
 
 import rbpf
 from rbpf.cli.showing import progress, say
-from rbpf.errors import InputError
 
 _ROOT = Path(rbpf.__file__).parent
 
@@ -59,17 +58,6 @@ def compile_kernels(every: bool = False) -> list[str]:
                 part()
                 report(done, len(work))
     return missing
-
-
-def use_threads(threads: int | None) -> None:
-    """Sets the number of threads of the kernels; None leaves all."""
-    if threads is None:
-        return
-    import numba
-
-    if not 1 <= threads <= numba.config.NUMBA_NUM_THREADS:
-        raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {threads}")
-    numba.set_num_threads(threads)
 
 
 def _first_calls() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rbpf.cli.commands import Commands
-from rbpf.cli.compiling import compile_kernels, use_threads
+from rbpf.cli.compiling import compile_kernels
 from rbpf.cli.interrupts import StoppedError, patient
 from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
 from rbpf.cli.showing import answer, progress, say
@@ -262,7 +262,12 @@ def _run(
         raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
     kept = options.resume or options.overwrite
     out = numbered(Path("run"), last=kept) if options.out is None else options.out
-    use_threads(options.threads)
+    if options.threads is not None:
+        import numba
+
+        if not 1 <= options.threads <= numba.config.NUMBA_NUM_THREADS:
+            raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {options.threads}")
+        numba.set_num_threads(options.threads)
     with own_folder(out), progress() as bar:
         if holds_run(out) and not kept:
             raise InputError(

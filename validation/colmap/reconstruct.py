@@ -6,8 +6,7 @@ there, and the known baseline gives the scale.
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -83,7 +82,10 @@ def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None =
 
     options = options or ReconstructionOptions()
     is_stereo, numbers = sequence.baseline_m is not None, []
-    with TemporaryDirectory(prefix="colmap-") as temporary, _quiet():
+    with TemporaryDirectory(prefix="colmap-") as temporary, ExitStack() as afterwards:
+        # COLMAP's progress is kept off the terminal.
+        afterwards.callback(setattr, pycolmap.logging, "minloglevel", pycolmap.logging.minloglevel)
+        pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
         images, models, database = (Path(temporary) / name for name in ("images", "models", "database.db"))
         images.mkdir()
         models.mkdir()
@@ -170,16 +172,3 @@ def _side(model: Any, side: int) -> dict[int, Array]:
     """Poses (7,) by frame, of the left (0) or right (1) images."""
     found = [image for image in model.images.values() if image.has_pose and image.name.endswith(f"_{side}.png")]
     return {int(image.name.split("_")[0]): from_colmap_pose(image.cam_from_world()) for image in found}
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps COLMAP's progress off the terminal."""
-    import pycolmap
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before

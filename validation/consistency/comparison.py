@@ -36,7 +36,7 @@ from rbpf.validation.consistency.statistic import Statistic, motion_statistics, 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 #: By system, where its configuration holds the one standard deviation of all measurements, px.
 SETTINGS = {"mono": ("search", "noise_px")}
-_PREFIX = "validation_"
+COMPARISON = "validation_"  #: What the names of their files begin with.
 
 
 @dataclass(frozen=True)
@@ -53,24 +53,15 @@ class Comparison:
 def write_comparison(folder: Path, comparison: Comparison) -> Path:
     """Writes `validation_NAME.json`; returns its path."""
     entries = vars(comparison) | {"statistics": [statistic.entries() for statistic in comparison.statistics]}
-    path = folder / f"{_PREFIX}{comparison.against}.json"
+    path = folder / f"{COMPARISON}{comparison.against}.json"
     write_text(path, json.dumps(entries, indent=2, allow_nan=False) + "\n")
     return path
-
-
-def clear_comparisons(folder: Path) -> None:
-    """Removes the comparisons of an earlier run from a folder, with their pictures."""
-    for path in folder.glob(f"{_PREFIX}*.json"):
-        against = path.stem.removeprefix(_PREFIX)
-        for picture in folder.glob(f"{against}_*.png"):
-            picture.unlink()
-        path.unlink()
 
 
 def read_comparisons(folder: Path) -> list[Comparison]:
     """All comparisons that a folder holds, in order of their names; an InputError names a file that is none."""
     found = []
-    for path in sorted(folder.glob(f"{_PREFIX}*.json")):
+    for path in sorted(folder.glob(f"{COMPARISON}*.json")):
         try:
             entries = json.loads(path.read_text(encoding="utf-8"))
             comparison = Comparison(
