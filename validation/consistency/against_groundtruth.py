@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.runs.plots import moved_map
-from rbpf.runs.reading import PathAndMap, RunFolder
+from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
 from rbpf.runs.truth import LEAST, RunTruth
 from rbpf.systems.map_estimate import MapEstimate
@@ -40,8 +40,6 @@ _HOW = {
 class TruthErrors:
     """A run beside the truth."""
 
-    path: PathAndMap  #: filtered poses.
-    truth: RunTruth  #: at the steps `truth.rows`.
     positions: AbsoluteError  #: errors of the aligned positions.
     whitened: statistic.WhitenedErrors  #: errors of the poses in units of the filter's own.
     fitted: int  #: parameters of the motion that brought the truth into the run's world; 0 where it is there.
@@ -62,24 +60,19 @@ class LandmarkErrors:
         return np.square(self.white).sum(axis=1)
 
 
-def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
-    """Errors of a run; the truth's own standard deviations per axis are `std_m` and `std_rad`.
-
-    Raises InputError: the run has no truth, or too little.
-    """
+def truth_errors(record: RunFolder) -> TruthErrors:
+    """Errors of a run. Raises InputError: it has no truth, or too little."""
     path, truth = record.path, record.truth
     if truth.rows.size < LEAST:
         raise InputError(f"{record.folder}: {truth.rows.size} steps have a true pose, a comparison needs {LEAST}")
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     positions = ate(path.at(truth.rows).trajectory, reference, truth.alignment)
-    turns = 1 if path.space.dim == SE2.dim else 3
-    own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
-    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows] + np.diag(own)
+    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows]
     anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
     if truth.alignment == "none":
         whitened = statistic.whitened_errors(space, mean, cov, truth.poses)
         landmarks = None if anonymous else _landmark_errors(record, truth, positions.alignment)
-        return TruthErrors(path, truth, positions, whitened, 0, landmarks)
+        return TruthErrors(positions, whitened, 0, landmarks)
     # The truth brought into the run's world.
     true, ours = (in_space(path.stamps_ns[truth.rows], poses) for poses in (truth.poses, mean))
     start = align(true.positions, ours.positions, with_scale=across)
@@ -103,7 +96,7 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     points = {name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()}
     there = RunTruth(truth.rows, space.compose(turn, moved), points, truth.alignment)
     landmarks = None if anonymous else _landmark_errors(record, there, positions.alignment)
-    return TruthErrors(path, truth, positions, statistic.WhitenedErrors(errors(motion), ranks), space.dim, landmarks)
+    return TruthErrors(positions, statistic.WhitenedErrors(errors(motion), ranks), space.dim, landmarks)
 
 
 def pose_statistics(errors: statistic.WhitenedErrors, fitted: int = 0) -> list[statistic.Statistic]:
@@ -126,7 +119,7 @@ def pose_statistics(errors: statistic.WhitenedErrors, fitted: int = 0) -> list[s
 
 def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
     """The comparison of a run with the truth, from its `truth_errors`."""
-    path, truth, at = errors.path, errors.truth, errors.positions
+    path, truth, at = record.path, record.truth, errors.positions
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     accuracy = (
         f"The path is {_metres(at.rmse)} (rms) from the truth, {_metres(at.max)} at worst, over {at.keys.size} of "
@@ -142,13 +135,11 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
         "motion_translation_rmse_m": relative.translation_rmse,
         "motion_rotation_rmse_deg": relative.rotation_rmse_deg,
     }
-    nees, known = errors.whitened.nees, errors.whitened.ranks > 0
-    statistics = pose_statistics(errors.whitened, errors.fitted)
-    figures |= {
-        "pose_nees_mean": float(nees[known].mean()) if known.any() else 0.0,
-        "pose_nees_median": float(np.median(nees[known])) if known.any() else 0.0,
-        "pose_nees_right": float(errors.whitened.ranks[known].mean()) if known.any() else 0.0,
-    }
+    known, white = errors.whitened.ranks > 0, errors.whitened
+    nees, ranks = (values[known] if known.any() else np.zeros(1) for values in (white.nees, white.ranks))
+    statistics = pose_statistics(white, errors.fitted)
+    figures |= {"pose_nees_mean": float(nees.mean()), "pose_nees_median": float(np.median(nees))}
+    figures["pose_nees_right"] = float(ranks.mean())
     if errors.landmarks is not None:
         found = errors.landmarks
         figures |= {

@@ -21,7 +21,7 @@ _LOWEST = 0.01  #: NEES below this fraction of the band are drawn there.
 
 def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
     """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
-    rows, name, white = errors.truth.rows, record.name, errors.whitened
+    rows, name, white = record.truth.rows, record.name, errors.whitened
     world = World.of(record)
     known, dim = white.ranks > 0, white.errors.shape[1]
     figures = {
