@@ -140,7 +140,7 @@ def test_a_run_without_images_is_refused(tmp_path):
     from rbpf import __version__
 
     (tmp_path / "config.yaml").write_text(f"rbpf: {__version__}\nsystem: range-bearing\n")
-    with pytest.raises(InputError, match="sees no images"):
+    with pytest.raises(InputError, match="needs a run over images"):
         compare_folder_with_colmap(tmp_path)
 
 
