@@ -59,8 +59,7 @@ def calibrate_images(
         for columns, rows in ((board.columns + less, board.rows + less) for less in (-1, 1)):
             if min(columns, rows) >= 3 and board_corners(empty, Board(columns, rows, board.square_m)) is not None:
                 raise InputError(
-                    f"{images}: a chessboard of {columns}x{rows} inner corners is seen, not of "
-                    f"{board.columns}x{board.rows}: {places}, give --board {columns}x{rows}"
+                    f"{images}: a chessboard of {columns}x{rows} corners is seen: {places}, give --board {columns}x{rows}"
                 )
         raise InputError(
             f"{images}: no chessboard of {board.columns}x{board.rows} inner corners is found in {looked_at} images: it has to "

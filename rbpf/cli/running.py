@@ -95,7 +95,7 @@ class ImageRunOptions(PartOptions):
 
         if self.rerun is not None:
             require_rerun()
-        more = {"rerun": self.rerun, "batch": self.batch, "most_iterations": self.batch_limit}
+        more: dict[str, Any] = {"rerun": self.rerun, "batch": self.batch, "most_iterations": self.batch_limit}
         _run(self, recording, config, video=video, **more)
 
 
@@ -271,8 +271,7 @@ def _run(
     with own_folder(out), progress() as bar:
         if holds_run(out) and not kept:
             raise InputError(
-                f"{out} holds a run already: name another folder with --out, go on with --resume, or write over it "
-                "with --overwrite"
+                f"{out} holds a run already: name another with --out, go on by --resume, or write over it by --overwrite"
             )
         with patient(bar("filtering")) as report:
             listeners = [lambda run, _: report(len(run.log), run.expected or 0)]

@@ -38,8 +38,7 @@ def check_model(
     name = type(model).__name__
     if not isinstance(model, MotionModel | ObservationModel | Landmark | Likelihood | Conditional):
         raise InputError(
-            "check_model tries a MotionModel, ObservationModel, Landmark, Likelihood, Sensor or Conditional; "
-            f"a {name} is none of these"
+            f"check_model tries a motion or observation model, Landmark, Likelihood, Sensor or Conditional, not a {name}"
         )
     with np.errstate(all="ignore"):
         if isinstance(model, Likelihood):

@@ -166,8 +166,7 @@ def read_origin(config: Path) -> list[str]:
             raise InputError(f"{config}: its {name} {path} is not there: repeat from the folder the run was started in")
     if "input_sha256" in entries and digest_of(files, config.parent) != entries["input_sha256"]:
         raise InputError(
-            f"{entries['recording']} has changed since the run of {config}: it cannot be repeated; to use its settings "
-            "alone give --config"
+            f"{entries['recording']} has changed since the run of {config}; to use its settings alone give --config"
         )
     # What else a run was started with: an entry has its option's name, and perhaps a unit behind it.
     words = [str(entries["system"]), str(entries["recording"]), "--config", str(config)]

@@ -125,13 +125,12 @@ class RunFolder:
             raise InputError(f"{file} has version {version}, this program reads version {VERSION}; {again}")
         try:
             with fitting(file):
-                found = PathAndMap(*read(arrays, _PATH).values())
-                sizes = found.world_from_body.shape[1], found.cov_poses.shape[1]
-                if sizes not in [(space.size, space.dim) for space in (SE2, SE3)]:
+                stamps_ns, mean, cov = read(arrays, _PATH).values()
+                if (mean.shape[1], cov.shape[1]) not in [(space.size, space.dim) for space in (SE2, SE3)]:
                     raise InputError("the poses are neither in the plane nor in space")
         except InputError as error:
             raise InputError(f"{file} does not hold the poses of a run ({error}); {again}") from error
-        return found
+        return PathAndMap(stamps_ns, mean, cov)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -186,7 +185,7 @@ class RunFolder:
     def _arrays(self, name: str, schema: Schema, **sizes: int) -> dict[str, np.ndarray]:
         arrays = load_arrays(self.folder / name)
         with fitting(self.folder / name):
-            return read(arrays, schema, **sizes)
+            return read(arrays, schema, "", **sizes)
 
     @cached_property
     def measurements(self) -> FeatureLog | Measurements:

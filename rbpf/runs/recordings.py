@@ -118,8 +118,7 @@ class MonoRecording:
         """The images, and the known points if there are any; errors as `open`."""
         if self.live is not None and self.known_points is not None:
             raise InputError(
-                "known points are pixels of a first image that is there already: "
-                "start a live camera from --board or --aruco, or without known points"
+                "known points need a first image: start a live camera from --board or --aruco, or without them"
             )
         known = None if self.known_points is None else readers.read_known_points(self.known_points)
         sequence: readers.ImageSequence | LiveCamera

@@ -279,7 +279,7 @@ def test_what_a_check_cannot_do_without():
         Spaceless(): "Spaceless has no attribute space: tell check_model the group",
         Speed(): r"Speed reads a substate: give Example\(substate=its size\)",
         RangeBearing(SE2, max_range=0.05): "RangeBearing sees too few random landmarks",
-        7: r"Landmark, Likelihood, Sensor or Conditional; a int is none of these",
+        7: r"Landmark, Likelihood, Sensor or Conditional, not a int",
         Scripted(): r"Scripted is tried on a frame and a belief: give Example\(frame=…, belief=…\)",
     }
     for model, message in missing.items():

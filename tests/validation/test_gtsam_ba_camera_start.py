@@ -157,8 +157,8 @@ def frames_apart(log):
     ("spoil", "known", "words"),
     [
         (few_landmarks, 4, "Frame 3 of small scene sees 2 landmarks"),
-        (frames_apart, 4, "Frame 3 of small scene shares no landmark, .* with the known points"),
-        (frames_apart, 0, "Frame 3 of small scene shares no landmark, .* with frame 0"),
+        (frames_apart, 4, "Frame 3 of small scene shares no landmark with the known points"),
+        (frames_apart, 0, "Frame 3 of small scene shares no landmark with frame 0"),
     ],
 )
 def test_frames_that_nothing_holds_are_refused(spoil, known, words):

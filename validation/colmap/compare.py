@@ -118,8 +118,7 @@ def compare_with_path(
     ours, theirs = associate(found.path, reference)
     if len(ours) < LEAST_FRAMES:
         raise InputError(
-            f"COLMAP's key frames of {found.name} and the path share {len(ours)} instants, expected "
-            f"{LEAST_FRAMES} or more for an alignment."
+            f"COLMAP's key frames of {found.name} and the path share {len(ours)} instants, expected {LEAST_FRAMES} or more."
         )
     errors = ate(ours, theirs, "rigid" if found.metric else "similarity")
     # The mean rotation between the cameras, and the scale and shift that then fit the centres: centres on a short or

@@ -76,8 +76,7 @@ def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> Evi
             raise InputError("log-evidences are compared over 2 seeds or more, which tell their error")
         if not np.isfinite(logs).all():
             raise InputError(
-                f"the {name} filter has no evidence: one of its likelihoods is not a density, or some observations updated "
-                "only the particles or only the map"
+                f"the {name} filter has no evidence: a likelihood is no density, or updates only the particles or the map"
             )
     (a, error_a), (b, error_b) = map(_log_evidence, pair)
     spread = float(max(logs.std(ddof=1) for logs in pair))
@@ -118,8 +117,7 @@ def compare_evidence(
             )
     if getattr(config_a, "association", None) != getattr(config_b, "association", None):
         raise InputError(
-            "a filter that is given the landmarks' names and one that is not do not explain the same data: set the "
-            "same association in both configurations"
+            "a filter that is told the landmarks' names and one that is not are incomparable: set the same association"
         )
     # What moves the particles of a stereo filter is given, not explained: both must be given the same.
     if isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig):
@@ -131,8 +129,7 @@ def compare_evidence(
         for name in ("odometry", "trigger", "dof"):
             if getattr(config_a, name) != getattr(config_b, name):
                 raise InputError(
-                    f"two stereo configurations that differ in {name} do not explain the same data: what odometry says "
-                    "is given to the filter, and differs between them"
+                    f"two stereo filters of another {name} explain other data: what odometry says is given to them"
                 )
     in_batch = _in_batch(config_a, data, len(seeds)), _in_batch(config_b, data, len(seeds))
     if in_batch[0] and in_batch[1]:

@@ -74,14 +74,12 @@ def solve_features(
     counts = np.bincount(table.steps, minlength=problem.frames)
     if (few := np.flatnonzero(counts < LEAST)).size:
         raise InputError(
-            f"Frame {few[0]} of {name} sees {counts[few[0]]} landmarks that are known or seen from elsewhere "
-            f"too, expected {LEAST} or more; leave the frame out."
+            f"Frame {few[0]} of {name} sees {counts[few[0]]} landmarks that are known or seen again, expected {LEAST}."
         )
     piece = observations.in_one_piece(table.steps, table.index, problem.frames, ~problem.free)
     if (apart := np.flatnonzero(~piece)).size:
         raise InputError(
-            f"Frame {apart[0]} of {name} shares no landmark, directly or through others, with "
-            f"{'the known points' if known else 'frame 0'}; leave it out."
+            f"Frame {apart[0]} of {name} shares no landmark with {'the known points' if known else 'frame 0'}; leave it out."
         )
     if known:
         positions = np.array([position for position, _ in known.values()])
@@ -94,8 +92,7 @@ def solve_features(
     found = adjust(problem, start, tolerance, on_iteration)
     if not found.converged:
         raise InputError(
-            f"The batch adjustment of {name} did not converge in {found.iterations} iterations; "
-            "start it from a better estimate, or ask for the robust loss."
+            f"{name} did not converge in {found.iterations} iterations; start nearer, or ask for the robust loss."
         )
     cov_poses, cov_landmarks = covariances(found) if marginals else (np.empty((0, 6, 6)), {})
     state, names = found.state, found.problem.table.names
@@ -119,8 +116,7 @@ def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
     table, path = problem.table, np.asarray(start.world_from_body, dtype=float)
     if path.shape != (problem.frames, 7) or not np.isfinite(path).all():
         raise InputError(
-            f"Expected finite initial poses of shape {(problem.frames, 7)}, one for each frame of "
-            f"{problem.name}, found {path.shape}."
+            f"Expected finite initial poses {(problem.frames, 7)}, one a frame of {problem.name}, found {path.shape}."
         )
     given = {name: mean for name, (mean, _) in problem.known.items()} | dict(start.landmarks)
     points = observations.triangulate(table, path)
@@ -220,14 +216,12 @@ class _Growth:
         is_pair = isinstance(self.table.camera, RectifiedStereo)
         if not step and len(seen) < KNOWN and (self.problem.known or not is_pair):
             raise InputError(
-                f"Frame 0 of {name} sees {len(seen)} known points, expected {KNOWN} or more to start from; "
-                "add known points or give an initial estimate."
+                f"Frame 0 of {name} sees {len(seen)} known points, expected {KNOWN} or more, or an initial estimate."
             )
         self.blind = 0 if len(seen) >= 3 or not step else self.blind + 1
         if self.blind == LOST:
             raise InputError(
-                f"Frames {step - LOST + 1} to {step} of {name} see fewer than 3 landmarks whose place is known "
-                "by then; give an initial estimate, or more known points."
+                f"Frames {step - LOST + 1} to {step} of {name} see too few known landmarks; give an initial estimate."
             )
         # The pose, from the landmarks placed so far.
         self.path[step] = self.path[max(step - 1, 0)]

@@ -111,8 +111,7 @@ class CameraProblem:
             far = int(np.argmax(distances))
             if distances[far] == 0:
                 raise InputError(
-                    f"All initial poses of {self.name} are at one place, expected a path to take the scale from, "
-                    "because there are no known points."
+                    f"All initial poses of {self.name} are at one place: without known points a path has to tell the scale."
                 )
             model = gtsam.noiseModel.Isotropic.Sigma(1, scale * distances[far])
             keys = self.pose_keys[0], self.pose_keys[far]

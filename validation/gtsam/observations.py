@@ -103,8 +103,7 @@ def known_by_name(known: KnownPoints | None, names: NDArray[np.int64]) -> dict[i
         variances = np.linalg.eigvalsh(cov)
         if variances[0] <= SINGULAR * variances[-1] and np.any(cov):
             raise InputError(
-                f"The covariance of known point {name} is singular; expected a positive definite one, "
-                "or zeros for a point known exactly."
+                f"The covariance of known point {name} is singular; give a positive definite one, or zeros where it is exact."
             )
         if name in seen:
             found[name] = (np.asarray(position, dtype=float), np.asarray(cov, dtype=float))

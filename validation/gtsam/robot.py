@@ -67,8 +67,7 @@ def solve(
             values, count, converged = solvers.levenberg_marquardt(graph, values, solvers.EXACT)
         if not converged:
             raise InputError(
-                f"The batch optimisation of {m.recording} did not converge in {count} iterations; "
-                "start it incrementally or from the filter's estimate, or ask for the robust loss."
+                f"{m.recording} did not converge in {count} iterations; start incrementally, or ask for the robust loss."
             )
         path, landmarks = problem.estimate(values)
         cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()

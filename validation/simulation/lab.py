@@ -329,8 +329,7 @@ class LabDrive:
         most = -(-DRIVES[self.trajectory][1] // self.every)
         if not 2 <= (self.frames or most) <= most:
             raise InputError(
-                f"with every = {self.every} the {self.trajectory} has {most} images, of which at least 2 are "
-                f"needed, got frames = {self.frames}"
+                f"with every = {self.every} the {self.trajectory} has {most} images; give 2 or more, got {self.frames}"
             )
 
     @property

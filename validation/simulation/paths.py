@@ -189,8 +189,7 @@ class Drive:
         self._pace = edges[-1] / driving if driving > 0.0 else np.inf
         if np.diff(edges).min() < self._pace * ramp_s:
             raise InputError(
-                f"{seconds:g} s do not suffice for {len(first)} starts of {ramp_s:g} s and rests of {rest.sum():g} s: "
-                "give the robot more time"
+                f"{seconds:g} s are too few for {len(first)} starts of {ramp_s:g} s and rests of {rest.sum():g} s: give more"
             )
         self._lasts, self._edges, self._ramp_s = np.diff(edges) / self._pace + ramp_s, edges, ramp_s
         self._begins = np.cumsum(rest[first] + np.concatenate([[0.0], self._lasts[:-1]]))

@@ -60,8 +60,7 @@ class Rectangle:
         texture = self.texture
         if texture.dtype != np.uint8 or texture.ndim != 2 or min(texture.shape) < 2:
             raise InputError(
-                "a rectangle's texture must be a grey image of uint8, at least 2 x 2, got shape "
-                f"{texture.shape} of {texture.dtype}"
+                f"a texture must be a grey image of uint8, at least 2 x 2, got shape {texture.shape} of {texture.dtype}"
             )
         check_ranges(self)
 
