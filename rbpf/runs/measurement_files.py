@@ -100,59 +100,50 @@ def _robot_texts(m: Measurements) -> dict[str, str]:
         "start": " ".join(map(repr, m.start.tolist())),
         "start_stamp_ns": str(int(m.stamps_ns[0])),
     }
-    observed = np.stack([m.steps, m.stamps_ns[m.steps], m.landmarks], axis=1)
-    moves = np.stack([np.arange(1, len(m.stamps_ns)), m.stamps_ns[1:]], axis=1)
-    numbers = np.concatenate([m.z, gaussian.pack(m.cov_z)], axis=1)
-    odometry = np.concatenate([m.deltas, gaussian.pack(m.covs)], axis=1)
-    return {
-        OBSERVATIONS: _text(OBSERVATIONS, m.recording, header, _observed(_axes(m.space)), observed, numbers),
-        ODOMETRY: _text(ODOMETRY, m.recording, {"space": repr(m.space)}, _moves(m.space), moves, odometry),
-    }
+    observed, moved = [m.steps, m.stamps_ns[m.steps], m.landmarks], [np.arange(1, len(m.stamps_ns)), m.stamps_ns[1:]]
+    seen = _text(OBSERVATIONS, m.recording, header, _observed(_axes(m.space)), observed, m.z, m.cov_z)
+    odometry = _text(ODOMETRY, m.recording, {"space": repr(m.space)}, _moves(m.space), moved, m.deltas, m.covs)
+    return {OBSERVATIONS: seen, ODOMETRY: odometry}
 
 
 def _camera_texts(log: FeatureLog) -> dict[str, str]:
+    pair = log.camera if isinstance(log.camera, RectifiedStereo) else None
+    left, kind = (log.camera, "pinhole") if isinstance(log.camera, Pinhole) else (log.camera.camera, "stereo")
+    header = {"space": "SE3", "measurement": kind, "size": f"{left.width} {left.height}"}
+    if left.distortion_model != PLAIN:
+        header["lens"] = left.distortion_model
+    header["camera"] = " ".join(repr(float(x)) for x in (left.fx, left.fy, left.cx, left.cy, *left.distortion))
+    if pair is not None:
+        header["baseline"] = repr(float(pair.baseline_m))
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     steps = np.repeat(np.arange(stamps.size), [frame.landmarks.size for frame in log.frames])
     names, z, cov = (np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z"))
-    header = _camera_header(log.camera)
-    columns = _observed(_PIXELS[header["measurement"]])
-    rows = np.stack([steps, stamps[steps], names], axis=1)
-    numbers = np.concatenate([z, gaussian.pack(cov)], axis=1)
-    frames = np.stack([np.arange(stamps.size), stamps], axis=1)
-    nothing = np.empty((stamps.size, 0))
+    rows = [steps, stamps[steps], names]
     texts = {
-        OBSERVATIONS: _text(OBSERVATIONS, log.name, header, columns, rows, numbers),
-        FRAMES: _text(FRAMES, log.name, {}, ["step", "stamp_ns"], frames, nothing),
+        OBSERVATIONS: _text(OBSERVATIONS, log.name, header, _observed(_PIXELS[kind]), rows, z, cov),
+        FRAMES: _text(FRAMES, log.name, {}, ["step", "stamp_ns"], [np.arange(stamps.size), stamps]),
     }
     if log.known is not None:
-        numbers = np.concatenate([log.known.positions, gaussian.pack(log.known.cov)], axis=1)
-        texts[KNOWN] = _text(KNOWN, log.name, {}, _KNOWN_COLUMNS, log.known.names[:, None], numbers)
+        known = [log.known.names], log.known.positions, log.known.cov
+        texts[KNOWN] = _text(KNOWN, log.name, {}, _KNOWN_COLUMNS, *known)
     return texts
 
 
-def _camera_header(camera: Pinhole | RectifiedStereo) -> dict[str, str]:
-    if isinstance(camera, RectifiedStereo):
-        header = _camera_header(camera.camera) | {"measurement": "stereo"}
-        return header | {"baseline": repr(float(camera.baseline_m))}
-    lens = {} if camera.distortion_model == PLAIN else {"lens": camera.distortion_model}
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
-    return {
-        "space": "SE3",
-        "measurement": "pinhole",
-        "size": f"{camera.width} {camera.height}",
-        **lens,
-        "camera": " ".join(repr(float(x)) for x in numbers),
-    }
-
-
 def _text(
-    name: str, recording: str, header: Mapping[str, str], columns: list[str], integers: np.ndarray, numbers: np.ndarray
+    name: str,
+    recording: str,
+    header: Mapping[str, str],
+    columns: list[str],
+    integers: Sequence[np.ndarray],
+    *numbers: np.ndarray,
 ) -> str:
+    """A file: whole numbers (n,) each; then, where there are any, numbers (n, k) and their covariances (n, d, d)."""
     lines = [f"# {_TITLES[name]}", f"# recording: {recording}"]
     lines += [f"# {key}: {value}" for key, value in header.items()]
-    lines += [f"# rows: {len(integers)}", ",".join(columns)]
-    rows = zip(integers.tolist(), numbers.tolist(), strict=True)
-    lines += [",".join(map(repr, [*whole_numbers, *real])) for whole_numbers, real in rows]
+    lines += [f"# rows: {len(integers[0])}", ",".join(columns)]
+    parts = [part if part.ndim == 2 else gaussian.pack(part) for part in numbers]
+    all_columns = [*integers, *(column for part in parts for column in part.T)]
+    lines += [",".join(map(repr, row)) for row in zip(*(column.tolist() for column in all_columns), strict=True)]
     return "\n".join([*lines, ""])
 
 

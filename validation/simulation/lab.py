@@ -141,11 +141,9 @@ class Furnishing:
         up = np.array([0.0, 0.0, z1 - z0])
         ring = np.array([[x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1]])
         ends = [(1, y0), (0, x1), (1, y1), (0, x0)]
-        self.surfaces += [
-            Surface(left, right - left, -up, side)
-            for left, right, (axis, at) in zip(ring, np.roll(ring, -1, axis=0), ends, strict=True)
-            if min(abs(at), abs(SIZE_M[axis] - at)) >= TOUCHING_M
-        ]
+        for left, right, (axis, at) in zip(ring, np.roll(ring, -1, axis=0), ends, strict=True):
+            if min(abs(at), abs(SIZE_M[axis] - at)) >= TOUCHING_M:
+                self.surfaces.append(Surface(left, right - left, -up, side))
         if z1 < SIZE_M[2] - TOUCHING_M:
             self.surfaces.append(Surface(ring[3], ring[2] - ring[3], ring[0] - ring[3], top))
         if z0 > ABOVE_M:
@@ -159,7 +157,6 @@ class Furnishing:
         self.surfaces.append(Surface(*sheet, paint))
 
     def uniform(self, low: float, high: float) -> float:
-        """A number between two others."""
         return float(self.rng.uniform(low, high))
 
 
@@ -167,8 +164,7 @@ def furnished(rng: np.random.Generator) -> Furnishing:
     """The laboratory without floor, ceiling and outer walls; the same generator gives the same laboratory."""
     lab, (x0, x1), (y0, y1), (_, width, height) = Furnishing(rng), PARTITION_M, DOOR_M, SIZE_M
     # The wall between the rooms: on both sides of the door and above it.
-    sides = ((0.0, y0, 0.0), (y1, width, 0.0), (y0, y1, LINTEL_M))
-    for start, end, low in sides:
+    for start, end, low in ((0.0, y0, 0.0), (y1, width, 0.0), (y0, y1, LINTEL_M)):
         lab.add(np.array([[x0, start, low], [x1, end, height]]), textures.plaster, textures.plaster)
     for wall in walls():
         for start, end in wall.free_m:
