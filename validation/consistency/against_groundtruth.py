@@ -60,14 +60,19 @@ class LandmarkErrors:
         return np.square(self.white).sum(axis=1)
 
 
-def truth_errors(record: RunFolder) -> TruthErrors:
-    """Errors of a run. Raises InputError: it has no truth, or too little."""
+def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
+    """Errors of a run; the truth's own standard deviations per axis are `std_m` and `std_rad`.
+
+    Raises InputError: the run has no truth, or too little.
+    """
     path, truth = record.path, record.truth
     if truth.rows.size < LEAST:
         raise InputError(f"{record.folder}: {truth.rows.size} steps have a true pose, a comparison needs {LEAST}")
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     positions = ate(path.at(truth.rows).trajectory, reference, truth.alignment)
-    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows]
+    turns = 1 if path.space.dim == SE2.dim else 3
+    own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
+    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows] + np.diag(own)
     anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
     if truth.alignment == "none":
         whitened = statistic.whitened_errors(space, mean, cov, truth.poses)

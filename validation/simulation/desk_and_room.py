@@ -5,9 +5,10 @@ from typing import Annotated
 
 import numpy as np
 
+from rbpf.lie import SE3
 from rbpf.ranges import MOST, CountOrNone, NotNegative, Positive, Range, Ranged
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.paths import HandHeld, Wave, eased, looking, shaken
+from rbpf.validation.simulation.paths import HandHeld, Wave, eased, looking
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, apart, stamps_ns
 
 SHEET_M = 0.0001  #: Sheets of paper lie this much above each other.
@@ -127,7 +128,7 @@ class TexturedRoom(Ranged):
         drop = np.full_like(turn, -np.tan(np.deg2rad(DROP_DEG)))
         bound = np.array([np.deg2rad(SHAKE_DEG)] * 3 + [SHAKE_M] * 3)
         direction = np.stack([np.cos(heading), np.sin(heading), drop], axis=-1)
-        path = shaken(looking(eye, direction), Wave.random(bound, SHAKE_HZ, rng), time)
+        path = SE3.retract(looking(eye, direction), Wave.random(bound, SHAKE_HZ, rng)(time))
         # The room, and pictures on its walls.
         half = 0.5 * np.array(ROOM_M[:2])
         room = np.array([[*-half, 0.0], [*half, ROOM_M[2]]])

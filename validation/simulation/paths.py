@@ -69,11 +69,6 @@ def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return SE3.from_matrix(columns)
 
 
-def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np.ndarray:
-    """Poses (T, 7) moved by a wave of six channels, [rotation, translation] in the camera's frame."""
-    return SE3.retract(world_from_camera, wave(seconds))
-
-
 ARM_HZ = 0.2, 0.8
 WRIST_HZ = 0.8, 2.0  #: Before the path is slowed down to the speed of a hand, to about a third.
 TREMOR_HZ = 1.0, 3.0
@@ -122,14 +117,14 @@ class HandHeld:
             away = np.stack([np.sin(side) * np.cos(rise), -np.cos(side) * np.cos(rise), np.sin(rise)], axis=-1)
             distance = 0.5 * (self.nearest_m + self.farthest_m) + wave[:, 5:]
             target = wave[:, :3] - start
-            return shaken(looking(target + distance * away, -away), wrist, time)
+            return SE3.retract(looking(target + distance * away, -away), wrist(time))
 
         # As slow as it takes that neither limit is passed.
         poses, time = sweep(seconds), eased(seconds, self.start_s)
         step = SE3.local(poses[:-1], poses[1:]) / np.diff(seconds)[:, None]
         turn_rad_s, speed_m_s = (float(np.linalg.norm(part, axis=1).max()) for part in (step[:, :3], step[:, 3:]))
         pace = min(1.0, 1.0 / max(turn_rad_s / self.turn_rad_s, speed_m_s / self.speed_m_s))
-        return shaken(sweep(pace * time), tremor, time)
+        return SE3.retract(sweep(pace * time), tremor(time))
 
 
 KNOTS = 257  #: Of the table that gives the fraction of a bend for the way along it.

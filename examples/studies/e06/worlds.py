@@ -9,7 +9,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import KnownPixels
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
-from rbpf.validation.simulation.paths import UP, HandHeld, Wave, eased, looking, shaken
+from rbpf.validation.simulation.paths import UP, HandHeld, Wave, eased, looking
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, stamps_ns
 
 RATE_HZ = 30.0
@@ -64,7 +64,7 @@ class LoopOverDesk:
         down = np.deg2rad(self.down_deg)
         forward = np.broadcast_to([0.0, np.cos(down), -np.sin(down)], gaze.shape)
         poses = looking(gaze - self.away_m * forward, forward)
-        return shaken(poses, Wave.random(TREMOR, TREMOR_HZ, rng), time)
+        return SE3.retract(poses, Wave.random(TREMOR, TREMOR_HZ, rng)(time))
 
 
 @dataclass(frozen=True)
