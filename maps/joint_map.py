@@ -631,6 +631,12 @@ class JointMap(Map):
         self._held.hold(self._held.table._replace(kind=kinds, clone=clones))
         self._drop([])
 
+    def loosen(self, ids: np.ndarray, cov: np.ndarray) -> None:
+        """Landmarks (K,) may have moved by as much, covariance (K, D, D), in the frame: each by itself."""
+        columns = self._held.of_one_kind(ids).columns
+        self.cov = self.cov.copy()
+        self.cov[columns[:, :, None], columns[:, None, :]] += cov
+
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         return np.zeros((self.n, ids.size))
 

@@ -10,8 +10,9 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.landmarks import Pair, log_support
+from rbpf.systems.stereo.landmarks import Pair, PlaceNoise, log_support
 from rbpf.systems.stereo.slam import StereoSlam
+from rbpf.systems.system import MAP_IDS
 from tests.systems.stereo_sequences import pairs
 
 pytestmark = pytest.mark.usefixtures("keypoints_once")
@@ -84,3 +85,19 @@ def test_how_well_landmarks_are_seen():
     nu, cov = np.array([[1.0, 0.0, 0.0], [90.0, 0.0, 0.0]]), np.tile(4.0 * np.eye(3), (2, 1, 1))
     log_normal = -0.5 * (0.25 + 3.0 * np.log(2.0 * np.pi * 4.0))
     assert log_support(nu, cov, z, rig) == pytest.approx(log_normal - np.log(density))
+
+
+def test_noise_of_each_landmark_is_learnt_from_its_residuals():
+    """Of some it is three times, of others half as large as their scale says; a new one has the mean."""
+    rng, noise, ids = np.random.default_rng(0), PlaceNoise(), np.arange(0, 80, 2)
+    deviation = np.where(ids % 4 == 0, 3.0, 0.5)
+    cov = np.repeat(0.1 * np.eye(3)[None], ids.size, axis=0)
+    for _ in range(400):
+        error = deviation[:, None] * np.sqrt(0.1) * rng.normal(size=(ids.size, 3)) * np.sqrt(0.9)
+        noise.learn(ids, error, 0.1 * deviation[:, None, None] ** 2 * cov, cov)
+    np.testing.assert_allclose(np.sqrt(noise.factor(ids)), deviation, rtol=0.1)
+    assert noise.factor(np.array([3]))[0] == pytest.approx(0.5 * (9.0 + 0.25), rel=0.1)
+    again = PlaceNoise()
+    again.restore(noise.arrays() | {MAP_IDS: ids})
+    noise.remove(ids[:1])
+    assert noise.factor(ids[:2])[0] == noise.factor(np.array([3]))[0] != again.factor(ids[:1])[0]

@@ -24,6 +24,7 @@ from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
+from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.maps.rows import MAP
 from rbpf.motion.stereo_geometry import Matches
@@ -42,10 +43,17 @@ SEEN_AGAIN = 2
 """Observations of a landmark that stands still: one that moves is not where it was seen first."""
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
+OWN_NUMBERS, PRIOR_NUMBERS = 6.0, 30.0
+"""Measured numbers that a landmark's noise is worth before it is seen again, and that of all landmarks at first."""
 SIGMAS = 3.0
 """The image is widened by so many standard deviations of the camera's direction."""
 
 _PLACES = {"place": numbers("landmarks", 3), "seen_from": numbers("landmarks", 3)}
+_NOISE = {
+    "ids": integers("learnt", least=0, ascending=True, refers=MAP_IDS),
+    "own": numbers("learnt", 2),
+    "all": numbers(2),
+}
 _NAMES = {
     "held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
     "observations": integers("landmarks", least=1),
@@ -344,6 +352,48 @@ class Places:
         self._ids, self._place, self._seen_from = ids.copy(), found["place"], found["seen_from"]
 
 
+class PlaceNoise:
+    """What each landmark's keypoint adds to its noise: a factor of the variance that its scale says, learnt as it is seen.
+
+    A keypoint on a corner of a thing keeps its place; one on an edge with something farther behind it has none, and moves
+    along as the view does. Given what the map knows after an update, Rᵢ⁻¹ (e eᵀ + cov e) has 3 times the factor on its trace,
+    on average (variational Bayes: S. Särkkä and A. Nummenmaa 2009). A new landmark has the mean of all others'.
+    """
+
+    def __init__(self) -> None:
+        self._ids = np.zeros(0, dtype=np.int64)
+        self._own = np.zeros((0, 2))  # of each landmark the sum of these traces, and how many numbers they are of
+        self._all = np.array(
+            [PRIOR_NUMBERS, PRIOR_NUMBERS]
+        )  # the same of all there ever were; at first as the scale says
+
+    def factor(self, ids: np.ndarray) -> np.ndarray:
+        """Of landmarks (k,), some of which may be new."""
+        own, known = np.zeros((ids.size, 2)), np.isin(ids, self._ids)
+        own[known] = self._own[np.searchsorted(self._ids, ids[known])]
+        return (OWN_NUMBERS * self._all[0] / self._all[1] + own[:, 0]) / (OWN_NUMBERS + own[:, 1])
+
+    def learn(self, ids: np.ndarray, error: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
+        """From residuals (k, 3) after an update, with covariances (k, 3, 3), of landmarks (k,) of such noise (k, 3, 3)."""
+        seen = np.einsum("kab,kba->k", np.linalg.inv(noise), error[:, :, None] * error[:, None] + cov)
+        held = np.union1d(self._ids, ids)
+        own = np.zeros((held.size, 2))
+        own[np.searchsorted(held, self._ids)] = self._own
+        found = np.column_stack([seen, np.full(ids.size, error.shape[1])])
+        own[np.searchsorted(held, ids)] += found
+        self._ids, self._own, self._all = held, own, self._all + found.sum(axis=0)
+
+    def remove(self, ids: np.ndarray) -> None:
+        kept = ~np.isin(self._ids, ids)
+        self._ids, self._own = self._ids[kept], self._own[kept]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"noise/ids": self._ids, "noise/own": self._own, "noise/all": self._all}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        self._ids, self._own, self._all = read(arrays, _NOISE, "noise/").values()
+
+
 class AssociationGate(ABC):
     """Which landmarks a feature may be, by where they are expected; their descriptors decide among these."""
 
@@ -389,6 +439,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.store = DescriptorStore(length)
         self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height))
         self.places = Places(rig, self.config)
+        self.noise = PlaceNoise() if self.config.kind == "joint" else None
         self.ids = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: Pair[StereoFeatures], belief: Belief) -> Sequence[Observations]:
@@ -402,6 +453,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             # With this observation they are seen often enough.
             often = self.manager.observations + 1 >= self.manager.config.observations
             weighs = np.isin(self.ids, self.manager.names[often])
+        if self.noise is not None and known.any():
+            # What a keypoint marks on its thing moves along with the view, from sighting to sighting by as much as its noise.
+            held, ids = belief.map, self.ids[known]
+            assert isinstance(held, JointMap)
+            local = SE3.inverse_transform(belief.state[belief.mode], belief.read_mode(ids).mean[0])
+            far = np.linalg.norm(local, axis=1) / self.rig.camera.fx
+            variance = self.noise.factor(ids) * features.cov[known, 1, 1] * far**2
+            held.loosen(ids, variance[:, None, None] * np.eye(3))
         groups = []
         # A candidate is updated, and does not weigh; what is no landmark is a null correspondence for all.
         for chosen, options in (
@@ -411,6 +470,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             if (self.ids[chosen] >= 0).any():
                 part: dict[str, Any] = {"ids": self.ids[chosen], **options}
                 z, cov = features.z[chosen], features.cov[chosen]
+                if self.noise is not None:
+                    cov = cov * self.noise.factor(self.ids[chosen])[:, None, None]
                 groups.append(Observations(z, cov, self.model, self.likelihood, **part))
         self.seconds = time.perf_counter() - started
         return groups
@@ -421,6 +482,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         """Counts what was seen, drops candidates that were not seen again, starts new ones."""
         known = self.ids >= 0
         seen = self.ids[known]
+        if self.noise is not None:
+            for group in observed:
+                self._learn(group, belief, self.noise)
         dropped = self.manager.observe(seen)
         if self.config.kind == "joint":
             more = surplus(self.manager.names, self.manager.observations, seen, self.config.active)
@@ -430,6 +494,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             belief.map.remove(dropped)
             self.store.remove(dropped)
             self.places.remove(dropped)
+            if self.noise is not None:
+                self.noise.remove(dropped)
         # Places are in the world, the particles' states and landmarks perhaps not.
         mode = belief.state[belief.mode]
         pose = belief.map.world(mode[None], np.array([belief.mode]))[0]
@@ -456,7 +522,10 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.store.add(ids, features.descriptors)
         self.places.put(ids, SE3.transform(pose, features.points), pose)
         self.ids[rows] = ids
-        return [NewLandmarks(features.z, features.cov, self.model, self.landmark, ids=ids)]
+        cov = features.cov
+        if self.noise is not None:
+            cov = cov * self.noise.factor(ids)[:, None, None]
+        return [NewLandmarks(features.z, cov, self.model, self.landmark, ids=ids)]
 
     def associate(self, pair: Pair[StereoFeatures], belief: Belief) -> np.ndarray:
         """By their descriptors, where the particles expect them."""
@@ -518,7 +587,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return np.flatnonzero(np.isin(self.kinds(), (FeatureKind.LANDMARK, FeatureKind.CANDIDATE)))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return self.store.arrays() | self.manager.arrays() | self.places.arrays()
+        learnt = {} if self.noise is None else self.noise.arrays()
+        return self.store.arrays() | self.manager.arrays() | self.places.arrays() | learnt
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         read(arrays, {"descriptors/ids": integers("landmarks", refers=MAP_IDS)})
@@ -527,6 +597,19 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if not np.array_equal(self.store.ids, self.manager.names):
             raise InputError("the landmarks that have descriptors are not those that are counted")
         self.places.restore(arrays, self.store.ids)
+        if self.noise is not None:
+            self.noise.restore(arrays)
+
+    def _learn(self, group: Observations, belief: Belief, noise: PlaceNoise) -> None:
+        """From what an update left of a group's innovations, but for outliers."""
+        assert group.ids is not None
+        sure = group.ids >= 0
+        if group.log_odds is not None:
+            sure &= group.log_odds >= 0.0
+        if sure.any():
+            ids = group.ids[sure]
+            mean, cov = self.expected(belief, ids)
+            noise.learn(ids, group.z[sure] - mean, cov, group.cov[sure] / noise.factor(ids)[:, None, None])
 
     def _alike(self, descriptors: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
         """Landmarks that may be in view and whose descriptors come near to that of any feature, ascending.
