@@ -16,6 +16,7 @@ Gaussian, too: a *clone*, C = K Exp(δ) in F, which moves with F as landmarks do
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from typing import final
 
@@ -64,7 +65,7 @@ from rbpf.maps.joint_rows import (
 )
 from rbpf.maps.point import Point
 from rbpf.maps.rows import checked_new_ids, expected, first_records, linearised, projected
-from rbpf.maps.submaps import SubMap, SubMaps, by_frame
+from rbpf.maps.submaps import Beside, SubMap, SubMaps, by_frame
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
@@ -88,6 +89,7 @@ class JointMap(Map):
         compiled: use the models' fused kernels where they have one.
         submap: landmarks with which a sub-map ends, so that a step costs the same however large the map becomes; None keeps
             one Gaussian. Sub-maps hold points, no substate, and nothing may be observed in the world.
+        unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
 
     Attributes:
         old: the sub-maps that are finished; None where there are none to be. All else is of the present one, where the
@@ -106,8 +108,9 @@ class JointMap(Map):
         substate: tuple[np.ndarray, np.ndarray] | None = None,
         compiled: bool = True,
         submap: int | None = None,
+        unnamed: bool = False,
     ) -> None:
-        self.space = space
+        self.space, self.unnamed = space, unnamed
         self.compiled = compiled
         self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
         self._held = JointColumns(space.dim, [self.point])
@@ -124,6 +127,7 @@ class JointMap(Map):
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n, self._next_id = n, 0
         self.old = None if self.submap is None else SubMaps(self.space, self.point.dim, 2 * self.submap)
+        self._beside: Beside | None = None
         self._frame: Estimate | None = None  # where there are finished sub-maps, what they and this one say of F
         self._begin_submap()
 
@@ -269,13 +273,46 @@ class JointMap(Map):
         self.mean = np.repeat(mean[None], self.n, axis=0)
         if self.old is not None and self.submap is not None:
             ids = self._held.table.ids
+            present = self._finished(self.origin, mean, self.cov)
             # As many as tell a pose in space; with fewer the sub-map waits for more.
-            if not self._in_step and (ids.size >= self.submap or self.old.returned(ids).sum() >= 3):
-                self.old.join(self._finished(self.origin, mean, self.cov))
+            enough = ids.size >= self.submap or self.old.returned(ids).sum() >= 3
+            recall = False
+            if self.unnamed and self.old.maps and ids.size and not self._in_step:
+                reach = float(np.linalg.norm(present.points, axis=1).max())
+                recall = self.old.comes_near(self.old.end(present), reach)
+            if not self._in_step and (enough or recall):
+                self.old.join(present, recall)
                 self._begin_submap()
+                present = self._finished(self.origin, self.mean[0], self.cov)
             if self.old.maps:
-                self._frame = self.old.end(self._finished(self.origin, self.mean[0], self.cov))
+                self._frame = self.old.end(present)
+                self._beside = self.old.beside(present) if self.unnamed else None
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
+
+    def widened(self) -> "JointMap":
+        """With the landmarks of old sub-maps that are next to the frame: what may be expected, and nothing is done with it."""
+        found = self._beside
+        if found is None:
+            return self
+        held, new, dim = self.holds(found.own), ~self.holds(found.ids), self.point.dim
+        columns = self._held.of_one_kind(found.own[held]).columns
+        at, rows = np.repeat(held, dim), np.repeat(new, dim)
+        slope, rest = found.slope[np.ix_(rows, at)], found.rest[np.ix_(rows, rows)]
+        moved = self.mean[:, columns.ravel()] - found.theirs[held].ravel()
+        cross = slope @ self.cov[columns.ravel()]
+        wide, size, count = copy(self), self.mean.shape[1], int(new.sum())
+        wide.mean = np.concatenate([self.mean, found.points[new].ravel() + moved @ slope.T], axis=1)
+        wide.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns.ravel()] @ slope.T]])
+        none = np.zeros(count, dtype=np.int64)
+        table = Table(found.ids[new], none, size + dim * np.arange(count), none - 1)
+        wide._held = JointColumns(self.space.dim, self._held.kinds)
+        wide._held.hold(Table(*(np.concatenate(pair) for pair in zip(self._held.table, table, strict=True))))
+        return wide
+
+    @property
+    def all_ids(self) -> np.ndarray:
+        """Of all landmarks, those of old sub-maps, too."""
+        return self.ids if self.old is None else np.union1d(self.ids, self.old.ids)
 
     def estimate(self, particles: Particles) -> Estimate:
         """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
@@ -676,6 +713,8 @@ class JointMap(Map):
         named = {f"joint/{name}": array for name, array in named.items()}
         if self._frame is not None:
             named |= {"joint/frame": self._frame.mean, "joint/frame_cov": self._frame.cov}
+        if self._beside is not None:
+            named |= {f"joint/beside/{name}": array for name, array in self._beside._asdict().items()}
         return named if self.old is None else named | self.old.arrays()
 
     def options(self) -> dict[str, object]:
@@ -712,3 +751,13 @@ class JointMap(Map):
                 schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}
                 found = checkpoint.read(arrays, schema, "joint/")
                 self._frame = Estimate(found["frame"], found["frame_cov"])
+                if self.unnamed:
+                    dim = self.point.dim
+                    schema = {
+                        "ids": checkpoint.integers("others", least=0), "points": checkpoint.numbers("others", dim),
+                        "own": checkpoint.integers("own", least=0), "theirs": checkpoint.numbers("own", dim),
+                        "slope": checkpoint.numbers("rows", "columns"), "rest": checkpoint.numbers("rows", "rows"),
+                    }  # fmt: skip
+                    self._beside = Beside(**checkpoint.read(arrays, schema, "joint/beside/"))
+                    if self._beside.slope.shape != (self._beside.points.size, self._beside.theirs.size):
+                        raise InputError("the array joint/beside/slope does not fit the landmarks beside it")

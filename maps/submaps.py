@@ -45,6 +45,21 @@ class SubMap(NamedTuple):
     tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
 
 
+class Beside(NamedTuple):
+    """Old landmarks (K,) at `points` (K, D) as seen from the end of the present sub-map, which does not have them.
+
+    Its own landmarks (M,) are at `theirs` (M, D): as these move, so do the others, by `slope` (KD, MD); `rest` (KD, KD) is
+    what is then uncertain about them.
+    """
+
+    ids: np.ndarray
+    points: np.ndarray
+    own: np.ndarray
+    theirs: np.ndarray
+    slope: np.ndarray
+    rest: np.ndarray
+
+
 class _Tied(NamedTuple):
     """Start, landmarks about it, new end and landmarks: their mean, and covariance before they are one, less halfᵀ half after.
 
@@ -161,9 +176,12 @@ class SubMaps:
         old = np.array([landmark in self._last for landmark in ids.tolist()], dtype=bool)
         return old & ~np.isin(ids, self.near)
 
-    def join(self, finished: SubMap) -> None:
-        """Takes a sub-map that begins at the last start; the next one begins at its end."""
-        loop = bool(self.returned(finished.ids).any())
+    def join(self, finished: SubMap, recall: bool = False) -> None:
+        """Takes a sub-map that begins at the last start; the next one begins at its end.
+
+        All are solved for if landmarks have returned, or, to `recall` those about the end, if that is wanted.
+        """
+        loop = recall or bool(self.returned(finished.ids).any())
         before = [self._last[name][0] for name in finished.ids.tolist() if name in self._last]
         self._take(finished)
         if loop:
@@ -184,11 +202,56 @@ class SubMaps:
         mean = space.compose(space.retract(self.start, x[:d]), end)
         return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
 
+    def beside(self, present: SubMap) -> Beside:
+        """The old landmarks about the end of the present sub-map, by all that is known."""
+        space, d, dim = self.space, self.space.dim, self.dim
+        x, cov, half, mine = self._tied(present)
+        first = d + dim * self.near.size
+        turned, own = slice(first, first + d), slice(first + d, len(x))
+        end = space.retract(present.end, x[turned])
+        others = np.setdiff1d(np.arange(self.near.size), mine)
+        seen = space.inverse_transform(end, x[d:first].reshape(-1, dim)[others])
+        theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
+        by_end = (-by_frame(space, seen) @ space.right_jacobian(x[turned])).reshape(-1, d)
+
+        def of_others(columns: np.ndarray) -> np.ndarray:
+            back = columns[theirs].reshape(others.size, dim, -1)
+            return (space.rotation(end).T @ back).reshape(theirs.size, -1) + by_end @ columns[turned]
+
+        # Rows of the joint covariance, then what of it goes with the present landmarks.
+        rows, halves = of_others(cov), of_others(half.T)
+        within = of_others(rows.T) - halves @ halves.T
+        cross = rows[:, own] - halves @ half[:, own]
+        spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(len(x) - first - d)
+        slope = cross @ _inverse(gaussian.symmetrise(spread)) if present.ids.size else cross
+        rest = gaussian.symmetrise(within - slope @ cross.T)
+        return Beside(self.near[others], seen, present.ids, present.points, slope, rest)
+
+    def comes_near(self, end: Estimate, reach: float) -> bool:
+        """Whether an old landmark that is not among those about the start may be within reach of a pose."""
+        origin = np.zeros((1, self.dim))
+        off = self.space.transform(end.mean, origin) - self.space.transform(self.start, origin)
+        ids = np.setdiff1d(self.ids, self.near)
+        if np.linalg.norm(off) < 0.5 * reach or not ids.size:
+            return False
+        at = self.space.dim - self.dim
+        reach += 3.0 * float(np.sqrt(np.linalg.eigvalsh(end.cov[at:, at:])[-1]))
+        far = np.linalg.norm(self.space.inverse_transform(end.mean, self._guess(ids)), axis=1)
+        return bool((far < reach).any())
+
     def with_one_more(self, finished: SubMap) -> "SubMaps":
         """As if the present sub-map ended here."""
         other = self.copied()
         other._take(finished)
         return other
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "SubMaps":
+        return self.copied()
+
+    @property
+    def ids(self) -> np.ndarray:
+        """Of all landmarks (M,)."""
+        return np.array(list(self._last), dtype=np.int64)
 
     def copied(self) -> "SubMaps":
         """What is told of all of them is solved for in a copy: to be asked changes nothing."""

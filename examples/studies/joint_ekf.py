@@ -40,7 +40,7 @@ def joint_ekf(m: Measurements) -> Filtered:
                 places[int(m.landmarks[row])] = len(points)
                 points, cov = _appended(model, pose, points, cov, m.z[row], m.cov_z[row])
         path.append(pose)
-        pose_covs.append(cov[:dim, :dim])
+        pose_covs.append(cov[:dim, :dim].copy())  # a view would keep every step's whole covariance
     blocks = {name: _block(cov, dim, len(m.z[0]), i) for name, i in places.items()}
     landmarks = {name: points[i] for name, i in places.items()}
     return Filtered(np.array(path), np.array(pose_covs), landmarks, blocks, log_evidence)
@@ -67,14 +67,16 @@ def _innovation(model, z, pose, points, at, dim):
 
 
 def _updated(nu, slope, cov, noises):
-    innovation = slope @ cov @ slope.T
+    used = np.flatnonzero(slope.any(axis=0))  # of many landmarks, few are in view
+    seen = slope[:, used] @ cov[used]
+    innovation = seen[:, used] @ slope[:, used].T
     p = noises.shape[-1]
     for k, noise in enumerate(noises):
         innovation[k * p : (k + 1) * p, k * p : (k + 1) * p] += noise
-    gain = np.linalg.solve(innovation, slope @ cov).T
+    gain = np.linalg.solve(innovation, seen).T
     log_det = np.linalg.slogdet(2 * np.pi * innovation)[1]
     log_density = -0.5 * (nu @ np.linalg.solve(innovation, nu) + log_det)
-    cov = cov - gain @ (slope @ cov)
+    cov = cov - gain @ seen
     return gain @ nu, 0.5 * (cov + cov.T), float(log_density)
 
 

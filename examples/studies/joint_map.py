@@ -53,6 +53,8 @@ MANY = RobotWorld(
     std_range_m=0.05, std_angle_deg=1.0, std_translation_m=0.02, std_rotation_deg=0.3,
 )  # fmt: skip
 """Two rounds of 125 m, seen twice: more landmarks than one Gaussian takes quickly."""
+LONG = replace(MANY, steps=20_000, laps=20_000 / 750)
+"""The same ground for so long, of which three hundred landmarks come into view."""
 OF_MANY = {
     **{f"joint map, sub-maps of {n}": replace(JOINT, submap=n) for n in (50, 150)},
     "joint map, one": replace(JOINT, submap=None),
@@ -228,6 +230,7 @@ def main(
     particles: tuple[int, ...] = (50, 250),
     windows: tuple[int, ...] = (1, 5),
     many_runs: int = 0,
+    long_runs: int = 0,
     recordings: Path | None = None,
     seeds: int = 3,
     room_runs: int = 10,
@@ -246,6 +249,7 @@ def main(
         many_runs: logs with 800 landmarks, seeds 0, 1, …, beside one Gaussian of all; each takes minutes.
         recordings: folder of the recorded logs; None leaves them out.
         seeds: of the filter on each recording, 0, 1, ….
+        long_runs: logs of 20,000 steps among 300 landmarks, seeds 0, 1, …; each takes ten minutes.
         room_runs: two cameras in a room, seeds 0, 1, …; none by 0.
         frames: of each.
         workers: processes.
@@ -281,6 +285,10 @@ def main(
             name: run_trials(RobotTrial(MANY, config), range(many_runs), workers) for name, config in OF_MANY.items()
         }
         rows += rows_of("800 landmarks", many, "joint map, one")
+    if long_runs:
+        trials = {"joint EKF": EkfTrial(LONG), "joint map, sub-maps of 150": RobotTrial(LONG, JOINT)}
+        long = {name: run_trials(trial, range(long_runs), workers) for name, trial in trials.items()}
+        rows += rows_of("20,000 steps", long)
     write_table(out / "joint_map.csv", header, rows)
     if recordings is not None:
         configs = {f"joint, 50, window {w}": replace(JOINT, particles=50, window=w) for w in windows}

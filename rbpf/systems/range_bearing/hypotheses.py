@@ -72,6 +72,7 @@ class _Explanation(NamedTuple):
     chosen: np.ndarray
     before: _View
     after: _View
+    recalls: bool  #: a landmark that only an old sub-map has
 
 
 class Hypotheses:
@@ -122,8 +123,9 @@ class Hypotheses:
             reports.append(self._stepped(each, named[-1], checked, control, stamp_ns))
             gained = reports[-1].log_evidence
             costs = self.gates.log_new * (one.chosen == NEW).sum() + self.gates.log_clutter * (one.chosen == NULL).sum()
-            # Where the likelihood is no density, what the prediction said.
-            each.log_weight = one.log_weight if np.isnan(gained) else each.log_weight + gained + float(costs)
+            # Where the likelihood is no density, and of what an old sub-map knows, what the prediction said.
+            predicted = np.isnan(gained) or one.recalls
+            each.log_weight = one.log_weight if predicted else each.log_weight + gained + float(costs)
 
         # Their weights, and the evidence of the frame by all of them.
         evidence = float(np.logaddexp.reduce([each.log_weight for each in held]))
@@ -164,7 +166,7 @@ class Hypotheses:
             if i:
                 each.filter.restore(own)
             odds, kept = read(own, _ODDS, "odds/"), read(own, _KEPT, "kept/")
-            if not np.array_equal(np.unique(odds["ids"]), np.sort(each.map.ids)):
+            if not np.array_equal(np.unique(odds["ids"]), np.sort(each.map.all_ids)):
                 raise InputError(f"the array {place}odds/ids does not name the landmarks of the map")
             each.log_weight, each.log_odds = log_weight, dict(zip(*(odds[name].tolist() for name in odds), strict=True))
             each.chosen = split(kept["chosen"], kept["counts"].tolist(), f"{place}kept/chosen")
@@ -181,12 +183,18 @@ class Hypotheses:
     ) -> StepReport:
         """A step with the landmarks named; then what was expected and not seen is less probable, or dropped."""
         used, ids = names != NULL, each.map.ids
+        held = set(ids.tolist())
         shown = FeatureFrame(stamp_ns or 0, names[used], observed.z[used], observed.cov[used])
         each.filter.health.silent = self.held[0].filter.health.silent
         report = each.filter.step(shown, control, stamp_ns)
         if self.keep:
             each.chosen.append(names)
-        log_odds = dict.fromkeys(names[used].tolist(), 0.0)
+        log_odds = each.log_odds | {
+            name: each.log_odds.get(name, -self.existence.hit) + self.existence.hit
+            for name in names[used].tolist()
+            if name not in held
+        }
+        ids = ids[each.map.holds(ids)]
         if ids.size:
             belief = each.filter.belief()
             mode = slice(belief.mode, belief.mode + 1)
@@ -196,6 +204,8 @@ class Hypotheses:
             gone = np.isneginf(moved)
             if gone.any():
                 each.map.remove(ids[gone])
+                for name in ids[gone].tolist():
+                    del log_odds[name]
             log_odds |= dict(zip(ids[~gone].tolist(), moved[~gone].tolist(), strict=True))
         each.log_odds = log_odds
         return report
@@ -210,20 +220,23 @@ class Hypotheses:
         z, noise = points.mean[0], points.cov[0]
         log_unit = 0.5 * (np.linalg.slogdet(noise)[1] - np.linalg.slogdet(observed.cov)[1])
         for each in self.held:
-            belief, ids, dim = each.filter.expect(control, stamp_ns), each.map.ids, z.shape[1]
+            # With the landmarks of old sub-maps that are near; one that is meant becomes one of the present sub-map, too.
+            belief, wide = each.filter.expect(control, stamp_ns), each.map.widened()
+            ids, dim = wide.ids, z.shape[1]
             view = _View(ids, np.zeros((0, dim)), np.zeros((0, dim, dim)))
             near, mean, cov = ids, view.mean, np.zeros((0, 0))
             if ids.size:
                 # Landmarks that are near any of the measurements, and what is expected of all of these together.
-                view = _View(ids, *each.map.project(seen, ids, belief))
+                view = _View(ids, *wide.project(seen, ids, belief))
                 squared = squared_mahalanobis(z[:, None] - view.mean, view.cov + noise[:, None])
                 near = ids[(squared <= self.gates.isolate).any(axis=0)]
                 if near.size:
-                    mean, cov = each.map.project_jointly(seen, near, belief)
+                    mean, cov = wide.project_jointly(seen, near, belief)
             for one in associations(z, noise, mean, cov, self.gates, log_unit, self.bound):
                 chosen = np.where(one.chosen < 0, one.chosen, np.append(near, NULL)[np.maximum(one.chosen, NULL)])
                 after = _View(near, one.mean, one.cov)
-                yield _Explanation(each.log_weight + one.log_density, each, chosen, view, after)
+                recalls = bool((~each.map.holds(chosen[chosen >= 0])).any())
+                yield _Explanation(each.log_weight + one.log_density, each, chosen, view, after, recalls)
 
     def _differ(self, one: _Explanation, other: _Explanation) -> bool:
         """Whether two explanations put a landmark at different places, as seen from the robot.

@@ -76,9 +76,10 @@ class RangeBearingSlam(System):
             self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
         self.kept_map, self.why_map = config.kept_map()
-        # Without names, landmarks of all that was mapped may be meant: one Gaussian has them.
-        submap = config.submap if config.association == "known" else None
-        joint = JointMap(space, compiled=config.compiled, submap=submap) if self.kept_map == "joint" else None
+        joint = None
+        if self.kept_map == "joint":
+            unnamed = config.association == "ml" and config.submap is not None
+            joint = JointMap(space, compiled=config.compiled, submap=config.submap, unnamed=unnamed)
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
