@@ -34,7 +34,7 @@ def run(settings: Settings) -> list[Row]:
             if len(run.log) == 1 and more:
                 add_elsewhere(run, more)
 
-        done = filter_opened(open_mono(replace(sequence), MonoConfig(particles=50), known), [fill])
+        done = filter_opened(open_mono(replace(sequence), MonoConfig(particles=50, map="particles"), known), [fill])
         assert not done.log.lost().any()
         spent = done.log["seconds"]
         seconds[more] = spent[SETTLING:]

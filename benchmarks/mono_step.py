@@ -36,7 +36,7 @@ def run(settings: Settings) -> list[Row]:
     """Median over the frames of the desk."""
     turns = settings.repetitions(300)
     log = simulate_features(DeskWorld(frames=SETTLING + turns + 3), Measuring(), MONO, 0)
-    config = MonoConfig(particles=50)
+    config = MonoConfig(particles=50, map="particles")
     contestants = {"rbpf": Walk(log, config), "twin": Walk(log, replace(config, compiled=False))}
     times = interleaved(contestants, turns)
     ours, twin = times["rbpf"].median * 1e3, times["twin"].median * 1e3

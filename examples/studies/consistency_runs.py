@@ -329,14 +329,14 @@ def robot_trials(steps: int, particles: tuple[int, ...]) -> tuple[Trials, Trials
 
 def desk_trials(frames: int, particles: tuple[int, ...]) -> tuple[Trials, Trials]:
     """The same for the camera over a desk."""
-    world, base = DeskWorld(frames=frames), MonoConfig(particles=particles[1])
+    world, base = DeskWorld(frames=frames), MonoConfig(particles=particles[1], map="particles")
     changed = {
         "start sampled (known points as landmarks)": replace(base, known="points"),
         "three linearisations": replace(base, proposal=ProposalConfig(iterations=3)),
         "linearised weights": replace(base, proposal=ProposalConfig(weights="linearised", iterations=1)),
         "epipolar constraint": replace(base, inverse_depth=replace(base.inverse_depth, pose_update="epipolar")),
     }
-    sizes = {f"{n} particles": DeskTrial(world, MonoConfig(particles=n)) for n in particles}
+    sizes = {f"{n} particles": DeskTrial(world, MonoConfig(particles=n, map="particles")) for n in particles}
     return sizes, {name: DeskTrial(world, config) for name, config in changed.items()}
 
 

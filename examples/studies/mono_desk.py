@@ -29,9 +29,9 @@ from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
 
 SETTINGS = {
-    "50 particles": MonoConfig(particles=50),
-    "250 particles": MonoConfig(particles=250),
-    "joint map, 50 particles": MonoConfig(particles=50, map="joint"),
+    "50 particles": MonoConfig(particles=50, map="particles"),
+    "250 particles": MonoConfig(particles=250, map="particles"),
+    "joint map, 50 particles": MonoConfig(particles=50),
 }
 
 

@@ -145,7 +145,7 @@ def robot(
 def camera_without_known_points() -> Run:
     """A camera in a hand over a desk, of which nothing is known beforehand."""
     log = simulate_features(DeskWorld(frames=120), Measuring(), MONO, 0)
-    return filter_features(replace(log, known=None), MonoConfig(particles=100))
+    return filter_features(replace(log, known=None), MonoConfig(particles=100, map="particles"))
 
 
 CASES = (

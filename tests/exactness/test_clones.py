@@ -214,9 +214,16 @@ def test_consolidation_keeps_the_moments_of_draws():
 def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
     joint, particles = rays(1)
     before, cov, mean = joint.moments(particles), joint.cov.copy(), joint.mean[0].copy()
+    own, row = joint.landmark_of(11).promote(joint.read(np.array([11]))).mean[0, 0], joint.ids.tolist().index(11)
     joint.promote(np.array([11]))
-    for first, second in zip(before, joint.moments(particles), strict=True):
-        np.testing.assert_allclose(second, first, rtol=1e-9)
+    after, others = joint.moments(particles), joint.ids != 11
+    for first, second in zip(before, after, strict=True):
+        np.testing.assert_allclose(second[others], first[others], rtol=1e-9)
+    # Its mean is that of its own transform: E[1/q] is not 1/q̄.
+    np.testing.assert_allclose(
+        after[0][row], SE3.transform(joint.world(SE3.identity((1,)), slice(1))[0], own), atol=1e-9
+    )
+    assert np.linalg.norm(after[0][row] - before[0][row]) > 1e-6
     assert joint.are(joint.ids, Point(3)).tolist() == [True] * 3 + [False] * 4 + [False, True]
     # Rows of the point: those of the clone and the ray, by numeric slopes.
     clone = joint.clones[1]
@@ -230,7 +237,7 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
     joint.remove(np.array([10, 20]))  # the last ray of the second clone: the clone goes, too
     np.testing.assert_array_equal(joint.ids, [5, 2, 9, 21, 22, 23, 11])
     assert len(joint.clones) == 1 and joint.mean.shape[1] == 6 + 3 * 7 + 6
-    for whole, rest in zip(before, joint.moments(particles), strict=True):
+    for whole, rest in zip(after, joint.moments(particles), strict=True):
         np.testing.assert_allclose(whole[[0, 1, 2, 4, 5, 6, 8]], rest, rtol=1e-9)
 
 

@@ -12,7 +12,7 @@ from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.simulation.paths import HandHeld
 
-SMALL = MonoConfig(particles=20)
+SMALL = MonoConfig(particles=20, map="particles")
 
 
 def desk(seed: int = 0, frames: int = 8, measurements: int = 12, **options: float) -> FeatureLog:

@@ -116,7 +116,7 @@ def test_a_camera_at_rest_stays():
     """RMS error in the particles' own world, after 60 frames of four recordings; with lines alone it is 6 mm."""
     squares = []
     for seed in range(4):
-        filter_ = run(still_log(seed, 60), MonoConfig(seed=seed, max_new_per_frame=30)).system.filter
+        filter_ = run(still_log(seed, 60), MonoConfig(seed=seed, max_new_per_frame=30, map="particles")).system.filter
         paths = SE3.translation(filter_.history.paths()[..., :7])
         squares.append(np.square(np.einsum("tnk,n->tk", paths, filter_.particles.weights)[-1]).sum())
     assert np.sqrt(np.mean(squares)) < 2e-3
@@ -127,7 +127,7 @@ def test_a_camera_at_rest_stays():
 def test_the_density_of_rays_is_continuous_in_the_state(displaced_px, heaviest):
     """Log p along a sideways displacement of 5 mm in steps of 25 µm, wherever on it the heaviest particle is."""
     log, n = still_log(0, 3), 200
-    system = run(log, MonoConfig(particles=n, max_new_per_frame=30)).system
+    system = run(log, MonoConfig(particles=n, max_new_per_frame=30, map="particles")).system
     belief = system.filter.belief()
     states = np.repeat(belief.state[:1], n, axis=0)
     states[:, :7] = SE3.retract(SE3.identity(), np.linspace(2.5e-5, 5e-3, n)[:, None] * np.eye(6)[3])
@@ -197,7 +197,7 @@ def scores(known_as: str, seeds: range) -> np.ndarray:
     """NEES (runs, frames)."""
 
     def one(seed: int) -> Run:
-        config = MonoConfig(particles=30, seed=seed, known=known_as)
+        config = MonoConfig(particles=30, seed=seed, known=known_as, map="particles")
         return run(desk(100 + seed, frames=12), config)
 
     return np.array([nees(one(seed)) for seed in seeds])

@@ -108,7 +108,7 @@ def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
 def test_a_pose_is_found_in_each_particles_own_world():
     """Two worlds that differ by a known motion: the same camera among the same landmarks in both, and as uncertain."""
     n, rng, other = 2, np.random.default_rng(0), SE3.exp(np.array([0.2, -0.3, 0.1, 0.5, -0.2, 0.3]))
-    slam = MonoSlam(CAMERA, MonoConfig(particles=n))
+    slam = MonoSlam(CAMERA, MonoConfig(particles=n, map="particles"))
     points = np.append(rng.uniform(-0.8, 0.8, (12, 2)), rng.uniform(2.0, 4.0, (12, 1)), axis=1)
     worlds = np.stack([SE3.identity(), other])
     mean = SE3.transform(worlds[:, None], points)

@@ -69,7 +69,7 @@ class Setting:
 
     def config(self, ray: InverseDepthConfig | None = None) -> MonoConfig:
         """Of a run: the defaults."""
-        config = MonoConfig(particles=self.particles, seed=self.seed)
+        config = MonoConfig(particles=self.particles, seed=self.seed, map="particles")
         return config if ray is None else replace(config, inverse_depth=ray)
 
     def sequence(

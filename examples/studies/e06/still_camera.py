@@ -51,7 +51,7 @@ def reproduce(setting: Setting) -> list[Row]:
     found = {}
     for treatment in TREATMENTS:
         ray = InverseDepthConfig(pose_update=treatment, promote_std_ratio=NEVER)  # type: ignore[arg-type]
-        config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray)
+        config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray, map="particles")
         run = filter_opened(open_mono(sequence, config, known))
         errors = whitened_errors(SE3, run.log.poses[-1:], run.log.covs[-1:], truth)
         pose, position = (np.sqrt(np.linalg.det(part)) for part in (run.log.covs[-1], run.log.covs[-1, 3:, 3:]))

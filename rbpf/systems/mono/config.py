@@ -164,10 +164,11 @@ class MonoConfig(Ranged):
     #: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world whose
     #: place each particle samples in the first frame (E06).
     known: Literal["frame", "points"] = "frame"
-    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles, E06); or, as soon as
-    #: depths are known, one Gaussian of all landmarks, velocity and frame, given the last few frames (joint): an
-    #: uncertainty that stays true. It needs velocity.mode=marginal; in a map that is only to be found there is none.
-    map: Literal["particles", "joint"] = "particles"
+    #: as soon as depths are known, one Gaussian of all landmarks, velocity and frame, given the last few frames (joint): an
+    #: uncertainty that stays true; or every particle's own landmarks, each of them a Gaussian given the whole sampled
+    #: path (particles, E06). By default (auto) joint, but particles where a lag is set, the velocity is sampled, or
+    #: features of unknown depth are of a kind of one's own. A known map that the camera is found in is never joint.
+    map: Literal["auto", "joint", "particles"] = "auto"
     #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
     #: below the threshold of resampling, which does not take place.
     window: Count = 5

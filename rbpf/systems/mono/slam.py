@@ -155,7 +155,8 @@ class MonoSlam(System):
 
         rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
         is_fixed = known_map is not None
-        self._becomes_joint = config.map == "joint" and not is_fixed
+        fits = isinstance(rays, InverseDepthRays) and config.velocity.mode == "marginal" and config.lag is None
+        self._becomes_joint = not is_fixed and (config.map == "joint" or (config.map == "auto" and fits))
         if self._becomes_joint:
             config = replace(config, particles=max(config.particles, config.starting_particles))
         self._begins_with = config
@@ -376,6 +377,7 @@ class MonoSlam(System):
             "frames_tracked": int((~lost).sum()),
             "lost_frames": int(lost.sum()),
             "relocalisations": int(log["relocalised"].sum()),
+            "map": "particles" if self.joint is None else "joint",
             "known_points": 0 if self.known_points is None else int(self.known_points.names.size),
             **({} if self.known_map is None else localised),
             "landmarks_full": int((~landmarks.is_ray()).sum()),
