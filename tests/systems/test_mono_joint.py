@@ -96,6 +96,15 @@ def test_the_oldest_features_make_room():
     np.testing.assert_array_equal(np.sort(held), np.flatnonzero(slam.sensor.table.alive))
 
 
+def test_the_oldest_names_make_room():
+    log, sizes = desk(3, frames=60), []
+    for most in (300, 14):
+        run = filter_features(log, replace(JOINT, active=most))
+        assert run.system.joint is not None
+        sizes.append((run.log["points"] + run.log["rays"])[-20:].max())
+    assert sizes[1] <= 14 < sizes[0]
+
+
 def test_what_is_refused():
     with pytest.raises(InputError, match=r"set velocity\.mode=marginal, not paper"):
         MonoSlam(CAMERA, replace(JOINT, velocity=VelocityConfig("paper")))

@@ -176,7 +176,8 @@ class MonoConfig(Ranged):
     starting_particles: Count = 250
     #: … until half of the depths in view were known in so many frames in a row.
     settled_frames: Count = 30
-    #: of a joint map: landmarks held, at most; of those not looked for the ones that were found least often are dropped.
+    #: of a joint map: landmarks held, at most; of those not looked for the ones that were found least often are dropped, of
+    #: named features the oldest.
     active: Count = 300
     #: landmarks started in one frame at most.
     max_new_per_frame: Annotated[CountOrNone, Formerly("births_per_frame")] = 1000

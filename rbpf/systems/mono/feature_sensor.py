@@ -237,6 +237,14 @@ class FeatureSensor(Sensor):
     def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
+        """As `start`; in a joint map that is full the oldest features that are not seen make room."""
+        started = self.start(frame, belief, observed)
+        if self.most is not None:
+            held, new = belief.map.ids, sum(len(group.z) for group in started)
+            belief.map.remove(held[~np.isin(held, frame.landmarks)][: max(held.size + new - self.most, 0)])
+        return started
+
+    def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """Turns features whose depth is known by now into points; starts one for every new name."""
         belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
         is_new = (self.members(frame.landmarks) < 0) & ~belief.map.holds(frame.landmarks)

@@ -220,7 +220,7 @@ class ImageSensor(Sensor):
         if frame.image is not None and not self.bad_frames:
             self._keep_appearances(frame.image, frame.used, pose)
             frame.started = self._started(frame, frame.image, pose)
-        new_landmarks = self.features.new_landmarks(frame.features, belief, observed)
+        new_landmarks = self.features.start(frame.features, belief, observed)
         for group in new_landmarks:
             records = group.model.initialise(pose[None], group.z, np.zeros((len(group.z), 2, 2)))
             const = None if records.const is None else records.const[0]
