@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from rbpf.kernels.signature import INDICES, VECTOR
+
 
 def filled(starts: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the Cholesky factor of a symmetric matrix (n, n) may have entries, by where its lower triangle has.
@@ -18,10 +20,10 @@ def filled(starts: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray
     for own in columns:
         if own.size > 2:
             columns[own[1]] = np.union1d(columns[own[1]], own[1:])
-    return np.append(0, np.cumsum([own.size for own in columns])), np.concatenate(columns)
+    return np.append(0, np.cumsum([own.size for own in columns])), np.concatenate(columns).astype(np.int64)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(VECTOR(INDICES, INDICES, VECTOR, VECTOR), cache=True, error_model="numpy")
 def selected_inverse(starts, rows, lower, pivots):
     """Entries of (L D Lᵀ)⁻¹ at the places of `filled` (K. Takahashi, J. Fagan and M. Chin 1973).
 
