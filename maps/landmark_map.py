@@ -34,7 +34,6 @@ from rbpf.maps.rows import (
     STATE,
     Plan,
     RowEngine,
-    by_use,
     checked_new_ids,
     expected,
     first_records,
@@ -42,7 +41,6 @@ from rbpf.maps.rows import (
     linearised,
     make_plan,
     projected,
-    require_apart,
 )
 from rbpf.maps.store import ALL, Layout, SharedStore
 
@@ -93,7 +91,7 @@ class LandmarkMap(Map):
         return self.store.columns.kinds(ids) == self._kind(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        records = first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
+        records = first_records(new_landmarks, state)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
@@ -237,8 +235,19 @@ class LandmarkMap(Map):
         return self._engine.information(self._plan(for_state), state, for_state, prior)
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        uses = by_use(groups)
-        require_apart(uses[STATE], uses[BOTH])
+        uses: dict[frozenset[Part], list[Observations]] = {STATE: [], BOTH: [], MAP: []}
+        for group in groups:
+            uses[group.updates].append(group)
+        if uses[STATE] and uses[BOTH]:
+            # Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others.
+            named = ([np.ravel(each.ids) for each in uses[use] if each.ids is not None] for use in (STATE, BOTH))
+            shared = np.intersect1d(*map(np.concatenate, named))
+            shared = shared[shared >= 0]
+            if shared.size:
+                raise InputError(
+                    f"landmark {shared[0]} is observed by a group that updates the state alone and by one that updates "
+                    "both: split the second into one for each"
+                )
         log_density, after_sampling = np.zeros(self.n), np.zeros(self.n)
         if uses[STATE]:
             log_density += self._density(state, uses[STATE])

@@ -23,6 +23,7 @@ from rbpf.core.models import (
     FusedKernel,
     Likelihood,
     LogDensities,
+    NewLandmarks,
     ObservationModel,
     Observations,
     Part,
@@ -156,27 +157,6 @@ def _rows(number: int, ids: np.ndarray) -> list[Row]:
             mask = column == landmark
             rows.append(Row(number, k, int(landmark), None if mask.all() else mask))
     return rows
-
-
-def by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observations]]:
-    """The groups by what they update."""
-    uses: dict[frozenset[Part], list[Observations]] = {STATE: [], BOTH: [], MAP: []}
-    for group in groups:
-        uses[group.updates].append(group)
-    return uses
-
-
-def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
-    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others."""
-    if not weigh or not both:
-        return
-    seen = [np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None]) for part in (weigh, both)]
-    shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
-    if shared.size:
-        raise InputError(
-            f"landmark {shared[0]} is observed by a group that updates the state alone and by one that updates both: "
-            "split the second into one for each"
-        )
 
 
 GAUSSIAN = Gaussian()
@@ -447,10 +427,10 @@ def checked_new_ids(
     return ids.astype(np.int64)
 
 
-def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state: np.ndarray) -> Records:
-    """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
-    name = type(model).__name__
-    return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))
+def first_records(new: NewLandmarks, state: np.ndarray) -> Records:
+    """Estimates (N, K, …) of landmarks that are started at states (N, E)."""
+    name = type(new.model).__name__
+    return new.model.initialise(state, numbers(new.z, f"z of {name}"), numbers(new.cov, f"cov of {name}"))
 
 
 def linearised(
