@@ -241,8 +241,8 @@ class LandmarkMap(Map):
         if uses[STATE] and uses[BOTH]:
             # Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others.
             named = ([np.ravel(each.ids) for each in uses[use] if each.ids is not None] for use in (STATE, BOTH))
-            shared = np.intersect1d(*map(np.concatenate, named))
-            shared = shared[shared >= 0]
+            one, other = (np.concatenate(ids) for ids in named)
+            shared = np.intersect1d(one[one >= 0], other)
             if shared.size:
                 raise InputError(
                     f"landmark {shared[0]} is observed by a group that updates the state alone and by one that updates "
