@@ -556,7 +556,7 @@ class JointMap(Map):
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         if new_landmarks.mask is not None and not new_landmarks.mask.all():
             raise InputError("a joint map's landmarks are in all particles")
-        records = first_records(new_landmarks, state)
+        records = first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
         return self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
 
     def add_records(

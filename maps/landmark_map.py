@@ -91,7 +91,7 @@ class LandmarkMap(Map):
         return self.store.columns.kinds(ids) == self._kind(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        records = first_records(new_landmarks, state)
+        records = first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 

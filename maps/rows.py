@@ -23,7 +23,6 @@ from rbpf.core.models import (
     FusedKernel,
     Likelihood,
     LogDensities,
-    NewLandmarks,
     ObservationModel,
     Observations,
     Part,
@@ -427,10 +426,10 @@ def checked_new_ids(
     return ids.astype(np.int64)
 
 
-def first_records(new: NewLandmarks, state: np.ndarray) -> Records:
-    """Estimates (N, K, …) of landmarks that are started at states (N, E)."""
-    name = type(new.model).__name__
-    return new.model.initialise(state, numbers(new.z, f"z of {name}"), numbers(new.cov, f"cov of {name}"))
+def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state: np.ndarray) -> Records:
+    """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
+    name = type(model).__name__
+    return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))
 
 
 def linearised(
