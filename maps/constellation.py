@@ -9,15 +9,13 @@ from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3, skew
 
+#: Points that may each have an error of their own; a record's covariance grows with the square of their number.
 MOST = 12
-"""Points that may each have an error of their own; a record's covariance grows with the square of their number."""
+#: Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors, of the points' means
+#: over the particles.
 ROUNDS = 20
-"""Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors,
-of the points' means over the particles."""
-SETTLED = 1e-10
-"""Length of the last step, radians and metres."""
-LEAST = 1e-12
-"""Variance, m², that keeps the fit defined where some of the points are exact and others are not."""
+SETTLED = 1e-10  #: Length of the last step, radians and metres.
+LEAST = 1e-12  #: Variance, m², that keeps the fit defined where some of the points are exact and others are not.
 
 
 @final

@@ -27,12 +27,9 @@ from rbpf.maps import grid_kernels as cells
 from rbpf.ranges import Positive, Range, Ranged, require_memory
 
 _FIRST_TILES = 256
-_EVERY = 2
-"""Of so many beams one is looked at on the lattice of a search,"""
-_APART = 16
-"""of these first each so many-th, then those beside them, and so on."""
-GRID = Part("occupancy grid")
-"""Its name in a filter."""
+_EVERY = 2  #: Of so many beams one is looked at on the lattice of a search,
+_APART = 16  #: of these first each so many-th, then those beside them, and so on.
+GRID = Part("occupancy grid")  #: Its name in a filter.
 
 
 @dataclass(frozen=True)

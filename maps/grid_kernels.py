@@ -12,13 +12,10 @@ from numba import boolean, float32, float64, int32, njit, prange, types, void
 
 from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR
 
-TILE = 32
-"""Cells of a side of a tile."""
-PLANES = 4
-"""Of a tile: log-odds; how many beams ended in the cell, and their mean place in it, x and y in [0, 1)."""
+TILE = 32  #: Cells of a side of a tile.
+PLANES = 4  #: Of a tile: log-odds; how many beams ended in the cell, and their mean place in it, x and y in [0, 1).
 LOG_ODDS, ENDS, MEAN_X, MEAN_Y = range(PLANES)
-FINE = 8
-"""Places in a cell, along each axis, for which the field of one occupied cell is tabulated."""
+FINE = 8  #: Places in a cell, along each axis, for which the field of one occupied cell is tabulated.
 
 INDEX = types.Array(int32, 3, "C")
 POOL = types.Array(float32, 4, "C")
@@ -287,8 +284,9 @@ def _second_order(field, window, border, side, base, at, beams, steps, state, gr
     return value
 
 
+#: Types of (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all
+#: zero.
 PLACE = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED
-"""Types of (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all zero."""
 
 
 @njit(void(*PLACE, VECTOR), parallel=True, cache=True, error_model="numpy")

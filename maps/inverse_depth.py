@@ -8,8 +8,7 @@ from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 
-MIN_RHO = 0.02
-"""Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m."""
+MIN_RHO = 0.02  #: Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m.
 
 
 @final

@@ -37,11 +37,10 @@ from rbpf.maps.store import Layout, SharedStore
 
 STATE = frozenset({Part.STATE})
 MAP = frozenset({Part.LANDMARK})
-BOTH = STATE | MAP
-"""What observations update."""
+BOTH = STATE | MAP  #: What observations update.
 
+#: Numbers (K,) of the parametrisations of landmarks (K,), -1 where the map holds none.
 Kinds = Callable[[np.ndarray], np.ndarray]
-"""Numbers (K,) of the parametrisations of landmarks (K,), -1 where the map holds none."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +159,8 @@ def _rows(number: int, ids: np.ndarray) -> list[Row]:
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
+#: Particle-observation pairs that NumPy takes at once, so that what it works on stays in the second-level cache.
 PAIRS_AT_ONCE = 8192
-"""Particle-observation pairs that NumPy takes at once, so that what it works on stays in the second-level cache."""
 
 
 class RowEngine:

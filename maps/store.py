@@ -29,10 +29,9 @@ _TABLES = {
 _HOT = {"data": numbers("fields", "n", values="log")}
 _COLD = {"kept": integers("kept", least=0, below="n", ascending=True), "data": numbers("fields", "kept", values="log")}
 
+#: A column with fewer surviving rows than this fraction of the particles gives its dense slab back.
 HOT_FRACTION = 0.75
-"""A column with fewer surviving rows than this fraction of the particles gives its dense slab back."""
-COLD_FRACTION = 0.9
-"""A compacted column is compacted again when no more than this fraction of its rows survives."""
+COLD_FRACTION = 0.9  #: A compacted column is compacted again when no more than this fraction of its rows survives.
 
 _FIRST_ROWS = 64
 _FIRST_SLABS = 32
@@ -120,15 +119,12 @@ class Columns:
     """
 
     def __init__(self) -> None:
-        self.count = 0
-        """Columns held."""
-        self.next_id = 0
-        """One more than the largest id that was ever used."""
+        self.count = 0  #: Columns held.
+        self.next_id = 0  #: One more than the largest id that was ever used.
         self._hold(np.zeros((5, _FIRST_ROWS), dtype=np.int64))
-        self._ascending = True
-        """Whether the ids held ascend, as those that are counted up do."""
+        self._ascending = True  #: Whether the ids held ascend, as those that are counted up do.
+        #: Where they do not: the ids ascending, and the rows of each; made when it is asked for.
         self._sorted: tuple[np.ndarray, np.ndarray] | None = None
-        """Where they do not: the ids ascending, and the rows of each; made when it is asked for."""
 
     @property
     def ids(self) -> np.ndarray:

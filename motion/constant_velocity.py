@@ -16,8 +16,8 @@ from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 
+#: State (N, 13) of `SampledVelocity`: world_from_body, then its velocity.
 POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
-"""State (N, 13) of `SampledVelocity`: world_from_body, then its velocity."""
 
 
 @dataclass(frozen=True)

@@ -24,20 +24,18 @@ from rbpf.ranges import NotNegative, Positive, Range, Ranged
 
 State = TypeVar("State")
 
+#: x → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is senseless.
 Evaluate = Callable[[State], tuple[Array, Array]]
-"""x → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is senseless."""
 
-Retract = Callable[[State, Array], State]
-"""x moved by ξ (d,)."""
+Retract = Callable[[State, Array], State]  #: x moved by ξ (d,).
 
+#: A singular value below this fraction of the largest counts as this fraction: its direction is not determined.
 SINGULAR = 1e-7
-"""A singular value below this fraction of the largest counts as this fraction: its direction is not determined."""
 
+#: A decrease below this fraction of the squared residuals is not worth a step, nor certain to be found.
 ROUNDING = 1e-12
-"""A decrease below this fraction of the squared residuals is not worth a step, nor certain to be found."""
 
-STUCK = 1e8
-"""Damping at this multiple of the largest singular value leaves no step."""
+STUCK = 1e8  #: Damping at this multiple of the largest singular value leaves no step.
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import SE3, LieGroup
 
+#: Of [ω, v] of a camera: the turn about its y axis, which points down, and the shift along x and z.
 CAMERA_PLANE = (False, True, False, True, False, True)
-"""Of [ω, v] of a camera: the turn about its y axis, which points down, and the shift along x and z."""
 
 
 @dataclass(frozen=True)

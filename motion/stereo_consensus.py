@@ -15,10 +15,8 @@ from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, points_from_pixels, times_pixels
 from rbpf.ranges import Formerly, Probability, Range, Ranged
 
-REFINEMENTS = 2
-"""Gauss-Newton steps on the nine pixels of a triple."""
-FARTHEST = 1e4
-"""Baselines away at most is a point put for the alignment."""
+REFINEMENTS = 2  #: Gauss-Newton steps on the nine pixels of a triple.
+FARTHEST = 1e4  #: Baselines away at most is a point put for the alignment.
 
 
 @dataclass(frozen=True)

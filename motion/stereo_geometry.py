@@ -34,8 +34,8 @@ Points = Literal["adjusted", "propagated", "exact"]
 - exact: where they were measured, without error, S = R: the paper's.
 """
 
+#: Of the adjustment of m̂: most of them, and the last one's change. g is nearly linear: two or three do.
 SWEEPS, SWEPT_PX = 10, 1e-4
-"""Of the adjustment of m̂: most of them, and the last one's change. g is nearly linear: two or three do."""
 
 
 class PinholeCamera(Protocol):

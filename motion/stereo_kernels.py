@@ -11,11 +11,10 @@ from numba import njit
 from rbpf.kernels.dense import factor, solve, solve_lower
 from rbpf.kernels.se3 import cross, exp_pair, multiply, turned, unit
 
+#: Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open.
 STIFFNESS = 1e-9
-"""Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open."""
 
-FLAT = 1e-12
-"""Shortest length that is divided by: points that coincide have no direction."""
+FLAT = 1e-12  #: Shortest length that is divided by: points that coincide have no direction.
 
 
 @njit(cache=True, error_model="numpy")

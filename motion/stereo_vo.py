@@ -23,16 +23,12 @@ from rbpf.motion.stereo_consensus import RansacConfig, consensus
 from rbpf.motion.stereo_geometry import Matches, Points, linearised, residuals, squared_distances, white_rows
 from rbpf.ranges import Formerly, Positive, Range, Ranged
 
-ROUNDS = 5
-"""Of optimising and choosing anew which matches agree; it ends when they stay the same."""
-REWEIGHTED = 3
-"""Times that S is formed anew for propagated points."""
-WIDE = 4.0
-"""Times the gate is what agrees with the consensus of three: it is not yet the motion of all."""
+ROUNDS = 5  #: Of optimising and choosing anew which matches agree; it ends when they stay the same.
+REWEIGHTED = 3  #: Times that S is formed anew for propagated points.
+WIDE = 4.0  #: Times the gate is what agrees with the consensus of three: it is not yet the motion of all.
+#: No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it.
 LEAST_KEPT = 0.05
-"""No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it."""
-ROUNDING = 1e-14
-"""Variances below this fraction of the largest are rounding."""
+ROUNDING = 1e-14  #: Variances below this fraction of the largest are rounding.
 
 
 @final

@@ -19,11 +19,10 @@ import numpy as np
 
 from rbpf.errors import InputError
 
+#: Of any number of which no range says otherwise: larger ones are slips, and their squares spoil what they enter.
 LARGEST = 1e9
-"""Of any number of which no range says otherwise: larger ones are slips, and their squares spoil what they enter."""
 
-MOST = 10**7
-"""Particles, landmarks or images: more than any machine holds."""
+MOST = 10**7  #: Particles, landmarks or images: more than any machine holds.
 
 
 @dataclass(frozen=True)
@@ -60,10 +59,8 @@ NotNegative = Annotated[float, Range(ge=0.0)]
 Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
 Rate = Annotated[float, Range(ge=0.0, lt=1.0)]
 Probability = Annotated[float, Range(gt=0.0, lt=1.0)]
-Ratio = Annotated[float, Range(ge=1.0)]
-"""Of the larger to the smaller."""
-Angle = Annotated[float, Range(ge=0.0, le=180.0)]
-"""Degrees."""
+Ratio = Annotated[float, Range(ge=1.0)]  #: Of the larger to the smaller.
+Angle = Annotated[float, Range(ge=0.0, le=180.0)]  #: Degrees.
 Count = Annotated[int, Range(ge=1, le=MOST)]
 CountOrNone = Annotated[int, Range(ge=0, le=MOST)]
 Seed = Annotated[int, Range(ge=0, le=2**63 - 1)]

@@ -26,17 +26,14 @@ from rbpf.sensors.camera import LENSES, Pinhole
 from rbpf.sensors.features.interface import checked_image
 from rbpf.sensors.readers.known_points import KnownPixels
 
+#: Corners that a run starts from, spread over the board: more are nearer to each other than a search reaches.
 MOST = 12
-"""Corners that a run starts from, spread over the board: more are nearer to each other than a search reaches."""
-LEAST_SQUARE_PX = 5.0
-"""Corners nearer to each other than this cannot be told apart."""
-LEAST_SIDE_PX = 12.0
-"""Markers smaller than this are read wrongly now and then."""
+LEAST_SQUARE_PX = 5.0  #: Corners nearer to each other than this cannot be told apart.
+LEAST_SIDE_PX = 12.0  #: Markers smaller than this are read wrongly now and then.
 DICTIONARIES = (
     *("4X4_50", "4X4_100", "4X4_250", "5X5_50", "5X5_100", "5X5_250", "6X6_50", "6X6_100", "6X6_250"),
     "APRILTAG_36H11",
-)
-"""Sets of patterns of markers."""
+)  #: Sets of patterns of markers.
 _SEARCHES = (0, "CALIB_CB_NORMALIZE_IMAGE", "CALIB_CB_EXHAUSTIVE")
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
 
@@ -224,18 +221,15 @@ def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
     return KnownPixels(corners[chosen], seen, positions[chosen], np.zeros(chosen.size), own_frame=True)
 
 
-LEAST_VIEWS = 5
-"""Three determine the camera; with fewer than five no mistake is noticed."""
+LEAST_VIEWS = 5  #: Three determine the camera; with fewer than five no mistake is noticed.
+#: Standard deviation of the focal length, as a fraction of it, above which the views say too little.
 MOST_UNCERTAIN = 0.02
-"""Standard deviation of the focal length, as a fraction of it, above which the views say too little."""
+#: Angle between the board's normals that two views must have: from one direction, near and small is far and large.
 LEAST_TURN = np.deg2rad(10.0)
-"""Angle between the board's normals that two views must have: from one direction, near and small is far and large."""
-OUTLYING = 4.0
-"""Views whose error is this many times the median one are left out, and …"""
-HARMLESS_PX = 0.3
-"""… those with less than this are not."""
+OUTLYING = 4.0  #: Views whose error is this many times the median one are left out, and …
+HARMLESS_PX = 0.3  #: … those with less than this are not.
+#: Of each kind of lens: how many of its coefficients, the first ones, may be needed.
 COUNTS = {"radial-tangential": (0, 2, 4, 5), "equidistant": (0, 2, 4)}
-"""Of each kind of lens: how many of its coefficients, the first ones, may be needed."""
 
 
 class BoardView(NamedTuple):

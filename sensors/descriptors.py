@@ -18,16 +18,15 @@ from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.ranges import Range, Ranged
 
-BLOCK = 4096
-"""Columns of a product that are looked at together: a block of a few hundred rows stays in the cache."""
+BLOCK = 4096  #: Columns of a product that are looked at together: a block of a few hundred rows stays in the cache.
+#: Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer.
 LARGEST = {36: 0.25, 128: 0.55}
-"""Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer."""
 _KEPT = {
     "ids": integers("landmarks", least=0, ascending=True),
     "descriptors": numbers("landmarks", "length", dtype=np.float32),
 }
+#: Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time.
 GATHERED, PAIRS = 8, 65536
-"""Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time."""
 
 
 @dataclass(frozen=True)

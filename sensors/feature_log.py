@@ -9,8 +9,7 @@ from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
-UNIT = 1e-6
-"""How far a quaternion's length may be from 1: six decimals in a file leave it there."""
+UNIT = 1e-6  #: How far a quaternion's length may be from 1: six decimals in a file leave it there.
 
 
 @dataclass(frozen=True)

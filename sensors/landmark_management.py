@@ -16,8 +16,8 @@ from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, Formerly, NotNegative, Range, Ranged
 from rbpf.sensors.descriptors import distances
 
+#: Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer.
 DISTINCT = {36: 0.12, 128: 0.3}
-"""Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer."""
 _KEPT = {"table": integers("landmarks", 3, least=0), "counters": integers(2, least=0)}
 
 
@@ -48,11 +48,10 @@ class LandmarkManager:
     def __init__(self, config: NewLandmarkConfig, size: tuple[int, int]) -> None:
         self.config = config
         self.size = size
-        self.frame = 0
-        """Frames so far."""
+        self.frame = 0  #: Frames so far.
         self.next_name = 0
+        #: Of each descriptor held its name, how often it was seen, and the frame in which it was seen last.
         self._table = np.zeros((0, 3), dtype=np.int64)
-        """Of each descriptor held its name, how often it was seen, and the frame in which it was seen last."""
 
     @property
     def names(self) -> np.ndarray:

@@ -48,8 +48,8 @@ class NamedLandmarkSensor(Sensor):
         self.landmark = landmark
         self.part = part
         self.likelihood = likelihood
+        #: Landmarks that were observed once, by a likelihood that rejects outliers.
         self.observed_once: set[int] = set()
-        """Landmarks that were observed once, by a likelihood that rejects outliers."""
         self._contradicted = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:

@@ -30,10 +30,8 @@ from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs,
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
 
-LEAP = 40
-"""Grey levels between a corrupted pixel and all its neighbours: several times the noise of any usable image."""
-TOLERATED_FRACTION = 0.001
-"""Fraction of isolated pixels up to which an image is left as it is."""
+LEAP = 40  #: Grey levels between a corrupted pixel and all its neighbours: several times the noise of any usable image.
+TOLERATED_FRACTION = 0.001  #: Fraction of isolated pixels up to which an image is left as it is.
 
 
 def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
@@ -135,12 +133,10 @@ def match_frames(
     return match_pairs(before.descriptors, after.descriptors, (m, k), limits)
 
 
-SWAPPED, FEWER = 20, 4
-"""So many matches the wrong way round, and so many times fewer the right way, are no accident."""
+SWAPPED, FEWER = 20, 4  #: So many matches the wrong way round, and so many times fewer the right way, are no accident.
+#: So many matches the wrong way round, and such a fraction of all, are no accident either: of KITTI's it is below 0.01.
 IMPOSSIBLE, FRACTION = 5, 0.03
-"""So many matches the wrong way round, and such a fraction of all, are no accident either: of KITTI's it is below 0.01."""
-REMEMBERED = 0.9
-"""Of the matches that were counted, what still counts a pair later: some ten pairs decide."""
+REMEMBERED = 0.9  #: Of the matches that were counted, what still counts a pair later: some ten pairs decide.
 
 
 @dataclass(frozen=True)
@@ -195,8 +191,7 @@ class StereoMatcher:
         self.rig = rig
         self.extractor = extractor or Sift()
         self.config = config or PairConfig()
-        self.impulse_fraction = 0.0
-        """Fraction of the pixels that were replaced in the last pair."""
+        self.impulse_fraction = 0.0  #: Fraction of the pixels that were replaced in the last pair.
         self._last: tuple[tuple[np.ndarray, np.ndarray], Features, Features, int] | None = None
 
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
@@ -313,10 +308,8 @@ class StereoMatcher:
             raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {one}")
 
 
-ITERATIONS = 5
-"""Steps; a keypoint is within a pixel of its place, from where three are enough."""
-LONGEST_PX = 1.0
-"""Of a step."""
+ITERATIONS = 5  #: Steps; a keypoint is within a pixel of its place, from where three are enough.
+LONGEST_PX = 1.0  #: Of a step.
 _TINY = 1e-9
 
 

@@ -25,17 +25,15 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, LieGroup
 
-VERSION = 1
-"""Of the format of checkpoints."""
+VERSION = 1  #: Of the format of checkpoints.
 
+#: What a file that is cut off, damaged or made up can raise, read by zipfile and NumPy.
 UNREADABLE = (
     OSError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError, RuntimeError, EOFError, MemoryError,
     SyntaxError, TokenError, zipfile.BadZipFile,
 )  # fmt: skip
-"""What a file that is cut off, damaged or made up can raise, read by zipfile and NumPy."""
 NOT_PLAIN = "it must hold truth values, numbers or text"
-_PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")
-"""Types of arrays that are read: truth values, numbers, text."""
+_PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")  #: Types of arrays that are read: truth values, numbers, text.
 
 
 def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -186,12 +184,10 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 #
 # A size that has a name is the same wherever the name comes: the first array that has it says what it is, or the caller.
 
-LARGEST = 1e30
-"""No number is larger, so that squares stay finite."""
+LARGEST = 1e30  #: No number is larger, so that squares stay finite.
 
 _WORDS = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "b": "truth values", "U": "text"}
-_CLOSE = 1e-6
-"""Quaternions of poses are of unit length up to this."""
+_CLOSE = 1e-6  #: Quaternions of poses are of unit length up to this.
 
 
 @dataclass(frozen=True)

@@ -19,17 +19,14 @@ from rbpf.core.genealogy import History
 from rbpf.core.particles import Estimate, Prior, Proposed
 from rbpf.lie import Finite, LieGroup, Product
 
-WINDOW = 20
-"""Steps with observations that a sign must last for, in most of them."""
-LARGE = 4.0
-"""Normalised innovation squared per degree of freedom; the median of a consistent filter is 0.45 to 1."""
+WINDOW = 20  #: Steps with observations that a sign must last for, in most of them.
+LARGE = 4.0  #: Normalised innovation squared per degree of freedom; the median of a consistent filter is 0.45 to 1.
+#: The same over all that was measured, where the noise is stated twice as large as it is; and of how many numbers at
+#: least.
 SMALL, ENOUGH = 0.25, 200.0
-"""The same over all that was measured, where the noise is stated twice as large as it is; and of how many numbers at least."""
-FEW = 0.02
-"""Fraction of the particles that is next to none of them, but two at least."""
+FEW = 0.02  #: Fraction of the particles that is next to none of them, but two at least.
 EVIDENCE_SIGMA = 6.0
-EVERY = 10
-"""Steps from one count of distinct states to the next."""
+EVERY = 10  #: Steps from one count of distinct states to the next.
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,12 @@ from rbpf.errors import InputError
 from rbpf.kernels import forest
 from rbpf.ranges import require_memory
 
+#: Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time.
 _FIRST_CHECK = 4
-"""Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time."""
 
-_MEMORY_CHECK = 64
-"""Steps between two looks at whether the paths still fit."""
+_MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
 
-DUE = integers("due", 2, least=0)
-"""Of a `Schedule`."""
+DUE = integers("due", 2, least=0)  #: Of a `Schedule`.
 
 _FOREST = {
     "parent": integers("nodes", least=-1, below="nodes"),
@@ -57,10 +55,10 @@ class Lineage:
         self._free = np.concatenate([self._free, np.zeros(n, dtype=np.int64)])
         self._identity = np.arange(n)
         self._cache: dict[int, np.ndarray] = {}
+        #: Of each retained generation, its nodes as they were last looked through, by row.
         self._members: dict[int, np.ndarray] = {}
-        """Of each retained generation, its nodes as they were last looked through, by row."""
+        #: Generations of which one row has all descendants: it always will, and the trunk need not be climbed again.
         self._settled: dict[int, int] = {}
-        """Generations of which one row has all descendants: it always will, and the trunk need not be climbed again."""
 
     @property
     def nodes(self) -> int:

@@ -122,8 +122,8 @@ def squared_mahalanobis(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
     return np.square(white).sum(axis=-1)
 
 
+#: Cost of an impossible pair: far above any log-density, and finite because the assignment solver wants numbers.
 _FORBIDDEN = 1e12
-"""Cost of an impossible pair: far above any log-density, and finite because the assignment solver wants numbers."""
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,7 @@ class Association(NamedTuple):
     cov: np.ndarray  #: (M, p, p).
 
 
-WIDTH = 50
-"""Explanations of the first measurements of a frame that are followed, at most."""
+WIDTH = 50  #: Explanations of the first measurements of a frame that are followed, at most.
 
 
 def associations(

@@ -13,8 +13,8 @@ from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
 EVERYTHING = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
+#: Variance at which log|2πS| is zero: a row of it, with zero residual and Jacobian, says nothing.
 _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
-"""Variance at which log|2πS| is zero: a row of it, with zero residual and Jacobian, says nothing."""
 
 
 def numeric_jacobians(

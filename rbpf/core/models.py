@@ -25,34 +25,29 @@ from rbpf.errors import InputError
 from rbpf.kernels.signature import ObservationKernel
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 
+#: Step of central differences, where truncation and rounding errors balance.
 STEP = float(np.finfo(float).eps) ** (1 / 3)
-"""Step of central differences, where truncation and rounding errors balance."""
 
-Control = TypeVar("Control", contravariant=True)
-"""What a motion model moves by, as odometry."""
-Frame = TypeVar("Frame", contravariant=True)
-"""What a sensor takes, as an image."""
+Control = TypeVar("Control", contravariant=True)  #: What a motion model moves by, as odometry.
+Frame = TypeVar("Frame", contravariant=True)  #: What a sensor takes, as an image.
 
-RigidSpace = SE2Group | SE3Group | Euclidean
-"""Poses that points are seen from; of Euclidean(n), places."""
+RigidSpace = SE2Group | SE3Group | Euclidean  #: Poses that points are seen from; of Euclidean(n), places.
 States = Float[np.ndarray, "*#batch E"]
 Means = Float[np.ndarray, "*#batch D"] | None
 Constants = Float[np.ndarray, "*#batch A"] | None
+#: What is observed, with leading axes that broadcast: states, landmarks, their constants and substates.
 Substates = Float[np.ndarray, "*#batch m"] | None
-"""What is observed, with leading axes that broadcast: states, landmarks, their constants and substates."""
 Measured = Float[np.ndarray, "*#batch p"]
 Result = Float[np.ndarray, "*batch p"]
 Covariances = Float[np.ndarray, "*#batch p p"]
 Ids = Int[np.ndarray, " K"]
 Z = Float[np.ndarray, "K p"]
 CovZ = Float[np.ndarray, "K p p"]
+#: K landmarks or measurements of one step, and the measurements' covariances.
 Moments = tuple[Float[np.ndarray, "*K D"], Float[np.ndarray, "*K d d"]]
-"""K landmarks or measurements of one step, and the measurements' covariances."""
 
-NULL = -1
-"""An observation that a particle takes as clutter."""
-NEW = -2
-"""An observation that a particle takes as the first of a new landmark."""
+NULL = -1  #: An observation that a particle takes as clutter.
+NEW = -2  #: An observation that a particle takes as the first of a new landmark.
 
 
 class Part(str):
@@ -285,8 +280,9 @@ class Landmark(ABC):
     dim: int
     constants: int = 0
     components: int = 1
+    #: Whether the estimate is in a frame of its own, world_from_anchor (E,), which its constants are; else in the
+    #: world.
     anchored: bool = False
-    """Whether the estimate is in a frame of its own, world_from_anchor (E,), which its constants are; else in the world."""
 
     @abstractmethod
     def homogeneous(
@@ -348,10 +344,9 @@ class Likelihood(ABC):
     """Log-density of an innovation ν with covariance S; `normalised` says whether it integrates to one."""
 
     normalised: bool = True
+    #: Whether some observations are taken for outliers, as of another thing than they are said to be of.
     rejects: bool = False
-    """Whether some observations are taken for outliers, as of another thing than they are said to be of."""
-    kernel_id: int = -1
-    """Number of the compiled twin in `rbpf.kernels.gate`, called with `params`; −1 has none."""
+    kernel_id: int = -1  #: Number of the compiled twin in `rbpf.kernels.gate`, called with `params`; −1 has none.
     params: np.ndarray = np.zeros(1)
 
     @abstractmethod
@@ -386,8 +381,8 @@ class Likelihood(ABC):
 class Sensor(ABC, Generic[Frame]):
     """Raw data → observations, given the predicted belief; then new landmarks."""
 
+    #: The map that holds its landmarks, where a filter has several; the belief's `map` is that one.
     part: Part = Part.LANDMARK
-    """The map that holds its landmarks, where a filter has several; the belief's `map` is that one."""
 
     @abstractmethod
     def observe(self, frame: Frame, belief: "Belief") -> Sequence[Observations]:
@@ -401,8 +396,7 @@ class Sensor(ABC, Generic[Frame]):
 class LikelihoodSensor(Sensor[Frame]):
     """Weights as they are: log p(frame | state) of any form, of the sampled states alone."""
 
-    normalised: bool = True
-    """Whether it is a density of the frame, as the evidence must be."""
+    normalised: bool = True  #: Whether it is a density of the frame, as the evidence must be.
 
     @abstractmethod
     def log_likelihood(self, frame: Frame, state: Float[np.ndarray, "N E"]) -> Float[np.ndarray, " N"]:
@@ -413,15 +407,14 @@ class LikelihoodSensor(Sensor[Frame]):
         return [Observations.raw(partial(self.log_likelihood, frame), Part.STATE, self.normalised)]
 
 
+#: What the observations say about the increment relative to the prior's mean, linearised at increments (N, d).
 LineariseAt = Callable[[Float[np.ndarray, "N d"]], Information]
-"""What the observations say about the increment relative to the prior's mean, linearised at increments (N, d)."""
 
 
 class Proposal(ABC):
     """q(x_t | x_{t-1}, z_t, u_t): where the particles are sampled."""
 
-    exact: bool = True
-    """Whether samples are corrected by w₂ = p(z|x) p(x|x⁻) / (q(x) w₁); E06 takes w₂ := 1."""
+    exact: bool = True  #: Whether samples are corrected by w₂ = p(z|x) p(x|x⁻) / (q(x) w₁); E06 takes w₂ := 1.
 
     @abstractmethod
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
@@ -436,12 +429,9 @@ class Conditional(ABC):
     kept between `predict` and `correct` has a row per particle and is resampled, too.
     """
 
-    supplies: Part
-    """Its name in the filter. Observations come here whose `part` it is, or else whose model reads it."""
-    also: frozenset[Part] = frozenset()
-    """What it supplies besides."""
-    takes_raw: bool = False
-    """Whether `information` and `correct` understand groups of raw data."""
+    supplies: Part  #: Its name in the filter. Observations come here whose `part` it is, or else whose model reads it.
+    also: frozenset[Part] = frozenset()  #: What it supplies besides.
+    takes_raw: bool = False  #: Whether `information` and `correct` understand groups of raw data.
 
     @abstractmethod
     def begin(self, n: int, lineage: Lineage) -> None:

@@ -17,10 +17,9 @@ from rbpf.arrays import Float, Int
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
+#: Fields of `Information` that add up over independent observations.
 SUMMED = "info", "vector", "quad", "log_det", "log_factor", "rows"
-"""Fields of `Information` that add up over independent observations."""
-NOTHING_MOVED = 1e-12
-"""χ² below which weights differ by rounding alone."""
+NOTHING_MOVED = 1e-12  #: χ² below which weights differ by rounding alone.
 
 
 @dataclass

@@ -12,8 +12,7 @@ from rbpf.core.models import Resampler
 from rbpf.core.particles import effective_sample_size
 from rbpf.errors import InputError
 
-_ROUNDING = 1e-12
-"""Relative error within which weights count as equal, and N W as whole."""
+_ROUNDING = 1e-12  #: Relative error within which weights count as equal, and N W as whole.
 
 
 def _inverse_cdf(weights: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -6,14 +6,11 @@ from numba import njit
 
 _STEEP = math.tan(math.pi / 8)
 _QUARTER = 0.5 * math.pi
+#: π/2 to 33 bits (W. Cody and W. Waite, 1980): its product with a whole number below 2²⁰ is exact.
 _QUARTER_HIGH = 1.57079632673412561417
-"""π/2 to 33 bits (W. Cody and W. Waite, 1980): its product with a whole number below 2²⁰ is exact."""
-_QUARTER_REST = 6.07710050650619224932e-11
-"""π/2 less that."""
-_PAIRS = 10
-"""Pairs of terms of arctan: the first one left out, z²⁰/41 with z ≤ tan²(π/8), is 1e−17."""
-_NESTED = 8
-"""Terms of sine and cosine: the first ones left out, (π/4)¹⁷/17! and (π/4)¹⁸/18!, are below 5e−17."""
+_QUARTER_REST = 6.07710050650619224932e-11  #: π/2 less that.
+_PAIRS = 10  #: Pairs of terms of arctan: the first one left out, z²⁰/41 with z ≤ tan²(π/8), is 1e−17.
+_NESTED = 8  #: Terms of sine and cosine: the first ones left out, (π/4)¹⁷/17! and (π/4)¹⁸/18!, are below 5e−17.
 
 
 @njit(cache=True, error_model="numpy", inline="always")

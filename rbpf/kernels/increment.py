@@ -9,8 +9,7 @@ from rbpf.kernels import dense
 from rbpf.kernels.block import add_squares, cholesky, packed, whiten_vector
 from rbpf.kernels.signature import BLOCK, CUBE, MATRIX, READ_ONLY, READ_ONLY_CUBE, VECTOR
 
-_SINGULAR = 1e-12
-"""The same as `rbpf.gaussian.psd_factor`'s: a pivot below this fraction of its variance is none."""
+_SINGULAR = 1e-12  #: The same as `rbpf.gaussian.psd_factor`'s: a pivot below this fraction of its variance is none.
 
 
 @njit(cache=True, error_model="numpy")

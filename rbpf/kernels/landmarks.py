@@ -38,8 +38,8 @@ from rbpf.kernels.signature import (
 )
 
 RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
+#: Types of (pool, slabs, which, maps) and of (z, noise, mask, kernel_id, kernel_params), see `refine`.
 OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
-"""Types of (pool, slabs, which, maps) and of (z, noise, mask, kernel_id, kernel_params), see `refine`."""
 
 
 @njit(

@@ -19,8 +19,7 @@ from numba import njit, void
 
 from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY
 
-TINY = 1e-300
-"""Added to θ², so that no division sees zero: its root is far below any angle that changes a result."""
+TINY = 1e-300  #: Added to θ², so that no division sees zero: its root is far below any angle that changes a result.
 
 _TERMS = 10
 _C = tuple((-1) ** k / math.factorial(2 * k + 3) for k in range(_TERMS))

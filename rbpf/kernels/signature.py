@@ -11,29 +11,28 @@ from numba import cfunc, float64, int64, types, void
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+#: Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache.
 BLOCK = 128
-"""Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache."""
 
+#: Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double.
 FACTORS_PER_LOG = 18
-"""Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double."""
 
+#: Particle-observation pairs worth a thread: a quarter of a millisecond of work, far above a wake-up.
 PAIRS_PER_THREAD = 8192
-"""Particle-observation pairs worth a thread: a quarter of a millisecond of work, far above a wake-up."""
 
 VECTOR = types.Array(float64, 1, "C")
 MATRIX = types.Array(float64, 2, "C")
 CUBE = types.Array(float64, 3, "C")
 HYPERCUBE = types.Array(float64, 4, "C")
-READ_ONLY = types.Array(float64, 2, "C", readonly=True)
-"""A matrix that is not written: the caller's may be locked."""
+READ_ONLY = types.Array(float64, 2, "C", readonly=True)  #: A matrix that is not written: the caller's may be locked.
 READ_ONLY_CUBE = types.Array(float64, 3, "C", readonly=True)
 INDICES = types.Array(int64, 1, "C")
 INDEX_MATRIX = types.Array(int64, 2, "C")
 MASK = types.Array(types.boolean, 2, "C")
 
 _SIGNATURE = void(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE)
+#: First-class function type: the drivers call a kernel through a pointer, so they compile once for all models.
 KERNEL_TYPE = types.FunctionType(_SIGNATURE)
-"""First-class function type: the drivers call a kernel through a pointer, so they compile once for all models."""
 
 
 @final
@@ -41,10 +40,8 @@ class ObservationKernel:
     """A compiled kernel; the drivers take its address, a plain number, which costs nothing to hand over."""
 
     def __init__(self, compiled: Any) -> None:
-        self.compiled = compiled
-        """Numba's object, which owns the machine code."""
-        self.address = int(compiled.address)
-        """Where the machine code starts."""
+        self.compiled = compiled  #: Numba's object, which owns the machine code.
+        self.address = int(compiled.address)  #: Where the machine code starts.
 
 
 @intrinsic

@@ -16,8 +16,8 @@ from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, Tan
 Complex = NDArray[np.complex128]
 
 _TURN = 2.0 * np.pi
+#: Added to theta^2, so that no division sees zero: its root is far below any angle that changes a result.
 _TINY = 1e-300
-"""Added to theta^2, so that no division sees zero: its root is far below any angle that changes a result."""
 _C_SERIES = [(-1) ** k / factorial(2 * k + 3) for k in range(10)]
 
 

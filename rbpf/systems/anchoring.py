@@ -30,8 +30,8 @@ from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 from rbpf.maps.landmark_map import LandmarkMap
 
+#: A landmark that owes more than this fraction of its information to the first frame says nothing about the start.
 _MOST_OF_ALL = 0.999
-"""A landmark that owes more than this fraction of its information to the first frame says nothing about the start."""
 # Names in a checkpoint, of the parts of the first motion and of the latest re-estimation.
 _SECOND, _LATEST = ("second", "state", "delta", "factor"), ("latest", "latest_mean", "latest_factor")
 

@@ -11,13 +11,13 @@ from rbpf.errors import InputError
 from rbpf.ranges import SettingError, former_names
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
 
+#: What a config.yaml says about the run besides its settings.
 HEADER = (
     "rbpf", "system", "versions", "input_sha256",
     "recording", "known_points", "board", "square_m", "calibration", "known_map", "localize",
     "aruco", "marker_m", "gap_m", "dictionary", "image_topic", "truth_topic", "video", "batch",
     "start_s", "end_s", "every", "resize_px", "scanner", "max_range", "upside_down",
 )  # fmt: skip
-"""What a config.yaml says about the run besides its settings."""
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

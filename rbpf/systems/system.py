@@ -27,29 +27,28 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 
+#: Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds.
 MAP_IDS = "map/ids"
-"""Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds."""
 
+#: Frames of the particles' paths that are kept where neither the settings nor a recording's length say how many.
 LAG = 150
-"""Frames of the particles' paths that are kept where neither the settings nor a recording's length say how many."""
 
+#: What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
+#: it is the same up to a rigid motion; up to a motion and a scale.
 Gauge = Literal["none", "first frame", "rigid", "similarity"]
-"""What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
-it is the same up to a rigid motion; up to a motion and a scale."""
 
 
 class TrackingState(StrEnum):
     """Whether the pose of a frame can be relied on."""
 
+    #: There is a pose, but earlier ones may still be revised: the scale or the first depths are not settled.
     INITIALISING = "initialising"
-    """There is a pose, but earlier ones may still be revised: the scale or the first depths are not settled."""
-    TRACKED = "tracked"
-    """The frame was measured and agrees with the map."""
+    TRACKED = "tracked"  #: The frame was measured and agrees with the map.
+    #: The frame gave no information, or not enough: the pose is the motion model's or the odometry's.
     PREDICTED = "predicted"
-    """The frame gave no information, or not enough: the pose is the motion model's or the odometry's."""
+    #: The frame was measured, but the map does not say where the camera is: the pose is the last trusted one, or goes
+    #: on from it as assumed.
     LOST = "lost"
-    """The frame was measured, but the map does not say where the camera is: the pose is the last trusted one, or goes on
-    from it as assumed."""
 
 
 @dataclass(frozen=True)

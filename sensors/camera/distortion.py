@@ -18,14 +18,11 @@ import numpy as np
 
 from rbpf.arrays import Bool, Float
 
+#: Errors of `undistort`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted.
 SETTLED, SOLVED = 1e-14, 1e-12
-"""Errors of `undistort`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted."""
-STALLED = 0.999
-"""A step that leaves more of the error than this has no solution ahead."""
-ARMIJO = 0.25
-"""Fraction of the decrease promised by the derivative that a step has to keep (L. Armijo 1966)."""
-ITERATIONS, HALVINGS = 60, 20
-"""Of Newton's method, for both lenses, and of one of its steps."""
+STALLED = 0.999  #: A step that leaves more of the error than this has no solution ahead.
+ARMIJO = 0.25  #: Fraction of the decrease promised by the derivative that a step has to keep (L. Armijo 1966).
+ITERATIONS, HALVINGS = 60, 20  #: Of Newton's method, for both lenses, and of one of its steps.
 
 
 @final
@@ -140,13 +137,11 @@ def inverse(matrix: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batc
     return adjugate / _determinant(matrix)[..., None, None]
 
 
+#: Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.forward` begins to bend: (u, v)
+#: and its errors grow without bound towards 90°.
 MAX_ANGLE = np.deg2rad(75.0)
-"""Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.forward` begins to bend: (u, v)
-and its errors grow without bound towards 90°."""
-NEAR = 1e-16
-"""Squared distance from the axis below which the lens is its own tangent, to rounding."""
-ANGLE_SETTLED = 1e-15
-"""A step of the angle, relative to 1, that ends the iteration of `undistort`."""
+NEAR = 1e-16  #: Squared distance from the axis below which the lens is its own tangent, to rounding.
+ANGLE_SETTLED = 1e-15  #: A step of the angle, relative to 1, that ends the iteration of `undistort`.
 
 
 @final

@@ -14,10 +14,9 @@ from rbpf.kernels.se3 import cross, rotation
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
 from rbpf.sensors.camera.distortion import NEAR
 
-KIND = 9
-"""Place of the lens in `Pinhole.params`, the last one: 0 radial-tangential, 1 equidistant."""
+KIND = 9  #: Place of the lens in `Pinhole.params`, the last one: 0 radial-tangential, 1 equidistant.
+#: Pixel of a point and its Jacobian by rows: (px, py, d00, d01, d02, d10, d11, d12).
 Projected = tuple[float, float, float, float, float, float, float, float]
-"""Pixel of a point and its Jacobian by rows: (px, py, d00, d01, d02, d10, d11, d12)."""
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -70,8 +69,7 @@ def project_equidistant(x: float, y: float, z: float, params: np.ndarray) -> Pro
     return px, py, d00, d01, -(d00 * u + d01 * v), d10, d11, -(d10 * u + d11 * v)
 
 
-MIN_DEPTH_FRACTION = 0.2
-"""The same as `rbpf.sensors.camera.points.MIN_DEPTH_FRACTION`; the tests compare them."""
+MIN_DEPTH_FRACTION = 0.2  #: The same as `rbpf.sensors.camera.points.MIN_DEPTH_FRACTION`; the tests compare them.
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -315,10 +313,8 @@ def in_view(place, first_pose, alive, pose, params, limits, rows, px):
     return count
 
 
-HEADER = KIND + 1
-"""Parameters before the points: the camera's."""
-_SMALL = 1e-2
-"""θ² below which the series of the coefficients are exact to rounding with the terms kept."""
+HEADER = KIND + 1  #: Parameters before the points: the camera's.
+_SMALL = 1e-2  #: θ² below which the series of the coefficients are exact to rounding with the terms kept.
 
 
 @njit(cache=True, error_model="numpy", inline="always")

@@ -17,8 +17,8 @@ from rbpf.sensors.camera.distortion import Equidistant, RadialTangential, invers
 
 Lens = RadialTangential | Equidistant
 
+#: By the name of their model of distortion; each has its number, `kind`, that the compiled twin reads.
 LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidistant": Equidistant}
-"""By the name of their model of distortion; each has its number, `kind`, that the compiled twin reads."""
 
 
 @final

@@ -17,10 +17,9 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
-Given = Array | None
-"""What a model may read, see `ObservationModel`."""
+Given = Array | None  #: What a model may read, see `ObservationModel`.
+#: Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside.
 MIN_DEPTH_FRACTION = 0.2
-"""Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside."""
 
 
 class CameraModel(ObservationModel):

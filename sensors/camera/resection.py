@@ -9,10 +9,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, skew
 from rbpf.sensors.camera import Pinhole
 
-FLAT = 1e-3
-"""Points whose second spread is below this fraction of the first lie on a line."""
-TRIPLES = 20
-"""Triples of points that are tried; four points have four."""
+FLAT = 1e-3  #: Points whose second spread is below this fraction of the first lie on a line.
+TRIPLES = 20  #: Triples of points that are tried; four points have four.
 
 
 def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
@@ -78,8 +76,7 @@ def _matrix(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return matrix
 
 
-ROUNDS = 10
-"""Of Gauss-Newton; points are taken in and out before each."""
+ROUNDS = 10  #: Of Gauss-Newton; points are taken in and out before each.
 
 
 @dataclass(frozen=True)
@@ -120,10 +117,9 @@ def _exact(points: np.ndarray, px: np.ndarray) -> "Sights":
     return Sights(points, np.zeros_like(points), px, np.ones(len(px)))
 
 
-GATE = 9.2
-"""Squared Mahalanobis distance within which a point agrees: 99 % of two dimensions."""
+GATE = 9.2  #: Squared Mahalanobis distance within which a point agrees: 99 % of two dimensions.
+#: Of each round of Gauss-Newton, and of the result: a first guess may be some pixels off everywhere.
 GATES = tuple(GATE * wider for wider in (16.0, 16.0, 4.0, 4.0, 1.0, 1.0, 1.0, 1.0, 1.0))
-"""Of each round of Gauss-Newton, and of the result: a first guess may be some pixels off everywhere."""
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import numpy as np
 
 from rbpf.sensors.features.interface import Detector, checked_image
 
-WINDOW_PX = 9
-"""The score looks at 9 × 9 px: a template of 11 × 11 px without its border."""
+WINDOW_PX = 9  #: The score looks at 9 × 9 px: a template of 11 × 11 px without its border.
 _FAST_RADIUS_PX = 3
 
 

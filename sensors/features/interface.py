@@ -15,10 +15,10 @@ import numpy as np
 
 from rbpf.errors import InputError
 
+#: Scale of a keypoint whose SIFT descriptor covers a window of 31 × 31 px; that of corners, which have none.
 WINDOW_SCALE_PX = 2.0
-"""Scale of a keypoint whose SIFT descriptor covers a window of 31 × 31 px; that of corners, which have none."""
+#: Windows described on one sheet are set apart by copies of their borders: a descriptor may blur the image first.
 SHEET_PAD_PX = 6
-"""Windows described on one sheet are set apart by copies of their borders: a descriptor may blur the image first."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,7 @@ class Detector(ABC):
     A subclass proposes candidates and scores them; `detect`, which is the same for all, chooses among them.
     """
 
-    margin_px: int = 0
-    """What `candidates` needs of the image around a keypoint."""
+    margin_px: int = 0  #: What `candidates` needs of the image around a keypoint.
 
     @abstractmethod
     def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -123,8 +122,7 @@ class Detector(ABC):
 class Descriptor(ABC):
     """Describes keypoints, so that they are found again without knowing where to look."""
 
-    length: int
-    """Entries of a descriptor."""
+    length: int  #: Entries of a descriptor.
 
     @abstractmethod
     def describe(self, image: np.ndarray, keypoints: Keypoints) -> np.ndarray:
@@ -156,8 +154,7 @@ class Descriptor(ABC):
 class FeatureExtractor(ABC):
     """Finds keypoints and describes them."""
 
-    length: int
-    """Entries of a descriptor."""
+    length: int  #: Entries of a descriptor.
 
     @abstractmethod
     def extract(self, image: np.ndarray) -> Features:

@@ -21,8 +21,7 @@ import numpy as np
 from rbpf.ranges import CountOrNone, NotNegative, Range, Ranged
 from rbpf.sensors.features.interface import Descriptor, FeatureExtractor, Features, Keypoints, checked_image
 
-_SIGMA = 1.6
-"""Blur of the first image of an octave; OpenCV's default, which is Lowe's."""
+_SIGMA = 1.6  #: Blur of the first image of an octave; OpenCV's default, which is Lowe's.
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat
 from rbpf.sensors.readers.text import quoted, read_bytes
 from rbpf.sensors.readers.victoria_park import VictoriaPark
 
+#: The first that recognises a recording reads it.
 ROBOT_LOGS: tuple[RobotLogFormat, ...] = (Mrpt(), Mrclam(), VictoriaPark())
-"""The first that recognises a recording reads it."""
+#: The first that recognises a recording reads it.
 IMAGES: tuple[ImageFormat, ...] = (RosBag(), Tum(), Euroc(), Kitti(), SevenScenes(), Photos(), Video(), Folder())
-"""The first that recognises a recording reads it."""
 _log = logging.getLogger(__name__)
 
 

@@ -45,17 +45,16 @@ from rbpf.sensors.readers.images.bag import SUFFIXES, Bag, numbers_of, opened
 from rbpf.sensors.readers.part import WHOLE, Part
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_number, parse_time, quoted
 
+#: Messages of a CARMEN log that hold scans; the first that a log has is read where none is named.
 SCANNERS = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER", "ROBOTLASER2", "RAWLASER2")
-"""Messages of a CARMEN log that hold scans; the first that a log has is read where none is named."""
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
-LATE_NS = 1_000_000_000
-"""A scan may be written so much after one of a later time."""
+LATE_NS = 1_000_000_000  #: A scan may be written so much after one of a later time.
 
 _FAR_M, _MILLIMETRES_M = 80.0, (8.18, 8.2)
+#: For a mirrored scanner so many turns [rad] are looked at, so far apart; two scans see one wall so near to each other.
 _TURNS, _TURNED, _NEAR_M, _WALL_M = 50, 0.2, 2.0, 0.2
-"""For a mirrored scanner so many turns [rad] are looked at, so far apart; two scans see one wall so near to each other."""
 _HEAD = ("type", "start angle", "field of view", "angular resolution", "maximum range", "accuracy", "remission mode")
 _POSES = ("x", "y", "theta", "odometry's x", "odometry's y", "odometry's theta")
 _log = logging.getLogger(__name__)
@@ -99,8 +98,7 @@ class ScansOfFile:
 class LaserFormat(ABC):
     """A format of recordings of a scanner; `LASERS` lists all of them."""
 
-    kind: str
-    """What it is and which files make it, for messages."""
+    kind: str  #: What it is and which files make it, for messages.
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:
@@ -512,5 +510,4 @@ def _pose(message: Any) -> Array | None:
     return np.asarray(SE3.normalise(pose))
 
 
-LASERS: tuple[LaserFormat, ...] = (LaserBag(), Carmen())
-"""The first that recognises a recording reads it."""
+LASERS: tuple[LaserFormat, ...] = (LaserBag(), Carmen())  #: The first that recognises a recording reads it.

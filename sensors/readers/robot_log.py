@@ -19,10 +19,8 @@ from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.ranges import NotNegative, Positive, Ranged
 from rbpf.sensors.readers.text import Table
 
-UNNAMED = -1
-"""In place of a landmark's name where it is not known which one was observed."""
-_ROUNDING = 1e-5
-"""Of a covariance's printed digits, relative."""
+UNNAMED = -1  #: In place of a landmark's name where it is not known which one was observed.
+_ROUNDING = 1e-5  #: Of a covariance's printed digits, relative.
 
 
 @dataclass(frozen=True)
@@ -105,8 +103,7 @@ class LogNoise(Ranged):
 class RobotLogFormat(ABC):
     """A format of robot logs; `rbpf.sensors.readers.formats` lists all of them."""
 
-    kind: str
-    """What it is and which files make it, for messages."""
+    kind: str  #: What it is and which files make it, for messages.
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import Array
 
-MOST_BYTES = 1 << 30
-"""No table of a recording is larger."""
+MOST_BYTES = 1 << 30  #: No table of a recording is larger.
 LARGEST = 1e12
 LATEST_S = 4e9
 

@@ -30,8 +30,7 @@ KIND = "the readings of a robot's wheels"
 MOTION = ("dx_m", "dy_m", "dyaw_rad")
 SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_yaw_rad")
 
-UNIT = 1e-6
-"""How far a quaternion's length may be from 1."""
+UNIT = 1e-6  #: How far a quaternion's length may be from 1.
 
 
 @dataclass(frozen=True)

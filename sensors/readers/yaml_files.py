@@ -10,10 +10,8 @@ import yaml
 from rbpf.errors import InputError
 from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_text
 
-DEEPEST = 20
-"""Lists and mappings within each other."""
-MOST_BYTES = 1 << 20
-"""Settings and calibrations are a few kilobytes."""
+DEEPEST = 20  #: Lists and mappings within each other.
+MOST_BYTES = 1 << 20  #: Settings and calibrations are a few kilobytes.
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from rbpf.systems.laser.config import LaserConfig
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, FILTER_COLUMNS, Column, Recorded, System, Tracked, TrackingState
 
-BARELY = 0.1
-"""A scan that fits its map less than this, of 1, says nothing of where the robot is."""
+BARELY = 0.1  #: A scan that fits its map less than this, of 1, says nothing of where the robot is.
 
 _STATE = {
     "pose": elements(SE2),
@@ -52,8 +51,7 @@ class ScanMatching(Proposal):
 
     def __init__(self, grid: GridMap, beams: np.ndarray) -> None:
         self.grid, self.beams = grid, beams
-        self.fit = 0.0
-        """How well the scan fits there, of 1, a mean over the particles."""
+        self.fit = 0.0  #: How well the scan fits there, of 1, a mean over the particles.
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
         proposed, fit = self.grid.match(prior, self.beams)

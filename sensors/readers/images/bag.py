@@ -47,13 +47,12 @@ from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageS
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 
-MOST_BYTES = 1 << 30
-"""No chunk of a bag is larger once it is unpacked."""
+MOST_BYTES = 1 << 30  #: No chunk of a bag is larger once it is unpacked.
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
+#: Where a message begins with a header: after four bytes, in both versions of ROS, seconds and nanoseconds.
 _LITTLE, _BIG = Struct("<4xII"), Struct(">4xII")
-"""Where a message begins with a header: after four bytes, in both versions of ROS, seconds and nanoseconds."""
 _LAYOUTS = {
     "mono8": (1, np.uint8, None),
     "8UC1": (1, np.uint8, None),
@@ -67,21 +66,18 @@ _LAYOUTS = {
         for pattern in ("rggb", "bggr", "gbrg", "grbg")
         for bits, kind in ((8, np.uint8), (16, np.uint16))
     },
-}
-"""Encoding to channels, type of their values, and OpenCV's way to grey, None where it is grey."""
+}  #: Encoding to channels, type of their values, and OpenCV's way to grey, None where it is grey.
+#: Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero.
 _RADIAL_TANGENTIAL = "plumb_bob", "rational_polynomial"
-"""Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero."""
-_EQUIDISTANT = "equidistant", "fisheye"
-"""Models with k1, k2, k3, k4: ROS's name and OpenCV's."""
+_EQUIDISTANT = "equidistant", "fisheye"  #: Models with k1, k2, k3, k4: ROS's name and OpenCV's.
 _POSES = {
     "geometry_msgs/msg/PoseStamped": "pose",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
     "nav_msgs/msg/Odometry": "pose.pose",
     "geometry_msgs/msg/TransformStamped": "transform",
-}
-"""Where a message holds its pose."""
+}  #: Where a message holds its pose.
+#: A message of ROS 1 that the library does not bring along: its definition and its name.
 _TRANSFORMS = "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
-"""A message of ROS 1 that the library does not bring along: its definition and its name."""
 _log = logging.getLogger(__name__)
 
 
@@ -103,8 +99,8 @@ class Bag:
         self._ros1 = path.suffix == ".bag" and path.is_file()
         # A file that was not summed up counts none at all.
         counted = any(c.msgcount for c in reader.connections)
+        #: Types of the topics that hold messages, by their names.
         self.topics: dict[str, str] = {c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted}
-        """Types of the topics that hold messages, by their names."""
 
     @property
     def name(self) -> str:

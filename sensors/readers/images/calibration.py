@@ -26,8 +26,8 @@ KIND = (
     "(`rbpf calibrate` makes one)"
 )
 
+#: What `model` may be, and the model of distortion that it means.
 MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"}
-"""What `model` may be, and the model of distortion that it means."""
 _REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")
 

@@ -96,8 +96,7 @@ def _to_8_bits(path: Path | str, image: np.ndarray) -> Grey:
     return image
 
 
-AHEAD = 4
-"""Images that are decoded before they are asked for."""
+AHEAD = 4  #: Images that are decoded before they are asked for.
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from rbpf.sensors.readers.images.poses import pose_of_matrix, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import line_error, parse_number, read_columns, read_stamped, read_text
 
-ALIGNED_PX = 1e-2
-"""How far intrinsics of the two cameras of a pair may differ."""
+ALIGNED_PX = 1e-2  #: How far intrinsics of the two cameras of a pair may differ.
 _PAIRS = ((0, 1), (2, 3))
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
 

@@ -10,10 +10,9 @@ from rbpf.lie import SE3, Array
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.text import read_stamped
 
+#: How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more.
 SKEWED = 0.02
-"""How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more."""
-LONGEST = 0.01
-"""How far a quaternion's length may be from 1 in a file; it is then scaled to 1."""
+LONGEST = 0.01  #: How far a quaternion's length may be from 1 in a file; it is then scaled to 1.
 
 
 def rigid_motion_error(matrix: Array) -> str | None:

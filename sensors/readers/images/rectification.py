@@ -16,14 +16,12 @@ from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 
+#: The baseline lies along the rows by this fraction of its length at least; beyond, most of the view is lost.
 BESIDE = 0.7
-"""The baseline lies along the rows by this fraction of its length at least; beyond, most of the view is lost."""
-OUTSIDE = -10.0
-"""A column and a row that no image has: what is drawn from there is black."""
-ALIKE_PX = 1e-2
-"""How far intrinsics of a rectified pair may differ: rounding, and no more than an image can show."""
+OUTSIDE = -10.0  #: A column and a row that no image has: what is drawn from there is black.
+ALIKE_PX = 1e-2  #: How far intrinsics of a rectified pair may differ: rounding, and no more than an image can show.
+#: How far the axes of a rectified pair may be rotated, and how far off the rows the baseline may point, relative to it.
 ROTATED_RAD, ASIDE = 1e-4, 1e-2
-"""How far the axes of a rectified pair may be rotated, and how far off the rows the baseline may point, relative to it."""
 
 
 @final

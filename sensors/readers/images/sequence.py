@@ -12,8 +12,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
 
-TOLERANCE_S = 0.005
-"""Two images whose times differ by no more were taken together."""
+TOLERANCE_S = 0.005  #: Two images whose times differ by no more were taken together.
 
 
 @dataclass(frozen=True)
@@ -139,12 +138,9 @@ class ReadOptions:
 class ImageFormat(ABC):
     """A format of image sequences; `rbpf.sensors.readers.formats` lists all of them."""
 
-    kind: str
-    """What it is and which files make it, for messages."""
-    stereo_kind: str = ""
-    """The same of a recording of two cameras; empty where the format has one camera only."""
-    has_topics: bool = False
-    """Whether streams in it have names."""
+    kind: str  #: What it is and which files make it, for messages.
+    stereo_kind: str = ""  #: The same of a recording of two cameras; empty where the format has one camera only.
+    has_topics: bool = False  #: Whether streams in it have names.
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:

@@ -30,8 +30,7 @@ from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageS
 
 SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv", ".y4m"})
 
-_ROUNDING_NS = 1_000_000
-"""Containers round times to milliseconds."""
+_ROUNDING_NS = 1_000_000  #: Containers round times to milliseconds.
 _ACTION = "convert it, or copy it again if its end is missing"
 
 
