@@ -35,10 +35,9 @@ from rbpf.kernels.signature import run_driver
 from rbpf.lie import LieGroup
 from rbpf.maps.store import Layout, SharedStore
 
-STATE = frozenset({Part.STATE})
-MAP = frozenset({Part.LANDMARK})
-BOTH = STATE | MAP  #: What observations update.
-
+#: What observations update.
+STATE, MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
+BOTH = STATE | MAP
 #: Numbers (K,) of the parametrisations of landmarks (K,), -1 where the map holds none.
 Kinds = Callable[[np.ndarray], np.ndarray]
 

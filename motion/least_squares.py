@@ -26,15 +26,11 @@ State = TypeVar("State")
 
 #: x → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is senseless.
 Evaluate = Callable[[State], tuple[Array, Array]]
-
 Retract = Callable[[State, Array], State]  #: x moved by ξ (d,).
-
 #: A singular value below this fraction of the largest counts as this fraction: its direction is not determined.
 SINGULAR = 1e-7
-
 #: A decrease below this fraction of the squared residuals is not worth a step, nor certain to be found.
 ROUNDING = 1e-12
-
 STUCK = 1e8  #: Damping at this multiple of the largest singular value leaves no step.
 
 

@@ -13,7 +13,6 @@ from rbpf.kernels.se3 import cross, exp_pair, multiply, turned, unit
 
 #: Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open.
 STIFFNESS = 1e-9
-
 FLAT = 1e-12  #: Shortest length that is divided by: points that coincide have no direction.
 
 

@@ -21,7 +21,6 @@ from rbpf.errors import InputError
 
 #: Of any number of which no range says otherwise: larger ones are slips, and their squares spoil what they enter.
 LARGEST = 1e9
-
 MOST = 10**7  #: Particles, landmarks or images: more than any machine holds.
 
 

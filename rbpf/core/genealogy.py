@@ -17,9 +17,7 @@ from rbpf.ranges import require_memory
 
 #: Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time.
 _FIRST_CHECK = 4
-
 _MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
-
 DUE = integers("due", 2, least=0)  #: Of a `Schedule`.
 
 _FOREST = {

@@ -27,23 +27,21 @@ from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 
 #: Step of central differences, where truncation and rounding errors balance.
 STEP = float(np.finfo(float).eps) ** (1 / 3)
-
 Control = TypeVar("Control", contravariant=True)  #: What a motion model moves by, as odometry.
 Frame = TypeVar("Frame", contravariant=True)  #: What a sensor takes, as an image.
-
 RigidSpace = SE2Group | SE3Group | Euclidean  #: Poses that points are seen from; of Euclidean(n), places.
+#: What is observed, with leading axes that broadcast: states, landmarks, their constants and substates.
 States = Float[np.ndarray, "*#batch E"]
 Means = Float[np.ndarray, "*#batch D"] | None
 Constants = Float[np.ndarray, "*#batch A"] | None
-#: What is observed, with leading axes that broadcast: states, landmarks, their constants and substates.
 Substates = Float[np.ndarray, "*#batch m"] | None
 Measured = Float[np.ndarray, "*#batch p"]
 Result = Float[np.ndarray, "*batch p"]
 Covariances = Float[np.ndarray, "*#batch p p"]
+#: K landmarks or measurements of one step, and the measurements' covariances.
 Ids = Int[np.ndarray, " K"]
 Z = Float[np.ndarray, "K p"]
 CovZ = Float[np.ndarray, "K p p"]
-#: K landmarks or measurements of one step, and the measurements' covariances.
 Moments = tuple[Float[np.ndarray, "*K D"], Float[np.ndarray, "*K d d"]]
 
 NULL = -1  #: An observation that a particle takes as clutter.

@@ -37,8 +37,8 @@ from rbpf.kernels.signature import (
     kernel_at,
 )
 
-RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
 #: Types of (pool, slabs, which, maps) and of (z, noise, mask, kernel_id, kernel_params), see `refine`.
+RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
 OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
 
 

@@ -11,13 +11,12 @@ from rbpf.arrays import Float, Like
 
 Array = NDArray[np.float64]
 
-#: Elements (..., E), as they are given.
-States = Like[ArrayLike, "*#batch {self.size}"]
-#: Tangent vectors (..., d), as they are given.
-Tangents = Like[ArrayLike, "*#batch {self.dim}"]
+States = Like[ArrayLike, "*#batch {self.size}"]  #: Elements (..., E), as they are given.
+Tangents = Like[ArrayLike, "*#batch {self.dim}"]  #: Tangent vectors (..., d), as they are given.
+#: Results: (..., E), (..., d) and (..., d, d).
 StateArray = Float[np.ndarray, "*batch {self.size}"]
 TangentArray = Float[np.ndarray, "*batch {self.dim}"]
-TangentMatrix = Float[np.ndarray, "*batch {self.dim} {self.dim}"]  #: Results: (..., E), (..., d) and (..., d, d).
+TangentMatrix = Float[np.ndarray, "*batch {self.dim} {self.dim}"]
 
 _MEAN_ITERATIONS = 50
 _MEAN_TOLERANCE = 1e-14

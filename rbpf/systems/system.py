@@ -29,10 +29,8 @@ from rbpf.systems.map_estimate import MapEstimate
 
 #: Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds.
 MAP_IDS = "map/ids"
-
 #: Frames of the particles' paths that are kept where neither the settings nor a recording's length say how many.
 LAG = 150
-
 #: What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
 #: it is the same up to a rigid motion; up to a motion and a scale.
 Gauge = Literal["none", "first frame", "rigid", "similarity"]

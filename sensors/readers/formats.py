@@ -19,7 +19,6 @@ from rbpf.sensors.readers.victoria_park import VictoriaPark
 
 #: The first that recognises a recording reads it.
 ROBOT_LOGS: tuple[RobotLogFormat, ...] = (Mrpt(), Mrclam(), VictoriaPark())
-#: The first that recognises a recording reads it.
 IMAGES: tuple[ImageFormat, ...] = (RosBag(), Tum(), Euroc(), Kitti(), SevenScenes(), Photos(), Video(), Folder())
 _log = logging.getLogger(__name__)
 
