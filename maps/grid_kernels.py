@@ -287,6 +287,7 @@ def _second_order(field, window, border, side, base, at, beams, steps, state, gr
 #: Types of (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all
 #: zero.
 PLACE = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED
+_SEARCH = void(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, MATRIX, VECTOR, CUBE)
 
 
 @njit(void(*PLACE, VECTOR), parallel=True, cache=True, error_model="numpy")
@@ -310,12 +311,7 @@ def _outward(k):
     return (k + 1) // 2 if k % 2 else -(k // 2)
 
 
-@njit(
-    void(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, MATRIX, VECTOR, CUBE),
-    parallel=True,
-    cache=True,
-    error_model="numpy",
-)
+@njit(_SEARCH, parallel=True, cache=True, error_model="numpy")
 def search(
     state, beams, side, origin, index, pool, stamps, fields, marks, info, radius, spacing, steps, few, rest,
     increment, value, hessian,

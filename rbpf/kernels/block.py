@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
+from rbpf.kernels.se3 import rotation
 from rbpf.kernels.signature import BLOCK
 
 
@@ -66,6 +67,23 @@ def load_record(pool, slab, rows, start, count, mean, cov, const):
 def flat(array):
     """A block's rows end to end: row m starts at m · BLOCK, a constant that lets the compiler tell rows apart."""
     return array.reshape(array.size)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def store_by_state(a0, a1, a2, x, y, z, row, i):
+    """A row of ∂z/∂ξ, flat, from that of the slope a at a point (x, y, z) of the moving frame: a × p, then −a."""
+    row[i] = a1 * z - a2 * y
+    row[BLOCK + i] = a2 * x - a0 * z
+    row[2 * BLOCK + i] = a0 * y - a1 * x
+    row[3 * BLOCK + i] = -a0
+    row[4 * BLOCK + i] = -a1
+    row[5 * BLOCK + i] = -a2
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def rotation_at(pose, i):
+    """Rotation of lane i."""
+    return rotation(pose[i], pose[BLOCK + i], pose[2 * BLOCK + i], pose[3 * BLOCK + i])
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,6 +10,7 @@ from rbpf.kernels.block import add_squares, cholesky, packed, whiten_vector
 from rbpf.kernels.signature import BLOCK, CUBE, MATRIX, READ_ONLY, READ_ONLY_CUBE, VECTOR
 
 _SINGULAR = 1e-12  #: The same as `rbpf.gaussian.psd_factor`'s: a pivot below this fraction of its variance is none.
+_POSTERIOR = void(CUBE, MATRIX, VECTOR, VECTOR, CUBE, MATRIX, CUBE, VECTOR, VECTOR)
 
 
 @njit(cache=True, error_model="numpy")
@@ -79,12 +80,7 @@ def _store(inverse, linear, start, count, mean, root):
             mean[start + i, a] = total
 
 
-@njit(
-    void(CUBE, MATRIX, VECTOR, VECTOR, CUBE, MATRIX, CUBE, VECTOR, VECTOR),
-    parallel=True,
-    cache=True,
-    error_model="numpy",
-)
+@njit(_POSTERIOR, parallel=True, cache=True, error_model="numpy")
 def posterior(info, vector, quad, log_det, factor, mean, root, log_w1, nis):
     """Whitened refined Gaussian: u ~ N(M⁻¹Lᵀη, M⁻¹), M = I + LᵀΛL, and the joint marginal log w₁.
 

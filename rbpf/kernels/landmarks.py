@@ -40,14 +40,12 @@ from rbpf.kernels.signature import (
 #: Types of (pool, slabs, which, maps) and of (z, noise, mask, kernel_id, kernel_params), see `refine`.
 RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
 OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
+_REFINE = void(int64, VECTOR, MATRIX, *RECORDS, *OBSERVED, CUBE, INDICES, CUBE, MATRIX, VECTOR, VECTOR, VECTOR)
+_UPDATE = void(int64, VECTOR, MATRIX, *RECORDS, INDICES, *OBSERVED, INDICES, VECTOR)
+_PROJECT = void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE)
 
 
-@njit(
-    void(int64, VECTOR, MATRIX, *RECORDS, *OBSERVED, CUBE, INDICES, CUBE, MATRIX, VECTOR, VECTOR, VECTOR),
-    parallel=True,
-    cache=True,
-    error_model="numpy",
-)
+@njit(_REFINE, parallel=True, cache=True, error_model="numpy")
 def refine(
     address, params, state, pool, slabs, which, maps, z, noise, mask, kernel_id, kernel_params, factor, sizes,
     info, vector, quad, log_det, rows,
@@ -131,12 +129,7 @@ def _store_record(pool, slab, source, rows, start, count, mean, cov):
                 pool[slab, f, start + i] = pool[source, f, rows[start + i]]
 
 
-@njit(
-    void(int64, VECTOR, MATRIX, *RECORDS, INDICES, *OBSERVED, INDICES, VECTOR),
-    parallel=True,
-    cache=True,
-    error_model="numpy",
-)
+@njit(_UPDATE, parallel=True, cache=True, error_model="numpy")
 def update(
     address, params, state, pool, slabs, which, maps, targets, z, noise, mask, kernel_id, kernel_params, sizes,
     log_density,
@@ -225,9 +218,7 @@ def _add_between(weights, offset, mean, cov):
             cov[a, b] = cov[b, a] = total
 
 
-@njit(
-    void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE), cache=True, error_model="numpy"
-)
+@njit(_PROJECT, cache=True, error_model="numpy")
 def project(address, params, state, pool, slabs, which, maps, anchor, weights, factor, sizes, mean, cov):
     """Fills `mean` (K, p), relative to `anchor` (K, p), and `cov` (K, p, p) = within + between particles.
 

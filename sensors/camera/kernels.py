@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numba import boolean, int64, njit, types
 
-from rbpf.kernels.block import flat
-from rbpf.kernels.se3 import cross, rotation
+from rbpf.kernels.block import flat, rotation_at, store_by_state
+from rbpf.kernels.se3 import back, cross, rotation, times
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
 from rbpf.sensors.camera.distortion import NEAR
 
@@ -79,33 +79,13 @@ def clamp_depth(x, y, z):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def store_by_state(a0, a1, a2, x, y, z, row, i):
-    """One row a = (a0, a1, a2) of the slope at c = (x, y, z): a × c by rotation, −a by translation."""
-    row[i] = a1 * z - a2 * y
-    row[BLOCK + i] = a2 * x - a0 * z
-    row[2 * BLOCK + i] = a0 * y - a1 * x
-    row[3 * BLOCK + i] = -a0
-    row[4 * BLOCK + i] = -a1
-    row[5 * BLOCK + i] = -a2
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _rotation_at(pose, i):
-    """Rotation of lane i."""
-    return rotation(pose[i], pose[BLOCK + i], pose[2 * BLOCK + i], pose[3 * BLOCK + i])
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def locate(pose, point, n, place):
     """Points in the camera's frame, their depth kept positive, into the first three rows of `place`."""
     for i in range(n):
-        r = _rotation_at(pose, i)
+        r = rotation_at(pose, i)
         a, b = point[i] - pose[4 * BLOCK + i], point[BLOCK + i] - pose[5 * BLOCK + i]
-        c = point[2 * BLOCK + i] - pose[6 * BLOCK + i]
-        x = r[0] * a + r[3] * b + r[6] * c
-        y = r[1] * a + r[4] * b + r[7] * c
-        place[i], place[BLOCK + i] = x, y
-        place[2 * BLOCK + i] = clamp_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+        x, y, z = back(r, a, b, point[2 * BLOCK + i] - pose[6 * BLOCK + i])
+        place[i], place[BLOCK + i], place[2 * BLOCK + i] = x, y, clamp_depth(x, y, z)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -135,11 +115,9 @@ def measure(place, z0, z1, params, n, nu, across, down):
 def turn(pose, row, n, by_point):
     """One row by the point, a Rᵀ, from the −a in the row by the state."""
     for i in range(n):
-        r = _rotation_at(pose, i)
+        r = rotation_at(pose, i)
         a0, a1, a2 = -row[3 * BLOCK + i], -row[4 * BLOCK + i], -row[5 * BLOCK + i]
-        by_point[i] = a0 * r[0] + a1 * r[1] + a2 * r[2]
-        by_point[BLOCK + i] = a0 * r[3] + a1 * r[4] + a2 * r[5]
-        by_point[2 * BLOCK + i] = a0 * r[6] + a1 * r[7] + a2 * r[8]
+        by_point[i], by_point[BLOCK + i], by_point[2 * BLOCK + i] = times(r, a0, a1, a2)
 
 
 @observation_kernel
@@ -188,11 +166,9 @@ def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 def _turn_ray(pose, anchor, row, n, by_ray):
     """One row by (u, v, ρ) from the −a in the row by the state."""
     for i in range(n):
-        r, s = _rotation_at(pose, i), _rotation_at(anchor, i)
+        r, s = rotation_at(pose, i), rotation_at(anchor, i)
         a0, a1, a2 = -row[3 * BLOCK + i], -row[4 * BLOCK + i], -row[5 * BLOCK + i]
-        e0 = a0 * r[0] + a1 * r[1] + a2 * r[2]
-        e1 = a0 * r[3] + a1 * r[4] + a2 * r[5]
-        e2 = a0 * r[6] + a1 * r[7] + a2 * r[8]
+        e0, e1, e2 = times(r, a0, a1, a2)
         by_ray[i] = e0 * s[0] + e1 * s[3] + e2 * s[6]
         by_ray[BLOCK + i] = e0 * s[1] + e1 * s[4] + e2 * s[7]
         by_ray[2 * BLOCK + i] = (
@@ -219,15 +195,13 @@ def _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     across, down = flat(jac_state[0]), flat(jac_state[1])
     # As `locate`, of directions R_a (u, v, 1) + ρ (t_a − t).
     for i in range(n):
-        r, s = _rotation_at(pose, i), _rotation_at(anchor, i)
+        r, s = rotation_at(pose, i), rotation_at(anchor, i)
         u, v, rho = ray[i], ray[BLOCK + i], ray[2 * BLOCK + i]
         a = s[0] * u + s[1] * v + s[2] + rho * (anchor[4 * BLOCK + i] - pose[4 * BLOCK + i])
         b = s[3] * u + s[4] * v + s[5] + rho * (anchor[5 * BLOCK + i] - pose[5 * BLOCK + i])
         c = s[6] * u + s[7] * v + s[8] + rho * (anchor[6 * BLOCK + i] - pose[6 * BLOCK + i])
-        x = r[0] * a + r[3] * b + r[6] * c
-        y = r[1] * a + r[4] * b + r[7] * c
-        by_ray[i], by_ray[BLOCK + i] = x, y
-        by_ray[2 * BLOCK + i] = clamp_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+        x, y, depth = back(r, a, b, c)
+        by_ray[i], by_ray[BLOCK + i], by_ray[2 * BLOCK + i] = x, y, clamp_depth(x, y, depth)
     measure(by_ray, z[0], z[1], params, n, flat(nu), across, down)
     _turn_ray(pose, anchor, across, n, by_ray)
     _turn_ray(pose, anchor, down, n, by_ray[3 * BLOCK :])
@@ -379,13 +353,10 @@ def _view(project, state, mean, const, z, params, n, nu, jac_state, jac_landmark
             first = HEADER + 3 * k
             x = (params[first], params[first + 1], params[first + 2])
             t = _turned(a, b, w, x)
-            p0, p1, p2 = t[0] + moved[0], t[1] + moved[1], t[2] + moved[2]
-            u0 = s[0] * p0 + s[1] * p1 + s[2] * p2 + const[4, i] - state[4, i]
-            u1 = s[3] * p0 + s[4] * p1 + s[5] * p2 + const[5, i] - state[5, i]
-            u2 = s[6] * p0 + s[7] * p1 + s[8] * p2 + const[6, i] - state[6, i]
-            c0 = r[0] * u0 + r[3] * u1 + r[6] * u2
-            c1 = r[1] * u0 + r[4] * u1 + r[7] * u2
-            depth = clamp_depth(c0, c1, r[2] * u0 + r[5] * u1 + r[8] * u2)
+            u0, u1, u2 = times(s, t[0] + moved[0], t[1] + moved[1], t[2] + moved[2])
+            u0, u1 = u0 + const[4, i] - state[4, i], u1 + const[5, i] - state[5, i]
+            c0, c1, c2 = back(r, u0, u1, u2 + const[6, i] - state[6, i])
+            depth = clamp_depth(c0, c1, c2)
             px, py, d00, d01, d02, d10, d11, d12 = project(c0, c1, depth, params)
             nu[2 * k, i] = z[2 * k] - px
             nu[2 * k + 1, i] = z[2 * k + 1] - py
@@ -393,18 +364,12 @@ def _view(project, state, mean, const, z, params, n, nu, jac_state, jac_landmark
                 d = (d00, d01, d02) if row == 0 else (d10, d11, d12)
                 out = 2 * k + row
                 store_by_state(d[0], d[1], d[2], c0, c1, depth, flat(jac_state[out]), i)
-                e0 = d[0] * r[0] + d[1] * r[1] + d[2] * r[2]
-                e1 = d[0] * r[3] + d[1] * r[4] + d[2] * r[5]
-                e2 = d[0] * r[6] + d[1] * r[7] + d[2] * r[8]
-                g = (
-                    e0 * s[0] + e1 * s[3] + e2 * s[6],
-                    e0 * s[1] + e1 * s[4] + e2 * s[7],
-                    e0 * s[2] + e1 * s[5] + e2 * s[8],
-                )
+                e0, e1, e2 = times(r, d[0], d[1], d[2])
+                g = back(s, e0, e1, e2)
                 turned = _by_turn(g, a, b, da, db, w, x)
                 carried = _by_turn(g, b, c, db, dc, w, shift)
-                back = (-w[0], -w[1], -w[2])
-                by_shift = _turned(b, c, back, g)
+                against = (-w[0], -w[1], -w[2])
+                by_shift = _turned(b, c, against, g)
                 for f in range(3):
                     jac_landmark[out, f, i] = turned[f] + carried[f]
                     jac_landmark[out, 3 + f, i] = by_shift[f]

@@ -5,8 +5,8 @@ import math
 from numba import njit
 
 from rbpf.kernels.angles import arctan2, cos_sin
-from rbpf.kernels.block import flat
-from rbpf.kernels.se3 import rotation
+from rbpf.kernels.block import flat, rotation_at, store_by_state
+from rbpf.kernels.se3 import back, times
 from rbpf.kernels.signature import BLOCK, observation_kernel
 
 
@@ -75,50 +75,29 @@ def position_planar(state, mean, const, z, params, n, nu, jac_state, jac_landmar
 @njit(cache=True, error_model="numpy", inline="always")
 def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark, i):
     """One row (a0, a1, a2) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
-    d0 = params[0] * a0 + params[1] * a1 + params[2] * a2
-    d1 = params[3] * a0 + params[4] * a1 + params[5] * a2
-    d2 = params[6] * a0 + params[7] * a1 + params[8] * a2
-    start = 6 * row * BLOCK + i
-    jac_state[start] = d1 * p[2] - d2 * p[1]
-    jac_state[start + BLOCK] = d2 * p[0] - d0 * p[2]
-    jac_state[start + 2 * BLOCK] = d0 * p[1] - d1 * p[0]
-    jac_state[start + 3 * BLOCK] = -d0
-    jac_state[start + 4 * BLOCK] = -d1
-    jac_state[start + 5 * BLOCK] = -d2
+    d0, d1, d2 = times(params, a0, a1, a2)
+    store_by_state(d0, d1, d2, p[0], p[1], p[2], jac_state, 6 * row * BLOCK + i)
     start = 3 * row * BLOCK + i
-    jac_landmark[start] = d0 * rotation[0] + d1 * rotation[1] + d2 * rotation[2]
-    jac_landmark[start + BLOCK] = d0 * rotation[3] + d1 * rotation[4] + d2 * rotation[5]
-    jac_landmark[start + 2 * BLOCK] = d0 * rotation[6] + d1 * rotation[7] + d2 * rotation[8]
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _rotation_at(state, i):
-    """Rotation of the robot in lane i."""
-    return rotation(state[i], state[BLOCK + i], state[2 * BLOCK + i], state[3 * BLOCK + i])
+    jac_landmark[start], jac_landmark[start + BLOCK], jac_landmark[start + 2 * BLOCK] = times(rotation, d0, d1, d2)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _locate(state, mean, params, n, point):
     """The landmark in the sensor's frame, into the rows of `point`."""
     for i in range(n):
-        r = _rotation_at(state, i)
+        r = rotation_at(state, i)
         a, b = mean[i] - state[4 * BLOCK + i], mean[BLOCK + i] - state[5 * BLOCK + i]
         c = mean[2 * BLOCK + i] - state[6 * BLOCK + i]
-        x, y = r[0] * a + r[3] * b + r[6] * c - params[9], r[1] * a + r[4] * b + r[7] * c - params[10]
-        z = r[2] * a + r[5] * b + r[8] * c - params[11]
-        point[i] = params[0] * x + params[3] * y + params[6] * z
-        point[BLOCK + i] = params[1] * x + params[4] * y + params[7] * z
-        point[2 * BLOCK + i] = params[2] * x + params[5] * y + params[8] * z
+        x, y, z = back(r, a, b, c)
+        x, y, z = back(params, x - params[9], y - params[10], z - params[11])
+        point[i], point[BLOCK + i], point[2 * BLOCK + i] = x, y, z
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _in_robot(params, a, b, c):
     """A point of the sensor's frame in the robot's."""
-    return (
-        params[0] * a + params[1] * b + params[2] * c + params[9],
-        params[3] * a + params[4] * b + params[5] * c + params[10],
-        params[6] * a + params[7] * b + params[8] * c + params[11],
-    )
+    x, y, z = times(params, a, b, c)
+    return x + params[9], y + params[10], z + params[11]
 
 
 @observation_kernel
@@ -131,7 +110,7 @@ def range_bearing_spatial(state, mean, const, z, params, n, nu, jac_state, jac_l
     _locate(pose, flat(mean), params, n, out)
     for i in range(n):
         x, y, h = out[i], out[BLOCK + i], out[2 * BLOCK + i]
-        rotation, p = _rotation_at(pose, i), _in_robot(params, x, y, h)
+        rotation, p = rotation_at(pose, i), _in_robot(params, x, y, h)
         flat2 = x * x + y * y
         distance2 = flat2 + h * h
         per_flat, per_distance = 1.0 / math.sqrt(flat2), 1.0 / math.sqrt(distance2)
@@ -159,7 +138,7 @@ def position_spatial(state, mean, const, z, params, n, nu, jac_state, jac_landma
     _locate(pose, flat(mean), params, n, out)
     for i in range(n):
         p = _in_robot(params, out[i], out[BLOCK + i], out[2 * BLOCK + i])
-        rotation = _rotation_at(pose, i)
+        rotation = rotation_at(pose, i)
         _store_spatial(0, 1.0, 0.0, 0.0, params, p, rotation, by_state, by_landmark, i)
         _store_spatial(1, 0.0, 1.0, 0.0, params, p, rotation, by_state, by_landmark, i)
         _store_spatial(2, 0.0, 0.0, 1.0, params, p, rotation, by_state, by_landmark, i)
