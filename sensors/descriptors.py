@@ -14,6 +14,7 @@ from typing import Annotated, final
 import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.ranges import Range, Ranged
@@ -169,20 +170,8 @@ def gate_pairs(
     for axis in range(1, z.shape[1]):
         near = np.abs(z[k, axis] - mean[m, axis]) <= reach[m, axis]
         k, m = k[near], m[near]
-    near = _squared(z[k] - mean[m], noise[k] + cov[m]) <= gate
+    near = squared_mahalanobis(z[k] - mean[m], noise[k] + cov[m]) <= gate
     return k[near], held[m[near]]
-
-
-def _squared(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distances (C,) of (C, p) under (C, p, p), by elimination along the pairs; p is 2 or 3."""
-    nu, cov = np.ascontiguousarray(nu.T), np.ascontiguousarray(np.moveaxis(cov, 0, -1))
-    total = np.zeros(nu.shape[1])
-    for j in range(nu.shape[0]):
-        total += nu[j] ** 2 / cov[j, j]
-        factor = cov[j + 1 :, j] / cov[j, j]
-        nu[j + 1 :] -= factor * nu[j]
-        cov[j + 1 :, j + 1 :] -= factor[:, None] * cov[None, j, j + 1 :]
-    return total
 
 
 @final

@@ -1,6 +1,7 @@
 """Sensors of landmarks: numbered by the recording, or associated by maximum likelihood in each particle."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Protocol, final
 
 import numpy as np
@@ -29,6 +30,7 @@ class LandmarkFrame(Protocol):
 
 
 @final
+@dataclass(eq=False)
 class NamedLandmarkSensor(Sensor):
     """Known association: each observation carries the landmark's number, which is its id in the map.
 
@@ -37,20 +39,13 @@ class NamedLandmarkSensor(Sensor):
     contradicts the first is begun anew with it: either may be the wrong one.
     """
 
-    def __init__(
-        self,
-        model: ObservationModel,
-        landmark: Landmark,
-        likelihood: Likelihood | None = None,
-        part: Part = Part.LANDMARK,
-    ) -> None:
-        self.model = model
-        self.landmark = landmark
-        self.part = part
-        self.likelihood = likelihood
-        #: Landmarks that were observed once, by a likelihood that rejects outliers.
-        self.observed_once: set[int] = set()
-        self._contradicted = np.zeros(0, dtype=np.int64)
+    model: ObservationModel
+    landmark: Landmark
+    likelihood: Likelihood | None = None
+    part: Part = Part.LANDMARK
+    #: landmarks that were observed once, by a likelihood that rejects outliers.
+    observed_once: set[int] = field(default_factory=set, init=False)
+    _contradicted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), init=False)
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
         """The observations of landmarks that the map holds."""
@@ -90,6 +85,7 @@ class NamedLandmarkSensor(Sensor):
 
 
 @final
+@dataclass(eq=False)
 class AnonymousLandmarkSensor(Sensor):
     """Unknown association: maximum likelihood per particle with mutual exclusion; spurious landmarks are deleted.
 
@@ -97,21 +93,12 @@ class AnonymousLandmarkSensor(Sensor):
     been seen. Without a likelihood that of the innovation is Gaussian.
     """
 
-    def __init__(
-        self,
-        model: ObservationModel,
-        landmark: Landmark,
-        gates: Gates,
-        existence: ExistenceModel | None = None,
-        likelihood: Likelihood | None = None,
-        part: Part = Part.LANDMARK,
-    ) -> None:
-        self.model = model
-        self.landmark = landmark
-        self.part = part
-        self.gates = gates
-        self.existence = existence or ExistenceModel()
-        self.likelihood = likelihood
+    model: ObservationModel
+    landmark: Landmark
+    gates: Gates
+    existence: ExistenceModel = field(default_factory=ExistenceModel)
+    likelihood: Likelihood | None = None
+    part: Part = Part.LANDMARK
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
         """Every measurement, with each particle's own association."""

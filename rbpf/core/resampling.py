@@ -11,6 +11,7 @@ import numpy as np
 from rbpf.core.models import Resampler
 from rbpf.core.particles import effective_sample_size
 from rbpf.errors import InputError
+from rbpf.ranges import Count, Fraction, Ranged
 
 _ROUNDING = 1e-12  #: Relative error within which weights count as equal, and N W as whole.
 
@@ -86,19 +87,14 @@ class EssTriggered(Resampler):
 
 @final
 @dataclass(frozen=True)
-class Consolidation:
+class Consolidation(Ranged):
     """When what the particles differ by is taken into what is marginalised, in place of resampling."""
 
-    window: int = 5  #: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
-    threshold: float = 0.5  #: fraction of N below which the effective sample size calls for it earlier.
+    #: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
+    window: Count = 5
+    threshold: Fraction = 0.5  #: fraction of N below which the effective sample size calls for it earlier.
     #: not now: while it is not known where the robot is, its frame must not move there.
     held: bool = field(default=False, repr=False)
-
-    def __post_init__(self) -> None:
-        if self.window < 1 or not 0.0 <= self.threshold <= 1.0:
-            raise InputError(
-                f"a window has 1, 2, … steps and a threshold in [0, 1], got {self.window}, {self.threshold}"
-            )
 
     def is_due(self, age: int, weights: np.ndarray) -> bool:
         """After `age` steps, with weights (N,)."""

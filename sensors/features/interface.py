@@ -166,26 +166,18 @@ class FeatureExtractor(ABC):
 
 
 @final
+@dataclass(eq=False)
 class Extractor(FeatureExtractor):
-    """Any detector with any descriptor: at most `count` keypoints of an image.
+    """Any detector with any descriptor."""
 
-    They are `spacing_px` from each other and `border_px` from the image's border.
-    """
+    detector: Detector
+    descriptor: Descriptor
+    count: int = 1000  #: keypoints of an image, at most.
+    spacing_px: float = 5.0  #: from each other, at least.
+    border_px: float = 16.0  #: from the image's border, at least.
 
-    def __init__(
-        self,
-        detector: Detector,
-        descriptor: Descriptor,
-        count: int = 1000,
-        spacing_px: float = 5.0,
-        border_px: float = 16.0,
-    ) -> None:
-        self.detector = detector
-        self.descriptor = descriptor
-        self.length = descriptor.length
-        self.count = count
-        self.spacing_px = spacing_px
-        self.border_px = border_px
+    def __post_init__(self) -> None:
+        self.length = self.descriptor.length
 
     def extract(self, image: np.ndarray) -> Features:
         found = self.detector.detect(image, self.count, None, self.spacing_px, self.border_px)

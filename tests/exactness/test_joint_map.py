@@ -296,5 +296,5 @@ def test_what_a_joint_map_does_not_take(world):
     space = Euclidean(2)
     with pytest.raises(InputError, match="LandmarkMap cannot take in"):
         Filter(Walk(), Scripted(), LandmarkMap(space), n=5, consolidation=Consolidation(1)).step(Frame())
-    with pytest.raises(InputError, match="a window has"):
+    with pytest.raises(InputError, match="window must be a whole number"):
         Consolidation(window=0)
