@@ -89,9 +89,7 @@ class UncertainConstellation(Landmark):
 
     def __init__(self, points: np.ndarray, cov_points: np.ndarray) -> None:
         if points.shape[0] > MOST:
-            raise InputError(
-                f"{points.shape[0]} known points have errors of their own: give at most {MOST}, or exact ones (σ = 0)"
-            )
+            raise InputError(f"{points.shape[0]} known points have errors: give at most {MOST}, or exact ones (σ = 0)")
         self.points = points.tolist()
         self.dim = 3 * points.shape[0]
         self._info_points = np.linalg.inv(cov_points + LEAST * np.eye(3)).tolist()

@@ -98,9 +98,7 @@ class GridMap(Conditional):
         Raises InputError: the prior's increment has a mean of its own, as of a motion that a substate drives.
         """
         if not prior.centred:
-            raise InputError(
-                "scans are matched about a motion whose noise has mean zero, not one that a substate drives"
-            )
+            raise InputError("scans are matched about a motion of mean zero, not one that a substate drives")
         n = prior.base.shape[0]
         cov = (prior.factor @ np.swapaxes(prior.factor, -1, -2)).mean(axis=0)
         radius = 3.0 * np.sqrt(np.diag(cov)) + 1e-9
@@ -254,7 +252,5 @@ def beams_of(group: Observations) -> np.ndarray:
     """The beams (K, 5) of a group. Raises InputError: the data are something else, or not finite."""
     beams = numbers_of(np.asarray(group.data), "a scan")
     if beams.ndim != 2 or beams.shape[1] != 5 or not np.isfinite(beams).all():
-        raise InputError(
-            f"a scan for a grid is beams (K, 5), finite: where each begins, where it ends, and its weight; got {beams.shape}"
-        )
+        raise InputError(f"a scan for a grid is finite beams (K, 5): beginnings, ends, weights; got {beams.shape}")
     return beams

@@ -84,9 +84,7 @@ def minimise(evaluate: Evaluate[State], x: State, retract: Retract[State], rule:
     rule = rule or Rule()
     residual, jac = evaluate(x)
     if jac.shape[0] < jac.shape[1]:
-        raise InputError(
-            f"least squares needs at least as many residuals as unknowns, got {jac.shape[0]} and {jac.shape[1]}"
-        )
+        raise InputError(f"least squares needs as many residuals as unknowns, got {jac.shape[0]} and {jac.shape[1]}")
     if not (np.isfinite(residual).all() and np.isfinite(jac).all()):
         raise InputError("the residuals or their derivative are not finite at the start of least squares")
     if not jac.any():

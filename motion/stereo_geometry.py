@@ -82,7 +82,7 @@ class Matches:
         before, now = (np.ascontiguousarray(z, dtype=float) for z in (z_prev, z_now))
         if before.shape != now.shape or before.shape[1:] != (3,):
             raise InputError(
-                f"matches must be two (K, 3) arrays of (u_left, v, u_right), got {before.shape} and {now.shape}"
+                f"matches must be two (K, 3) arrays (u_left, v, u_right), got {before.shape} and {now.shape}"
             )
         if not (np.isfinite(before).all() and np.isfinite(now).all()):
             raise InputError("the pixels of the matches hold NaN or infinity: leave these matches out")

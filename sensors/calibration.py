@@ -162,9 +162,7 @@ class MarkerBoard:
         if min(self.columns, self.rows) < 1:
             raise InputError(f"a board needs at least 1x1 markers, got {self.columns}x{self.rows}")
         if not (0.0 < self.side_m < np.inf and 0.0 <= self.gap_m < np.inf):
-            raise InputError(
-                f"a marker's side must be positive and the gap not negative, got {self.side_m} m, {self.gap_m} m"
-            )
+            raise InputError(f"a marker's side is positive, the gap not negative, got {self.side_m} m, {self.gap_m} m")
         if self.dictionary not in DICTIONARIES:
             raise InputError(f"there is no dictionary {self.dictionary!r} of markers; known: {', '.join(DICTIONARIES)}")
 

@@ -201,9 +201,7 @@ class DescriptorStore:
         """Adds descriptors (k, d) of new landmarks (k,), whose ids ascend beyond those held; else an InputError."""
         ids = np.asarray(ids, dtype=np.int64)
         if descriptors.shape != (ids.size, self.length):
-            raise InputError(
-                f"descriptors must be ({ids.size}, {self.length}), one for each id, got {descriptors.shape}"
-            )
+            raise InputError(f"descriptors must be ({ids.size}, {self.length}), a row an id, got {descriptors.shape}")
         last = self._ids[self._count - 1 : self._count]
         if (np.diff(np.concatenate([last, ids])) <= 0).any():
             raise InputError("ids of new descriptors must ascend, and be above those held: take the map's own")

@@ -27,9 +27,7 @@ class Scanner:
         if self.angles.ndim != 1 or not self.angles.size or not np.isfinite(self.angles).all():
             raise InputError(f"a scanner needs the angles of its beams, finite numbers (B,), got {self.angles.shape}")
         if not 0.0 <= self.min_range_m < self.max_range_m < np.inf:
-            raise InputError(
-                f"a scanner's ranges must be 0 <= min < max < inf, got {self.min_range_m} m to {self.max_range_m} m"
-            )
+            raise InputError(f"ranges must be 0 <= min < max < inf, got {self.min_range_m} m to {self.max_range_m} m")
         if self.robot_from_sensor.shape != (SE2.size,) or not np.isfinite(self.robot_from_sensor).all():
             raise InputError(f"robot_from_sensor must be ({SE2.size},) finite numbers: {self.robot_from_sensor}")
 

@@ -295,9 +295,7 @@ class Filter:
         errors as `step`; returns the log-likelihood (N,) of the observations.
         """
         if self._draws:
-            raise InputError(
-                f"follow needs a path of Gaussian increments, but {type(self.motion).__name__} draws: see `sample`"
-            )
+            raise InputError(f"follow needs Gaussian increments, but {type(self.motion).__name__} draws: see `sample`")
         stamp_ns, dt = self._clock(stamp_ns)
         state = checked_start(np.asarray(state, dtype=float), self.n, self.space)
         prior, log_weights = self._predict(control, dt), self.particles.log_weights
@@ -526,9 +524,7 @@ def checked_observations(group: Observations) -> Observations:
         )
     updates = group.updates
     if not (isinstance(updates, frozenset) and updates and updates <= {Part.STATE, Part.LANDMARK}):
-        raise InputError(
-            f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both, got {updates}"
-        )
+        raise InputError(f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both: {updates}")
     if Part.STATE not in updates and Part.LANDMARK not in group.model.reads:
         raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
     # The usual case, found out quickly: all is finite and the covariances are positive definite.

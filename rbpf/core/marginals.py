@@ -84,9 +84,7 @@ def log_likelihoods(group: Observations, state: np.ndarray) -> np.ndarray:
     """(N,) of raw data about the states (N, E). Raises InputError: not one number each, or NaN."""
     found = numbers(np.asarray(group.data(state)), "a log-likelihood of the states")  # type: ignore[operator]
     if found.shape != state.shape[:1]:
-        raise InputError(
-            f"a log-likelihood of {state.shape[0]} states must have shape {state.shape[:1]}, got {found.shape}"
-        )
+        raise InputError(f"a log-likelihood of states must be {state.shape[:1]}, got {found.shape}")
     return found
 
 
@@ -121,9 +119,7 @@ class KalmanSubstate(Conditional):
         self._mean = numbers(mean, "the mean of a substate").copy()
         self._cov = numbers(cov, "the cov of a substate").copy()
         if self._cov.shape != (self._mean.size, self._mean.size):
-            raise InputError(
-                f"a substate with mean {self._mean.shape} needs a square cov of that size, got {self._cov.shape}"
-            )
+            raise InputError(f"a substate with mean {self._mean.shape} needs a cov of that size, got {self._cov.shape}")
         gaussian.psd_factor(self._cov)
 
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -140,9 +136,7 @@ class KalmanSubstate(Conditional):
             self._rest = gaussian.symmetrise(dynamics @ self.cov @ dynamics.T + factor @ factor.T)
             return None
         if transition.coupling is None or transition.dynamics is None or transition.drift is None:
-            raise InputError(
-                "the motion model must give coupling, dynamics and drift: the filter has a Kalman substate"
-            )
+            raise InputError("a Kalman substate needs coupling, dynamics and drift of the motion model")
         d, m = space.dim, self._mean.size
         sizes = (transition.coupling.shape[1:], transition.dynamics.shape[1:], transition.drift.shape[1:])
         if sizes != ((d, m), (m, m), (m,)):
@@ -283,9 +277,7 @@ class Marginals(Conditional):
         for name, part in self.parts.items():
             prior = part.predict(transition, space, dt)
             if prior is not None and found is not None:
-                raise InputError(
-                    f"{name} is the second part that drives the motion: hold what drives it in one substate"
-                )
+                raise InputError(f"{name} is a second part that drives the motion: hold them in one substate")
             found = found or prior
         if found is not None:
             return found
@@ -350,9 +342,7 @@ class Marginals(Conditional):
         """By the one part that there is: Gaussians apart from one another lack the correlation that the particles show."""
         parts = [part for part in self.parts.values() if not isinstance(part, StateOnly)]
         if len(parts) != 1:
-            raise InputError(
-                f"particles are consolidated into one Gaussian: give the filter one conditional, not {len(parts)}"
-            )
+            raise InputError(f"consolidation makes one Gaussian: give the filter one conditional, not {len(parts)}")
         return parts[0].consolidate(particles)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -388,9 +378,7 @@ class Marginals(Conditional):
                 what = "raw data are for" if group.data is not None else f"{name} reads"
                 raise InputError(f"{what} a {wanted}, which this filter does not hold")
             if group.data is not None and not holder.takes_raw:
-                raise InputError(
-                    f"{type(holder).__name__} takes no raw data, but groups of rows with an observation model"
-                )
+                raise InputError(f"{type(holder).__name__} takes no raw data, but rows with an observation model")
             routed[holder.supplies].append(group)
         return routed
 

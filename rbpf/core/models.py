@@ -234,9 +234,7 @@ class ObservationModel(ABC):
 
     def invert(self, state: States, z: Measured) -> Float[np.ndarray, "*batch D"]:
         """The landmark (…, D) that would be measured as z (…, p) from the state, for `initialise`."""
-        raise InputError(
-            f"{type(self).__name__} cannot start landmarks: override invert(state, z) or initialise(state, z, cov)"
-        )
+        raise InputError(f"{type(self).__name__} cannot start landmarks: override invert or initialise")
 
     def initialise(self, state: Float[np.ndarray, "N E"], z: Z, cov: CovZ) -> Records:
         """First estimate of landmarks from (N, E), (K, p), (K, p, p).

@@ -64,9 +64,7 @@ def _transition_log_density(
     if density is not None:
         return density
     if draws(motion):
-        raise InputError(
-            f"backward simulation needs the density of {type(motion).__name__}.sample: override log_density"
-        )
+        raise InputError(f"backward simulation needs a density of {type(motion).__name__}.sample: override log_density")
     transition = motion.transition(before, control, dt)
     if transition.coupling is not None and transition.coupling.shape[-1]:
         raise InputError("backward simulation takes motion models without a substate")

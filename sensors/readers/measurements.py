@@ -44,9 +44,7 @@ class Measurements:
 
     def __post_init__(self) -> None:
         if self.recording.splitlines() != [self.recording.strip()]:
-            raise InputError(
-                f"Expected a recording's name on one line without blanks around it, found {self.recording!r}."
-            )
+            raise InputError(f"Expected a name on one line without blanks around it, found {self.recording!r}.")
         if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
             expected = f"a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1"
             raise InputError(f"Expected {expected}, found {self.measurement!r} and {self.pitch_sign!r}.")

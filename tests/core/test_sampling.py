@@ -176,7 +176,7 @@ def test_a_failing_step_leaves_the_generator(rng):
 
 
 def test_what_a_sampled_motion_cannot(rng):
-    with pytest.raises(InputError, match="follow needs a path of Gaussian increments, but Drawn draws"):
+    with pytest.raises(InputError, match="follow needs Gaussian increments, but Drawn draws"):
         sampled(Drawn(), Weights(), rng).follow(np.zeros(2), Z[0])
 
     class Idle(MotionModel):
@@ -231,7 +231,7 @@ def test_backward_simulation_with_a_density_and_without(rng):
     class Mute(Laplace):
         log_density = MotionModel.log_density
 
-    with pytest.raises(InputError, match=r"needs the density of Mute\.sample: override log_density"):
+    with pytest.raises(InputError, match=r"needs a density of Mute\.sample: override log_density"):
         backward_simulation(Mute(), filter_.history, 4, rng)
 
 

@@ -95,7 +95,7 @@ def test_too_few_iterations_are_said():
 @pytest.mark.parametrize(
     ("residual", "jac", "message"),
     [
-        (np.ones(2), np.ones((2, 3)), "at least as many residuals as unknowns, got 2 and 3"),
+        (np.ones(2), np.ones((2, 3)), "needs as many residuals as unknowns, got 2 and 3"),
         (np.array([1.0, np.nan]), np.ones((2, 1)), "not finite at the start"),
         (np.ones(2), np.full((2, 1), np.inf), "not finite at the start"),
         (np.ones(2), np.zeros((2, 1)), "do not depend on the unknowns"),

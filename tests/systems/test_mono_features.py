@@ -311,7 +311,7 @@ def test_more_known_points_than_needed():
     done = run(first_only(one_outside(desk(0, known=5))), SMALL)
     assert np.abs(errors(done)[0]).max() < 0.1
     log = desk(known=13, measurements=30)
-    with pytest.raises(InputError, match="13 known points have errors of their own: give at most 12"):
+    with pytest.raises(InputError, match="13 known points have errors: give at most 12"):
         MonoSlam(log.camera, SMALL, log.known)
     exact = replace(known(log.known), cov=np.zeros((13, 3, 3)))
     done = run(first_only(replace(log, known=exact)), SMALL)

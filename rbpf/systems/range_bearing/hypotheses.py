@@ -155,9 +155,7 @@ class Hypotheses:
         schema = {"log_weights": numbers("hypotheses"), "next": integers(1, least=0)}
         log_weights, following = read(arrays, schema, "hypotheses/").values()
         if not 1 <= log_weights.size <= self.most:
-            raise InputError(
-                f"the array hypotheses/log_weights must have 1 to {self.most} rows, got {log_weights.size}"
-            )
+            raise InputError(f"the array hypotheses/log_weights must have 1 to {self.most} rows: {log_weights.size}")
         held = list[Hypothesis]()
         for i, log_weight in enumerate(log_weights.tolist()):
             place = f"hypotheses/{i}/"

@@ -111,9 +111,7 @@ class Topics:
         """
         names = () if images is None else tuple(name.strip() for name in images.split(","))
         if len(names) > 2 or not all(names) or truth == "":
-            raise InputError(
-                f"expected the name of an image topic, or two as LEFT,RIGHT, got {images!r} and truth {truth!r}"
-            )
+            raise InputError(f"expected an image topic, or two as LEFT,RIGHT, got {images!r} and truth {truth!r}")
         return cls(names, truth)
 
     def entries(self) -> dict[str, str]:

@@ -199,9 +199,7 @@ class LiveCamera:
         import cv2
 
         if calibration is None:
-            raise InputError(
-                f"camera {number} needs --calibration camera.yaml; rbpf calibrate makes it from pictures of a chessboard"
-            )
+            raise InputError(f"camera {number} needs --calibration camera.yaml; `rbpf calibrate` makes one")
         self.name, calibrated = f"camera {number}", read_calibration(calibration)
         self.camera = calibrated.camera
         self._capture: Any = cv2.VideoCapture(number)

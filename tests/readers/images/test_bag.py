@@ -196,7 +196,7 @@ def test_a_bag_without_images(tmp_path):
 
 
 def test_names_of_topics_are_what_config_yaml_says():
-    with pytest.raises(InputError, match="expected the name of an image topic, or two as LEFT,RIGHT"):
+    with pytest.raises(InputError, match="expected an image topic, or two as LEFT,RIGHT"):
         Topics.parse("/a,")
     assert (
         Topics.parse("/a, /b", "/t")
