@@ -155,7 +155,15 @@ class GridMap(Conditional):
         side = self.config.cell_m
         cells.touch(state, beams, side, self.origin, touched)
         # As many at most: what is shared, or not there, in what is written.
-        self._require(int(np.count_nonzero(touched & ((self.index < 0) | (self.users[self.index] > 1)))))
+        count = int(np.count_nonzero(touched & ((self.index < 0) | (self.users[self.index] > 1))))
+        lacking = count - int(np.count_nonzero(self.users == 0))
+        if lacking > 0:
+            more = max(lacking, self.users.size)
+            total = self.users.size + more
+            require_memory(4.0 * total * self.pool[0].size, f"{total} tiles of the map")
+            held, self.pool = self.pool, np.zeros((total, *self.pool.shape[1:]), dtype=np.float32)
+            self.pool[: len(held)] = held  # what is not used yet needs no memory
+            self.users = np.concatenate([self.users, np.zeros(more, dtype=np.int64)])
         cells.own(touched, self.index, self.users, self.pool, np.flatnonzero(self.users == 0))
         cells.insert(state, beams, side, self.origin, self.index, self.pool, self._change)
 
@@ -235,17 +243,6 @@ class GridMap(Conditional):
         y, x = before - low
         self.index[:, y : y + old.shape[1], x : x + old.shape[2]] = old
         self.origin = low
-
-    def _require(self, count: int) -> None:
-        """Makes room for so many more tiles."""
-        free = int(np.count_nonzero(self.users == 0))
-        if free >= count:
-            return
-        more = max(count - free, self.users.size)
-        require_memory(4.0 * (self.users.size + more) * self.pool[0].size, f"{self.users.size + more} tiles of the map")
-        held, self.pool = self.pool, np.zeros((self.users.size + more, *self.pool.shape[1:]), dtype=np.float32)
-        self.pool[: len(held)] = held  # what is not used yet needs no memory
-        self.users = np.concatenate([self.users, np.zeros(more, dtype=np.int64)])
 
 
 def beams_of(group: Observations) -> np.ndarray:

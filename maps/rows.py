@@ -28,7 +28,7 @@ from rbpf.core.models import (
     Part,
     Records,
 )
-from rbpf.core.particles import Information, Prior
+from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import linearise_all, refine, update
 from rbpf.kernels.signature import run_driver
@@ -89,7 +89,11 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
             if log_density != 0.0:
                 count = (ids == outcome).sum(axis=-1)
                 plan.log_factor += np.where(count > 0, log_density, 0.0) * count
-    if _are_simple(named, kinds, plain):
+    # Where all particles agree, no landmark is observed twice and each group's have one plain parametrisation.
+    landmarks = [ids[ids >= 0] for ids in named]
+    seen = np.concatenate([np.zeros(0, dtype=np.int64), *landmarks])
+    agreed = all(ids.ndim == 1 for ids in named) and np.unique(seen).size == seen.size
+    if agreed and all(plain[of].all() and np.unique(of).size <= 1 for of in map(kinds, landmarks)):
         chosen = [np.flatnonzero(ids >= 0) for ids in named]
         plan.batches = [Batch(number, ks, named[number][ks]) for number, ks in enumerate(chosen) if ks.size]
         return plan
@@ -119,15 +123,6 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
             batch.mask = np.ascontiguousarray(mask.T)
         plan.batches.append(batch)
     return plan
-
-
-def _are_simple(named: Sequence[np.ndarray], kinds: Kinds, plain: np.ndarray) -> bool:
-    """Whether all particles agree, no landmark is observed twice and each group's have one plain parametrisation."""
-    landmarks = [ids[ids >= 0] for ids in named]
-    seen = np.concatenate([np.zeros(0, dtype=np.int64), *landmarks])
-    if any(ids.ndim != 1 for ids in named) or np.unique(seen).size < seen.size:
-        return False
-    return all(plain[of].all() and np.unique(of).size <= 1 for of in map(kinds, landmarks))
 
 
 def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
@@ -197,7 +192,9 @@ class RowEngine:
                 [not _likelihood(groups[row.group]).normalised for row in rows],
                 [groups[row.group].model.dim for row in rows],
             )
-            total.log_factor += linearisation.log_normaliser(cov, literal)
+            # ½ log|2πS| of these rows, whose likelihood is no density.
+            chol = gaussian.cholesky(2.0 * np.pi * cov[:, literal][:, :, literal])
+            total.log_factor += 0.5 * gaussian.log_det(chol)
         return total
 
     def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -257,7 +254,7 @@ class RowEngine:
     def _information_numpy(self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior) -> Information:
         _, records = self._read(batch.ids)
         z, noise = group.z[batch.ks], group.cov[batch.ks]
-        parts = []
+        found = Information.zeros(state.shape[0], self.space.dim)
         for part in _spans(state.shape[0], batch.ks.size):
             mean, cov_map, const = _taken(records, part)
             nu, jac = linearise(group.model, self.space, z, state[part, None], mean, const)
@@ -265,8 +262,10 @@ class RowEngine:
             cov = linearisation.innovation_covariance(jac.landmark, cov_map, noise)
             mask = None if batch.mask is None else batch.mask[part]
             likelihood = _likelihood(group)
-            parts.append(linearisation.information(nu, jac.state, cov, likelihood, prior.take(part), mask))
-        return Information.of_parts(parts)
+            told = linearisation.information(nu, jac.state, cov, likelihood, prior.take(part), mask)
+            for name in SUMMED:
+                getattr(found, name)[part] = getattr(told, name)
+        return found
 
     def _correct_once(
         self, batch: Batch, rows: np.ndarray, group: Observations, state: np.ndarray, log_density: np.ndarray

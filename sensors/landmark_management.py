@@ -92,8 +92,17 @@ class LandmarkManager:
         distinct = self.config.distinct
         if distinct is None:
             distinct = DISTINCT.get(descriptors.shape[1], 0.0)
+        # Those of the emptiest cells first, in each cell in their order.
+        cell = self._cell(px)
+        rank, count = (
+            np.zeros(cell.size, dtype=np.int64),
+            np.bincount(self._cell(taken), minlength=self.config.cells**2),
+        )
+        for row, place in enumerate(cell.tolist()):
+            rank[row] = count[place]
+            count[place] += 1
         chosen: list[int] = []
-        for row in self._order(px, taken).tolist():
+        for row in np.argsort(rank, kind="stable").tolist():
             if len(chosen) >= room:
                 break
             # Far enough from what is held, and from others of the frame, in the image and in the descriptor.
@@ -128,16 +137,6 @@ class LandmarkManager:
         self._table, (self.frame, self.next_name) = found["table"], found["counters"].tolist()
         if (np.diff(self.names, append=self.next_name) <= 0).any():
             raise InputError("the names of the landmarks that are counted do not ascend below the next one")
-
-    def _order(self, px: np.ndarray, taken: np.ndarray) -> np.ndarray:
-        """Rows of features, those of the emptiest cells first, in each cell in their order."""
-        cell = self._cell(px)
-        rank = np.zeros(cell.size, dtype=np.int64)
-        count = np.bincount(self._cell(taken), minlength=self.config.cells**2)
-        for row, place in enumerate(cell.tolist()):
-            rank[row] = count[place]
-            count[place] += 1
-        return np.argsort(rank, kind="stable")
 
     def _cell(self, px: np.ndarray) -> np.ndarray:
         column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T

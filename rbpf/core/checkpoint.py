@@ -15,6 +15,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
@@ -211,24 +212,17 @@ class Entry:
 Schema = Mapping[str, Entry]
 
 
-def numbers(*shape: int | str, **options: Any) -> Entry:
-    """Floating-point numbers, see `Entry`."""
-    return Entry(**{"dtype": np.float64, "shape": shape, **options})
+def entry(*shape: int | str, **options: Any) -> Entry:
+    """An array of a shape, see `Entry`."""
+    return Entry(shape=shape, **options)
 
 
-def integers(*shape: int | str, **options: Any) -> Entry:
-    """Whole numbers, see `Entry`."""
-    return Entry(**{"dtype": np.int64, "shape": shape, **options})
-
-
-def truths(*shape: int | str) -> Entry:
-    """Truth values."""
-    return Entry(np.bool_, shape)
-
-
-def grey(*shape: int | str) -> Entry:
-    """Grey levels of images."""
-    return Entry(np.uint8, shape)
+numbers, integers = (
+    partial(entry, dtype=np.float64),
+    partial(entry, dtype=np.int64),
+)  #: Of an `Entry`'s shape and options.
+truths, text = partial(entry, dtype=np.bool_), partial(entry, dtype=np.str_)  #: Likewise.
+grey = partial(entry, dtype=np.uint8)  #: Grey levels of images.
 
 
 def elements(space: LieGroup, *shape: int | str) -> Entry:
@@ -239,11 +233,6 @@ def elements(space: LieGroup, *shape: int | str) -> Entry:
 def poses(*shape: int | str) -> Entry:
     """Elements (…, 7) of SE(3)."""
     return elements(SE3, *shape)
-
-
-def text(*shape: int | str) -> Entry:
-    """Text."""
-    return Entry(np.str_, shape)
 
 
 def read(arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **sizes: int) -> dict[str, np.ndarray]:

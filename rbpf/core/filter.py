@@ -213,8 +213,12 @@ class Filter:
 
         # Resample if it is time: descendants inherit by ancestor, and so do associations of their own.
         if ancestors is not None:
+            fits = ancestors.dtype.kind in "iu" and ancestors.shape == (self.n,)
+            if not fits or ancestors.min() < 0 or ancestors.max() >= self.n:
+                name = type(self.resampler).__name__
+                raise InputError(f"{name} must return {self.n} ancestors in 0..{self.n - 1}, got {ancestors}")
             log_weights = uniform_log_weights(self.n)
-            self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
+            self.lineage.advance(ancestors)
             self.marginals.resample(ancestors)
             if self._draws and proposed.nis is None:
                 # Nothing has looked at what was drawn: each descendant draws anew.
@@ -412,7 +416,10 @@ class Filter:
     def _predict(self, control: object, dt: float) -> Prior:
         state, what = self.particles.state, f"step {self.steps}: {type(self.motion).__name__}"
         if self._draws:
-            state = checked_states(self.motion.sample(state, control, dt, self.rng), state.shape, f"{what}.sample")
+            drawn = numbers(self.motion.sample(state, control, dt, self.rng), f"{what}.sample")
+            if drawn.shape != state.shape or not np.isfinite(drawn).all():
+                raise InputError(f"{what}.sample must return {state.shape} finite numbers, got {drawn.shape}")
+            state = np.ascontiguousarray(drawn)
         substate = self.marginals.driving()
         if substate is None:
             transition = self.motion.transition(state, control, dt)
@@ -497,14 +504,6 @@ def checked_transition(transition: Transition, state: np.ndarray, space: LieGrou
     return transition
 
 
-def checked_states(state: np.ndarray, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """States (N, E) that were drawn. Raises InputError: another shape, or not finite."""
-    state = np.ascontiguousarray(numbers(state, what))
-    if state.shape != shape or not np.isfinite(state).all():
-        raise InputError(f"{what} must return {shape} finite numbers, got {state.shape}")
-    return state
-
-
 def checked_observations(group: Observations) -> Observations:
     """A group as the kernels take it. Raises InputError: z or cov has the wrong shape, is not finite, or is no covariance."""
     if group.data is not None:
@@ -537,15 +536,6 @@ def checked_observations(group: Observations) -> Observations:
     except InputError as error:
         raise InputError(f"the noise of {name} has no covariance: {error}") from error
     return group
-
-
-def checked_ancestors(ancestors: np.ndarray, n: int, resampler: object) -> np.ndarray:
-    """Ancestors (N,) of a resampler; each must be a particle."""
-    whole = ancestors.dtype.kind in "iu"
-    if not whole or ancestors.shape != (n,) or ancestors.min() < 0 or ancestors.max() >= n:
-        name = type(resampler).__name__
-        raise InputError(f"{name} must return {n} ancestors in 0..{n - 1}, got {ancestors}")
-    return ancestors
 
 
 def checked_start(start: np.ndarray, n: int, space: LieGroup) -> np.ndarray:

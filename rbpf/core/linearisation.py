@@ -130,12 +130,6 @@ def information(
     return Information(info, vector, np.square(white_nu).sum(axis=(1, 2)), log_det, log_factor, rows)
 
 
-def log_normaliser(cov: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """½ log|2πS| of some of the stacked rows, (N, p, p) and (p,) bool → (N,)."""
-    chol = gaussian.cholesky(2.0 * np.pi * cov[:, rows][:, :, rows])
-    return 0.5 * gaussian.log_det(chol)
-
-
 def gated(
     nu: np.ndarray,
     jac_state: np.ndarray,

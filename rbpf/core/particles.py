@@ -8,7 +8,6 @@ log-weights is that of S05 (8)–(12).
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -136,14 +135,6 @@ class Information:
     def zeros(cls, n: int, dim: int) -> "Information":
         """No observations."""
         return cls(np.zeros((n, dim, dim)), np.zeros((n, dim)), *np.zeros((4, n)))
-
-    @classmethod
-    def of_parts(cls, parts: list["Information"]) -> "Information":
-        """The same observations, of particles that were taken in several parts."""
-        if len(parts) == 1:
-            return parts[0]
-        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in SUMMED}
-        return cls(**joined)
 
     def add(self, other: "Information") -> None:
         """Adds independent observations, in place."""

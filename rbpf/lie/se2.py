@@ -178,15 +178,12 @@ def _coupling(xi: Array) -> Complex:
     # b = (1 - cos theta) / theta^2 = sum_k (-x)^k / (2k + 2)! of x = theta^2, from the half angle, which does not cancel.
     theta = np.sqrt(squared + _TINY)
     b = 2.0 * np.square(np.sin(0.5 * theta) / theta)
-    return _planar(xi) * (xi[..., 0] * _coefficient_c(squared) - 1j * b)
-
-
-def _coefficient_c(theta_squared: Array) -> Array:
-    """(theta - sin theta) / theta^3 = sum_k (-x)^k / (2k + 3)! of x = theta^2; by the series below 1, where it cancels."""
-    # Clipping keeps the branch that is not taken from overflowing.
-    small, x = np.minimum(theta_squared, 1.0), np.maximum(theta_squared, 1.0)
+    # c = (theta - sin theta) / theta^3 = sum_k (-x)^k / (2k + 3)!, by the series below x = 1, where it cancels; clipping
+    # keeps the branch that is not taken from overflowing.
+    small, large = np.minimum(squared, 1.0), np.maximum(squared, 1.0)
     series = np.full_like(small, _C_SERIES[-1])
     for coefficient in _C_SERIES[-2::-1]:
         series = series * small + coefficient
-    theta = np.sqrt(x)
-    return np.where(theta_squared < 1.0, series, (theta - np.sin(theta)) / (x * theta))
+    theta = np.sqrt(large)
+    c = np.where(squared < 1.0, series, (theta - np.sin(theta)) / (large * theta))
+    return _planar(xi) * (xi[..., 0] * c - 1j * b)

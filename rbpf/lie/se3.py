@@ -86,7 +86,20 @@ class SE3Group(LieGroup):
     def from_matrix(self, m: Like[ArrayLike, "*batch row 4"]) -> Float[np.ndarray, "*batch 7"]:
         """Element of a homogeneous (or 3 x 4) matrix, (..., 4, 4) -> (..., 7), with qw >= 0."""
         m = np.asarray(m, dtype=float)
-        return np.concatenate([_quat_from_matrix(m[..., :3, :3]), m[..., :3, 3]], axis=-1)
+        rotation, swapped = m[..., :3, :3], np.swapaxes(m[..., :3, :3], -1, -2)
+        # All of 4 q q^T is linear in the matrix; its row with the largest diagonal loses no digits.
+        outer = np.empty((*m.shape[:-2], 4, 4))
+        trace = np.trace(rotation, axis1=-2, axis2=-1)
+        outer[..., :3, :3] = rotation + swapped + (1.0 - trace)[..., None, None] * np.eye(3)
+        odd = rotation - swapped
+        outer[..., 3, 0] = outer[..., 0, 3] = odd[..., 2, 1]
+        outer[..., 3, 1] = outer[..., 1, 3] = odd[..., 0, 2]
+        outer[..., 3, 2] = outer[..., 2, 3] = odd[..., 1, 0]
+        outer[..., 3, 3] = 1.0 + trace
+        best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+        quat = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+        quat = quat / np.sqrt(np.square(quat).sum(-1, keepdims=True))
+        return np.concatenate([np.where(quat[..., 3:] < 0.0, -quat, quat), m[..., :3, 3]], axis=-1)
 
     def from_ypr(
         self,
@@ -132,10 +145,7 @@ class SE3Group(LieGroup):
         sign = np.ones(middle.shape)
         sign[..., 2] = np.sign(np.linalg.det(u @ vt))
         rotation = (u * sign[..., None, :]) @ vt
-        matrix = np.zeros((*middle.shape[:-1], 4, 4))
-        matrix[..., :3, :3], matrix[..., 3, 3] = rotation, 1.0
-        matrix[..., :3, 3] = middle - rotation @ centre
-        return self.from_matrix(matrix)
+        return self.from_matrix(np.concatenate([rotation, (middle - rotation @ centre)[..., None]], axis=-1))
 
 
 def _one(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:
@@ -180,23 +190,3 @@ def skew(v: Array) -> Array:
     out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -v[..., 0], -v[..., 1], -v[..., 2]
     return out
-
-
-def _quat_from_matrix(rotation: Array) -> Array:
-    """Unit quaternion with w >= 0 of a rotation matrix, (..., 3, 3) -> (..., 4), order xyzw.
-
-    All of 4 q q^T is linear in the matrix; its row with the largest diagonal loses no digits.
-    """
-    outer = np.empty((*rotation.shape[:-2], 4, 4))
-    trace = np.trace(rotation, axis1=-2, axis2=-1)
-    swapped = np.swapaxes(rotation, -1, -2)
-    outer[..., :3, :3] = rotation + swapped + (1.0 - trace)[..., None, None] * np.eye(3)
-    odd = rotation - swapped
-    outer[..., 3, 0] = outer[..., 0, 3] = odd[..., 2, 1]
-    outer[..., 3, 1] = outer[..., 1, 3] = odd[..., 0, 2]
-    outer[..., 3, 2] = outer[..., 2, 3] = odd[..., 1, 0]
-    outer[..., 3, 3] = 1.0 + trace
-    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    quat = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    quat = quat / np.sqrt(np.square(quat).sum(-1, keepdims=True))
-    return np.where(quat[..., 3:] < 0.0, -quat, quat)

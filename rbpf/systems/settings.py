@@ -39,7 +39,12 @@ def load_settings(
 
     Raises InputError: the file is unreadable, a key does not exist or a value has the wrong type.
     """
-    values = {} if path is None else _read(path, system)
+    values = {} if path is None else read_plain_yaml(path)
+    if not isinstance(values, dict):
+        raise InputError(f"{path} must hold settings as `name: value`, one per line")
+    if (found := values.get("system", system)) != system:
+        raise InputError(f"{path} holds settings of the system {found!r}, not of {system}")
+    values = {name: value for name, value in values.items() if name not in HEADER}
     for pair in pairs:
         _put(values, pair)
     values.update(given)
@@ -53,16 +58,6 @@ def load_settings(
         if isinstance(error.__cause__, SettingError):
             name, words = f"{name}.{error.__cause__.name}".lstrip("."), error.__cause__.words
         raise InputError(f"settings: {name} {words}".replace(" Expected", ": expected")) from error
-
-
-def _read(path: Path, expected: str) -> dict[str, Any]:
-    values = read_plain_yaml(path)
-    if not isinstance(values, dict):
-        raise InputError(f"{path} must hold settings as `name: value`, one per line")
-    system = values.get("system", expected)
-    if system != expected:
-        raise InputError(f"{path} holds settings of the system {system!r}, not of {expected}")
-    return {name: value for name, value in values.items() if name not in HEADER}
 
 
 def _put(values: dict[str, Any], pair: str) -> None:

@@ -38,7 +38,7 @@ def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
         for turn, shift in _p3p(points[list(triple)], uv[list(triple)]):
             matrices.append(_matrix(*cv2.solvePnPRefineLM(points, uv, eye, None, turn.copy(), shift.copy())))
     # Their sums of squared residuals in normalised coordinates; infinite where a point is behind the camera.
-    poses = SE3.inverse(SE3.from_matrix(np.array(matrices).reshape(-1, 4, 4)))
+    poses = SE3.inverse(SE3.from_matrix(np.array(matrices).reshape(-1, 3, 4)))
     seen = SE3.inverse_transform(poses[:, None], points)
     with np.errstate(all="ignore"):
         costs = np.square(seen[..., :2] / seen[..., 2:] - uv).sum(axis=(1, 2))
@@ -55,7 +55,7 @@ def three_point_poses(points: np.ndarray, uv: np.ndarray, triples: int, rng: np.
         rows = rng.choice(points.shape[0], 3, replace=False)
         if np.isfinite(uv[rows]).all():
             matrices += [_matrix(turn, shift) for turn, shift in _p3p(points[rows], uv[rows])]
-    return SE3.inverse(SE3.from_matrix(np.array(matrices).reshape(-1, 4, 4)))
+    return SE3.inverse(SE3.from_matrix(np.array(matrices).reshape(-1, 3, 4)))
 
 
 def _p3p(points: np.ndarray, uv: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -68,12 +68,10 @@ def _p3p(points: np.ndarray, uv: np.ndarray) -> list[tuple[np.ndarray, np.ndarra
 
 
 def _matrix(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """(4, 4) of a rotation vector and a translation as OpenCV gives them."""
+    """(3, 4) of a rotation vector and a translation as OpenCV gives them."""
     import cv2
 
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-    return matrix
+    return np.column_stack([cv2.Rodrigues(turn)[0], shift])
 
 
 ROUNDS = 10  #: Of Gauss-Newton; points are taken in and out before each.

@@ -299,9 +299,15 @@ class _Line(NamedTuple):
             if not (count == int(count) and 0 <= count < len(words) - at):
                 problem = f"expected {count:g} {what} and what follows them, found {len(words) - at} words"
                 raise line_error(path, number, problem)
-            values = words[at : at + int(count)]
-            at += int(count)
-            return _ranges(path, number, what, values)
+            values = np.empty(int(count))  # which may be nan or inf
+            for k in range(values.size):
+                try:
+                    values[k] = float(words[at + k])
+                except ValueError:
+                    wrong = f"expected {what} to be numbers, found {quoted(words[at + k])}"
+                    raise line_error(path, number, wrong) from None
+            at += values.size
+            return values
 
         head = () if old else tuple(take(_HEAD).tolist())
         ranges = take_list("readings")
@@ -354,17 +360,6 @@ def _numbers(path: Path, line: int, names: Iterable[str], words: list[str]) -> A
     if len(words) < len(names):
         raise line_error(path, line, f"expected {names[len(words)]}, found the end of the line")
     return np.array([parse_number(path, line, *pair) for pair in zip(names, words, strict=True)])
-
-
-def _ranges(path: Path, line: int, what: str, words: list[str]) -> Array:
-    """Words as numbers, which may be nan or inf."""
-    values = np.empty(len(words))
-    for k, word in enumerate(words):
-        try:
-            values[k] = float(word)
-        except ValueError:
-            raise line_error(path, line, f"expected {what} to be numbers, found {quoted(word)}") from None
-    return values
 
 
 def _mount(path: Path, name: str, implied: Array, told: Array, rear: bool) -> Array:

@@ -121,9 +121,11 @@ class LaserSlam(System):
 
         # Use the scan if there is something in it, and if the robot has moved.
         state, fit, resampled = TrackingState.PREDICTED, float("nan"), False
+        way, turned, without = self._moved.tolist()
+        far = way >= self.config.distance_m or turned >= self.config.angle_rad
         if len(beams) < self.config.least_beams:
             messages.append(f"{len(beams)} of {len(ranges)} readings came back: the pose is predicted")
-        elif not self._used or self._is_due(stamp_ns):
+        elif not self._used or far or without > 0.0 or (stamp_ns - self._stamps[1]) * 1e-9 >= self.config.seconds:
             proposal = ScanMatching(self.grid, beams) if self._used else None
             resampled, state = self._step(beams, stamp_ns, proposal), TrackingState.TRACKED
             if proposal is not None:
@@ -228,12 +230,6 @@ class LaserSlam(System):
         motion = self.config.motion
         cov = motion.cov(way, turned) + (motion.cov_without(without) if without else 0.0)
         return Odometry(self._since, cov)
-
-    def _is_due(self, stamp_ns: int) -> bool:
-        way, turned, without = self._moved.tolist()
-        seconds = (stamp_ns - self._stamps[1]) * 1e-9
-        far = way >= self.config.distance_m or turned >= self.config.angle_rad
-        return far or without > 0.0 or seconds >= self.config.seconds
 
     def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
         """A step of the filter; whether it resampled."""

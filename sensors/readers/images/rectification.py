@@ -69,9 +69,8 @@ class Rectification:
                 for given, turn, target in zip((left, right), turns, projections, strict=True)
             ]
             rig = RectifiedStereo(Pinhole(*size, fx, fy, cx, cy), -float(projections[1][0, 3]) / fx)
-        back = np.eye(4)
-        back[:3, :3] = turns[0].T
-        return cls(rig, SE3.from_matrix(back), (maps[0], maps[1]))
+        back = SE3.from_matrix(np.column_stack([turns[0].T, np.zeros(3)]))
+        return cls(rig, back, (maps[0], maps[1]))
 
     def frame(self, frame: ImageFrame) -> ImageFrame:
         """The frame with its images rectified."""
@@ -109,9 +108,15 @@ def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, w
     Raises:
         InputError: the right camera is not to the right of the left one.
     """
-    baseline_m = rectified_baseline(sequence.camera, right, left_from_right)
-    if baseline_m is not None:
-        return replace(sequence, baseline_m=baseline_m)
+    # They are a rectified pair already if both have one size and one set of intrinsics, no distortion and equal axes, and
+    # the right one lies to the right of the left one along the rows.
+    left, (along, *across) = sequence.camera, SE3.translation(left_from_right)
+    equal = (
+        (left.width, left.height) == (right.width, right.height) and left.lens.is_identity and right.lens.is_identity
+    )
+    aligned = np.linalg.norm(SE3.log(left_from_right)[:3]) <= ROTATED_RAD and np.linalg.norm(across) <= ASIDE * along
+    if equal and aligned and along > 0.0 and np.abs(left.params - right.params).max() <= ALIKE_PX:
+        return replace(sequence, baseline_m=float(along))
     done = Rectification.between(sequence.camera, right, left_from_right, where)
     truth = sequence.truth
     if truth is not None:
@@ -172,22 +177,3 @@ def _nearest(stamps_ns: np.ndarray, among_ns: np.ndarray) -> tuple[np.ndarray, n
     before = np.maximum(after - 1, 0)
     gap_before, gap_after = np.abs(stamps_ns - among_ns[before]), np.abs(stamps_ns - among_ns[after])
     return np.where(gap_before <= gap_after, before, after), np.minimum(gap_before, gap_after)
-
-
-def rectified_baseline(left: Pinhole, right: Pinhole, left_from_right: Array) -> float | None:
-    """Distance [m] of the cameras of a rectified pair; None where they are not one.
-
-    They are if both have one size and one set of intrinsics, no distortion and equal axes, and the right one lies to the
-    right of the left one along the rows.
-    """
-    if (left.width, left.height) != (right.width, right.height):
-        return None
-    if not (left.lens.is_identity and right.lens.is_identity):
-        return None
-    if np.abs(left.params - right.params).max() > ALIKE_PX:
-        return None
-    along, *across = SE3.translation(left_from_right)
-    rotated = np.linalg.norm(SE3.log(left_from_right)[:3])
-    if rotated > ROTATED_RAD or along <= 0.0 or np.linalg.norm(across) > ASIDE * along:
-        return None
-    return float(along)
