@@ -32,7 +32,7 @@ from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import linearise_all, refine, update
 from rbpf.kernels.signature import run_driver
-from rbpf.lie import LieGroup
+from rbpf.lie import Array, LieGroup
 from rbpf.maps.store import Layout, SharedStore
 
 #: What observations update.
@@ -268,7 +268,7 @@ class RowEngine:
         return found
 
     def _correct_once(
-        self, batch: Batch, rows: np.ndarray, group: Observations, state: np.ndarray, log_density: np.ndarray
+        self, batch: Batch, rows: np.ndarray, group: Observations, state: Array, log_density: Array
     ) -> None:
         ids, ks = batch.ids[rows], batch.ks[rows]
         columns, records = self._read(ids)
@@ -315,9 +315,7 @@ class RowEngine:
         nu, jac_all, noise = linearisation.stacked(nus, jacs, noises, masks)
         return nu, jac_all, records, noise, log_factor, used
 
-    def _correct_joint(
-        self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, log_density: np.ndarray
-    ) -> None:
+    def _correct_joint(self, rows: list[Row], groups: Sequence[Observations], state: Array, log_density: Array) -> None:
         """Stacked where all rows are Gaussian; else one after the other, each with its own likelihood's density.
 
         They are sorted by what was measured, so that the order within a frame does not matter.
@@ -331,7 +329,7 @@ class RowEngine:
         nu, jac, records, noise, _, _ = self._joint(rows, groups, state)
         jac_map = jac[:, None, :, self.space.dim :]
         mean, cov, log_terms = linearisation.updated(
-            nu[:, None], jac_map, records.mean, records.cov, noise[:, None], GAUSSIAN
+            nu[:, None], jac_map, records.mean, records.cov, noise[:, None], GAUSSIAN, None
         )
         log_density += log_terms[:, 0]
         ids = np.array([rows[0].landmark])
@@ -430,14 +428,8 @@ def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state
 
 
 def linearised(
-    model: ObservationModel,
-    space: LieGroup,
-    z: np.ndarray,
-    state: np.ndarray,
-    mean: np.ndarray,
-    const: np.ndarray | None,
-    compiled: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    model: ObservationModel, space: LieGroup, z: Array, state: Array, mean: Array, const: Array | None, compiled: bool
+) -> tuple[Array, Array, Array]:
     """ν (N, K, p), ∂z/∂state (N, K, p, d), ∂z/∂landmark (N, K, p, D) of landmarks (N, K, D) at states (N, E)."""
     (n, k, dim), p = mean.shape, z.shape[1]
     kernel = fused_kernel(model) if compiled else None

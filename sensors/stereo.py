@@ -24,6 +24,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.errors import InputError
+from rbpf.lie import Array
 from rbpf.ranges import Formerly, NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
@@ -71,13 +72,7 @@ class StereoFeatures:
 
     @classmethod
     def measured(
-        cls,
-        rig: RectifiedStereo,
-        z: np.ndarray,
-        cov: np.ndarray,
-        scale: np.ndarray,
-        orientation: np.ndarray,
-        descriptors: np.ndarray,
+        cls, rig: RectifiedStereo, z: Array, cov: Array, scale: Array, orientation: Array, descriptors: np.ndarray
     ) -> "StereoFeatures":
         """Features whose points and their covariances follow from the pixels."""
         points = rig.triangulate(z)
@@ -255,9 +250,7 @@ class StereoMatcher:
         chosen, noise = left.take(matches.first[far]), self.noise(left.scale[matches.first[far]])
         return StereoFeatures.measured(self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors)
 
-    def _refined(
-        self, images: tuple[np.ndarray, np.ndarray], px: np.ndarray, u: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _refined(self, images: tuple[np.ndarray, np.ndarray], px: Array, u: Array) -> tuple[np.ndarray, np.ndarray]:
         """Which places px (K, 2) of the left image are found near columns u (K,) of the right one, and where."""
         config = self.config
         if not (config.refine and u.size):

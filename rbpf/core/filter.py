@@ -48,7 +48,7 @@ from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import Consolidation, EssTriggered, Systematic
 from rbpf.errors import InputError
 from rbpf.kernels.increment import are_sound
-from rbpf.lie import LieGroup
+from rbpf.lie import Array, LieGroup
 from rbpf.ranges import require_memory
 
 
@@ -290,9 +290,7 @@ class Filter:
             new_landmarks=new_landmarks,
         )
 
-    def follow(
-        self, state: np.ndarray, frame: object, control: object = None, stamp_ns: int | None = None
-    ) -> np.ndarray:
+    def follow(self, state: Array, frame: object, control: object = None, stamp_ns: int | None = None) -> Array:
         """A step along given states (E,) or (N, E): what is marginalised is conditioned on them, p(m | x_0:t, z_1:t).
 
         Mapping with known poses, or the maps of paths that were drawn elsewhere. The weights stay as they are. Arguments and

@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from rbpf import gaussian
 from rbpf.core.models import NEW, NULL, Likelihood
 from rbpf.errors import InputError
+from rbpf.lie import Array
 
 
 @final
@@ -181,13 +182,7 @@ WIDTH = 50  #: Explanations of the first measurements of a frame that are follow
 
 
 def associations(
-    z: np.ndarray,
-    noise: np.ndarray,
-    mean: np.ndarray,
-    cov: np.ndarray,
-    gates: Gates,
-    log_unit: np.ndarray,
-    bound: float,
+    z: Array, noise: Array, mean: Array, cov: Array, gates: Gates, log_unit: Array, bound: float
 ) -> list[Association]:
     """The most probable explanations of a frame, best first, Mathematics (association-search).
 

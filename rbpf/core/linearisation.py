@@ -10,7 +10,7 @@ from rbpf.arrays import numbers
 from rbpf.core.models import STEP, Jacobians, Likelihood, ObservationModel, Part
 from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
-from rbpf.lie import LieGroup
+from rbpf.lie import Array, LieGroup
 
 EVERYTHING = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
 #: Variance at which log|2πS| is zero: a row of it, with zero residual and Jacobian, says nothing.
@@ -100,12 +100,7 @@ def innovation_covariance(jac: np.ndarray, cov: np.ndarray, noise: np.ndarray) -
 
 
 def information(
-    nu: np.ndarray,
-    jac_state: np.ndarray,
-    cov: np.ndarray,
-    likelihood: Likelihood,
-    prior: Prior,
-    mask: np.ndarray | None = None,
+    nu: Array, jac_state: Array, cov: Array, likelihood: Likelihood, prior: Prior, mask: np.ndarray | None = None
 ) -> Information:
     """Information of independent observations with innovations ν (N, K, p), H (N, K, p, d), S (N, K, p, p).
 
@@ -131,12 +126,7 @@ def information(
 
 
 def gated(
-    nu: np.ndarray,
-    jac_state: np.ndarray,
-    cov: np.ndarray,
-    likelihood: Likelihood,
-    prior: Prior,
-    mask: np.ndarray | None,
+    nu: Array, jac_state: Array, cov: Array, likelihood: Likelihood, prior: Prior, mask: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which particles take an observation as an inlier (N, K), and the log-density (N,) that this adds.
 
@@ -150,14 +140,8 @@ def gated(
 
 
 def updated(
-    nu: np.ndarray,
-    jac: np.ndarray,
-    mean: np.ndarray,
-    cov_map: np.ndarray,
-    noise: np.ndarray,
-    likelihood: Likelihood,
-    mask: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    nu: Array, jac: Array, mean: Array, cov_map: Array, noise: Array, likelihood: Likelihood, mask: np.ndarray | None
+) -> tuple[Array, Array, Array]:
     """Kalman updates of landmarks at sampled states, and each observation's log p(z | x).
 
     ν (N, K, p), J (N, K, p, D), means (N, K, D), covariances (N, K, D, D), R (K, p, p) → new means, covariances and

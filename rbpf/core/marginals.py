@@ -16,7 +16,7 @@ from rbpf.core.models import NEW, NULL, Belief, Conditional, LineariseAt, LogDen
 from rbpf.core.particles import Information, Particles, Prior, mixture_estimate, take
 from rbpf.errors import InputError
 from rbpf.kernels.increment import conditioned
-from rbpf.lie import LieGroup
+from rbpf.lie import Array, LieGroup
 
 GAUSSIAN = Gaussian()
 Moves = Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -219,9 +219,7 @@ class KalmanSubstate(Conditional):
         if len(self.cov) not in (1, n):
             raise InputError(f"the array substate/cov must have 1 or {n} matrices")
 
-    def _rows(
-        self, state: np.ndarray, substate: np.ndarray, groups: Sequence[Observations]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _rows(self, state: Array, substate: Array, groups: Sequence[Observations]) -> tuple[Array, Array, Array]:
         n, m = substate.shape
         nus, jacs, noises = [], [], []
         for group in groups:

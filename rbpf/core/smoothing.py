@@ -8,7 +8,7 @@ from rbpf import gaussian
 from rbpf.core.genealogy import History
 from rbpf.core.models import MotionModel, draws
 from rbpf.errors import InputError
-from rbpf.lie import LieGroup
+from rbpf.lie import Array, LieGroup
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,7 @@ def backward_simulation(
     return _summary(motion.space, stamps, np.array(paths), np.full(count, 1.0 / count))
 
 
-def _transition_log_density(
-    motion: MotionModel, before: np.ndarray, after: np.ndarray, control: object, dt: float
-) -> np.ndarray:
+def _transition_log_density(motion: MotionModel, before: Array, after: Array, control: object, dt: float) -> Array:
     """Log p(after_j | before_i) up to what does not depend on i, (J, N): Mathematics (backward)."""
     density = motion.log_density(before, after, control, dt)
     if density is not None:

@@ -6,7 +6,7 @@ from itertools import combinations, islice
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3, skew
+from rbpf.lie import SE3, Array, skew
 from rbpf.sensors.camera import Pinhole
 
 FLAT = 1e-3  #: Points whose second spread is below this fraction of the first lie on a line.
@@ -143,9 +143,7 @@ def squared_distances(camera: Pinhole, poses: np.ndarray, sights: Sights) -> np.
     return _compared(camera, poses, sights)[0]
 
 
-def refined_on_all(
-    camera: Pinhole, pose: np.ndarray, sights: Sights, gates: tuple[float, ...] = GATES
-) -> Resected | None:
+def refined_on_all(camera: Pinhole, pose: Array, sights: Sights, gates: tuple[float, ...] = GATES) -> Resected | None:
     """The camera near a first guess world_from_camera (7,) that most points agree on.
 
     Its information is in 1/px², `rms_px` in σ. `gates` are the squared distances within which a point agrees, in each
@@ -169,9 +167,7 @@ def refined_on_all(
     return Resected(pose, information, inliers, float(rms))
 
 
-def _compared(
-    camera: Pinhole, poses: np.ndarray, sights: Sights
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _compared(camera: Pinhole, poses: Array, sights: Sights) -> tuple[Array, Array, Array, Array]:
     """Squared distances (C, M), whitened misses (C, M, 2), points in the camera (C, M, 3), whitening (C, M, 2, 2).
 
     With the image's slope d along the spread, the covariance is S = σ² I + d dᵀ, and S^(−1/2) = (I − k d dᵀ) / σ.

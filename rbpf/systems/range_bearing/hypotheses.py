@@ -18,6 +18,7 @@ from rbpf.core.filter import Filter, StepReport, checked_observations
 from rbpf.core.likelihoods import associations, squared_mahalanobis
 from rbpf.core.models import NEW, NULL, Observations, Part
 from rbpf.errors import InputError
+from rbpf.lie import Array
 from rbpf.maps.joint_map import JointMap
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.feature_log import FeatureFrame
@@ -95,7 +96,7 @@ class Hypotheses:
         self._next = 0
 
     def step(
-        self, z: np.ndarray, cov_z: np.ndarray, control: Odometry | None, stamp_ns: int | None
+        self, z: Array, cov_z: Array, control: Odometry | None, stamp_ns: int | None
     ) -> tuple[np.ndarray, StepReport]:
         """A step of every hypothesis: names (K,), NULL for clutter, and report of the first one, with the evidence of all.
 
