@@ -27,21 +27,9 @@ from rbpf.core.particles import Information, Particles, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import gather, project
 from rbpf.lie import LieGroup
+from rbpf.maps import rows
 from rbpf.maps.point import Point
-from rbpf.maps.rows import (
-    BOTH,
-    MAP,
-    STATE,
-    Plan,
-    RowEngine,
-    checked_new_ids,
-    expected,
-    first_records,
-    fused_kernel,
-    linearised,
-    make_plan,
-    projected,
-)
+from rbpf.maps.rows import BOTH, MAP, STATE
 from rbpf.maps.store import ALL, Layout, SharedStore
 
 
@@ -65,12 +53,12 @@ class LandmarkMap(Map):
         self.evidence = evidence
         self.compiled = compiled
         self.layouts: list[Layout] = []
-        self._planned: tuple[Sequence[Observations], Plan] | None = None
+        self._planned: tuple[Sequence[Observations], rows.Plan] | None = None
 
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n = n
         self.store = SharedStore(n, lineage)
-        self._engine = RowEngine(self.space, self.store, self._layout_of, self.compiled)
+        self._engine = rows.RowEngine(self.space, self.store, self._layout_of, self.compiled)
 
     @property
     def ids(self) -> np.ndarray:
@@ -91,7 +79,7 @@ class LandmarkMap(Map):
         return self.store.columns.kinds(ids) == self._kind(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        records = first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
+        records = rows.first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
@@ -103,7 +91,7 @@ class LandmarkMap(Map):
         kind = self._kind(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
         count = columns.shape[0]
-        ids = checked_new_ids(ids, count, self.store.columns.next_id, self.holds)
+        ids = rows.checked_new_ids(ids, count, self.store.columns.next_id, self.holds)
         for column, landmark_id in zip(columns, ids.tolist(), strict=True):
             self.store.add(column, landmark_id)
         self.store.columns.kind[self.store.columns.rows(ids)] = kind
@@ -176,7 +164,7 @@ class LandmarkMap(Map):
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
         records = self.read(ids, slice(particle, particle + 1))
-        nu, by_state, by_landmark = linearised(
+        nu, by_state, by_landmark = rows.linearised(
             model, self.space, z, state[None], records.mean, records.const, self.compiled
         )
         return nu[0], Jacobians(by_state[0], by_landmark[0]), records
@@ -184,7 +172,7 @@ class LandmarkMap(Map):
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
     ) -> tuple[np.ndarray, np.ndarray]:
-        predicted, within = expected(model, self.read(ids), belief)
+        predicted, within = rows.expected(model, self.read(ids), belief)
         return model.residual(z[:, None, :], predicted[:, None]), within[:, None] + cov[:, None]
 
     def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
@@ -197,7 +185,7 @@ class LandmarkMap(Map):
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         self._known(ids)
         prior, weights = belief.prior, belief.weights
-        kernel = fused_kernel(model) if self.is_compiled(model, ids) else None
+        kernel = rows.fused_kernel(model) if self.is_compiled(model, ids) else None
         if kernel is not None:
             # Relative to the particle of highest weight, so that angles need not be wrapped.
             landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim
@@ -210,7 +198,7 @@ class LandmarkMap(Map):
             fused = kernel.function.address, kernel.params, state
             project(*fused, *access, anchor, weights, spread, sizes, mean, cov)
             return anchor + mean, cov
-        return projected(model, self.read(ids), belief)
+        return rows.projected(model, self.read(ids), belief)
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         if not self.evidence:
@@ -321,13 +309,13 @@ class LandmarkMap(Map):
         self.layouts.append(Layout(landmark, self.evidence))
         return len(self.layouts) - 1
 
-    def _plan(self, groups: Sequence[Observations]) -> Plan:
+    def _plan(self, groups: Sequence[Observations]) -> rows.Plan:
         """A step asks for the plan of the same groups again and again; a resampling may have replaced some."""
         planned = self._planned
         if planned is not None and len(planned[0]) == len(groups) and all(map(is_, planned[0], groups)):
             return planned[1]
         plain = np.array([layout.landmark.components == 1 for layout in self.layouts], dtype=bool)
-        plan = make_plan(groups, self.n, self.store.columns.kinds, plain)
+        plan = rows.make_plan(groups, self.n, self.store.columns.kinds, plain)
         self._planned = (groups, plan)
         return plan
 

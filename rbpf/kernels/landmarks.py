@@ -9,20 +9,8 @@ import math
 import numpy as np
 from numba import int64, njit, prange, void
 
-from rbpf.kernels.block import (
-    add_gram,
-    add_spread,
-    add_squares,
-    add_transposed_product,
-    cholesky,
-    innovation_covariance,
-    load_record,
-    load_states,
-    packed,
-    whiten_matrix,
-    whiten_vector,
-    workspace,
-)
+from rbpf.kernels import block as lanes
+from rbpf.kernels.block import packed
 from rbpf.kernels.gate import accept_predicted, is_inlier, leave_out, log_likelihood
 from rbpf.kernels.signature import (
     BLOCK,
@@ -66,7 +54,7 @@ def refine(
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
         kernel = kernel_at(address)
-        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(size, p, dim, dim_map, size_const)
+        x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
         weight = np.ones(BLOCK)
         scale = np.ones(BLOCK)
         sum_info = np.zeros((dim * (dim + 1) // 2, BLOCK))
@@ -76,23 +64,23 @@ def refine(
         penalty = np.zeros(BLOCK)
         used = np.zeros(BLOCK)
         pivots = 0
-        load_states(state, start, count, x)
+        lanes.load_states(state, start, count, x)
         for k in range(n_obs):
-            load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
+            lanes.load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
             kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
-            innovation_covariance(jac_map, cov, noise[k], count, cross, total)
+            lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
             partial = mask.shape[0] > 0 or kernel_id != 0
             if partial:
                 for i in range(count):
                     weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
                 accept_predicted(kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty)
                 leave_out(weight, count, nu, jac_state, total)
-            cholesky(total, count, scale)
-            whiten_vector(total, count, nu)
-            whiten_matrix(total, count, jac_state)
-            add_squares(nu, count, sum_quad)
-            add_gram(jac_state, 1.0, count, sum_info)
-            add_transposed_product(jac_state, nu, count, sum_vector)
+            lanes.cholesky(total, count, scale)
+            lanes.whiten_vector(total, count, nu)
+            lanes.whiten_matrix(total, count, jac_state)
+            lanes.add_squares(nu, count, sum_quad)
+            lanes.add_gram(jac_state, 1.0, count, sum_info)
+            lanes.add_transposed_product(jac_state, nu, count, sum_vector)
             pivots += p
             for i in range(count):
                 used[i] += weight[i]
@@ -147,19 +135,19 @@ def update(
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
         kernel = kernel_at(address)
-        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(size, p, dim, dim_map, size_const)
+        x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
         weight = np.ones(BLOCK)
         scale = np.ones(BLOCK)
         squared = np.zeros(BLOCK)
         used = np.zeros(BLOCK)
         pivots = 0
         sum_log = np.zeros(BLOCK)
-        load_states(state, start, count, x)
+        lanes.load_states(state, start, count, x)
         for k in range(n_obs):
             rows = maps[which[k]]
-            load_record(pool, slabs[k], rows, start, count, mean, cov, const)
+            lanes.load_record(pool, slabs[k], rows, start, count, mean, cov, const)
             kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
-            innovation_covariance(jac_map, cov, noise[k], count, cross, total)
+            lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
             if mask.shape[0] > 0:
                 for i in range(count):
                     weight[i] = 1.0 if mask[k, start + i] else 0.0
@@ -168,9 +156,9 @@ def update(
                 for i in range(count):
                     squared[i] = 0.0
                     scale[i] = 1.0
-            cholesky(total, count, scale)
-            whiten_vector(total, count, nu)
-            add_squares(nu, count, squared)
+            lanes.cholesky(total, count, scale)
+            lanes.whiten_vector(total, count, nu)
+            lanes.add_squares(nu, count, squared)
             rejected = False
             if kernel_id == 0:
                 pivots += p
@@ -187,11 +175,11 @@ def update(
                         sum_log[i] += log_likelihood(kernel_id, kernel_params, squared[i], scale[i], p)
                         weight[i] = 1.0 if is_inlier(kernel_id, kernel_params, squared[i], scale[i], p) else 0.0
                         rejected = rejected or weight[i] == 0.0
-            whiten_matrix(total, count, cross)
+            lanes.whiten_matrix(total, count, cross)
             if rejected:
                 leave_out(weight, count, nu, cross, total)
-            add_transposed_product(cross, nu, count, mean)
-            add_gram(cross, -1.0, count, cov)
+            lanes.add_transposed_product(cross, nu, count, mean)
+            lanes.add_gram(cross, -1.0, count, cov)
             _store_record(pool, targets[k], slabs[k], rows, start, count, mean, cov)
             if kernel_id != 0 and mask.shape[0] == 0:
                 weight[:] = 1.0
@@ -229,7 +217,9 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
     n_particles, size = state.shape
     p = anchor.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    x, record, packed_cov, const, nu, jac_state, jac_map, cross, total = workspace(size, p, dim, dim_map, size_const)
+    x, record, packed_cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(
+        size, p, dim, dim_map, size_const
+    )
     column = np.empty((p, BLOCK))
     offset = np.empty((p, n_particles))
     nothing = np.zeros((p, p))
@@ -238,11 +228,11 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
         for start in range(0, n_particles, BLOCK):
             count = min(BLOCK, n_particles - start)
             if k == 0 or n_particles > BLOCK:
-                load_states(state, start, count, x)
-            load_record(pool, slabs[k], maps[which[k]], start, count, record, packed_cov, const)
+                lanes.load_states(state, start, count, x)
+            lanes.load_record(pool, slabs[k], maps[which[k]], start, count, record, packed_cov, const)
             kernel(x, record, const, anchor[k], params, count, nu, jac_state, jac_map)
-            innovation_covariance(jac_map, packed_cov, nothing, count, cross, total)
-            add_spread(jac_state, factor, start, count, column, total)
+            lanes.innovation_covariance(jac_map, packed_cov, nothing, count, cross, total)
+            lanes.add_spread(jac_state, factor, start, count, column, total)
             for a in range(p):
                 for i in range(count):
                     offset[a, start + i] = -nu[a, i]
