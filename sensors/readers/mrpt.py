@@ -28,20 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3
-from rbpf.sensors.readers.robot_log import (
-    UNNAMED,
-    LogNoise,
-    RobotLog,
-    RobotLogFormat,
-    Truth,
-    assemble,
-    diagonal,
-    planar_to_chart,
-    read_covariances,
-    require_ranges,
-    spatial_to_chart,
-    std_column,
-)
+from rbpf.sensors.readers import robot_log
+from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, RobotLogFormat, Truth, assemble
 from rbpf.sensors.readers.text import Table, read_csv
 from rbpf.sensors.readers.yaml_files import read_yaml
 
@@ -82,19 +70,19 @@ class Mrpt(RobotLogFormat):
         if planar:
             robot_from_sensor = SE2.normalise(np.array([yaw, x, y]))
             delta = SE2.normalise(np.roll(odometry.block("dx_m", "dphi_rad"), 1, axis=1))
-            cov_delta = planar_to_chart(delta, read_covariances(odometry, "cxx", "cpp"))
+            cov_delta = robot_log.planar_to_chart(delta, robot_log.read_covariances(odometry, "cxx", "cpp"))
         else:
             robot_from_sensor = SE3.from_ypr(np.array([x, y, height]), yaw, pitch, roll)
             ypr = odometry.block("yaw_rad", "roll_rad")
             delta = SE3.from_ypr(odometry.block("dx_m", "dz_m"), *ypr.T)
-            cov_delta = spatial_to_chart(delta, ypr, read_covariances(odometry, "cov00", "cov55"))
+            cov_delta = robot_log.spatial_to_chart(delta, ypr, robot_log.read_covariances(odometry, "cov00", "cov55"))
         cov_delta *= noise.odometry_variance_factor()
         step, landmarks = _require_order(table, odometry)
         # Measurements and their covariances.
-        require_ranges(table, "range_m", "yaw_rad")
+        robot_log.require_ranges(table, "range_m", "yaw_rad")
         std = [
-            std_column(table, "std_range_m", noise.std_range_m),
-            std_column(table, "std_yaw_rad", noise.std_bearing_rad),
+            robot_log.std_column(table, "std_range_m", noise.std_range_m),
+            robot_log.std_column(table, "std_yaw_rad", noise.std_bearing_rad),
         ]
         if planar:
             table.require(table["pitch_rad"] == 0, "pitch_rad", "0, as the odometry is planar")
@@ -102,7 +90,7 @@ class Mrpt(RobotLogFormat):
         else:
             right = np.abs(table["pitch_rad"]) <= np.pi / 2
             table.require(right, "pitch_rad", "in radians, within a quarter turn")
-            std.append(std_column(table, "std_pitch_rad", noise.std_pitch_rad))
+            std.append(robot_log.std_column(table, "std_pitch_rad", noise.std_pitch_rad))
         z = table.block("range_m", "yaw_rad" if planar else "pitch_rad")
         frames = step[-1] + 1
         motion = delta[: frames - 1], cov_delta[: frames - 1]
@@ -111,7 +99,7 @@ class Mrpt(RobotLogFormat):
             space=SE2 if planar else SE3,
             measurement="range_bearing",
             robot_from_sensor=robot_from_sensor,
-            frames=assemble(np.arange(frames), *motion, step, landmarks, z, diagonal(std)),
+            frames=assemble(np.arange(frames), *motion, step, landmarks, z, robot_log.diagonal(std)),
             pitch_sign=pitch_sign,
             truth=_read_truth(path, planar),
         )

@@ -22,15 +22,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.sensors.readers.robot_log import (
-    LogNoise,
-    RobotLog,
-    RobotLogFormat,
-    assemble,
-    diagonal,
-    planar_to_chart,
-    read_covariances,
-)
+from rbpf.sensors.readers import robot_log
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat, assemble
 from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_bytes, read_lines
 
 _COLUMNS = {
@@ -82,11 +75,11 @@ class VictoriaPark(RobotLogFormat):
         by_number = np.argsort(poses)
         frame = by_number[np.searchsorted(poses, pose, sorter=by_number)]
         observations.require_distinct(pose, landmarks, "pose")
-        z, cov_z = observations.block("x", "y"), read_covariances(observations, "cxx", "cyy")
+        z, cov_z = observations.block("x", "y"), robot_log.read_covariances(observations, "cxx", "cyy")
         if noise.std_position_m is not None:
-            cov_z = diagonal([np.full(len(z), noise.std_position_m)] * 2)
+            cov_z = robot_log.diagonal([np.full(len(z), noise.std_position_m)] * 2)
         delta = SE2.normalise(np.roll(odometry.block("dx", "dtheta"), 1, axis=1))
-        cov_delta = planar_to_chart(delta, read_covariances(odometry, "cxx", "ctt"))
+        cov_delta = robot_log.planar_to_chart(delta, robot_log.read_covariances(odometry, "cxx", "ctt"))
         cov_delta = cov_delta * noise.odometry_variance_factor()
         order = np.argsort(frame, kind="stable")
         stamps = np.arange(len(poses))
