@@ -76,8 +76,7 @@ class Matches:
     ) -> "Matches":
         """Of pixels (K, 3) and covariances (K, 3, 3), or (3, 3) for all.
 
-        Raises:
-            InputError: a shape does not fit, a number is not finite, or a covariance is not positive definite.
+        Raises InputError: a shape does not fit, a number is not finite, or a covariance is not positive definite.
         """
         before, now = (np.ascontiguousarray(z, dtype=float) for z in (z_prev, z_now))
         if before.shape != now.shape or before.shape[1:] != (3,):

@@ -277,8 +277,7 @@ class VisualOdometry:
     def candidates(self, matches: Matches, velocity: Array, dt: float, rng: np.random.Generator) -> CandidateMotions:
         """The motions over `dt` seconds that the matches may tell of, after a velocity (6,) [ω, v], rad/s, m/s.
 
-        Raises:
-            InputError: dt is not positive.
+        Raises InputError: dt is not positive.
         """
         if not dt > 0.0:
             raise InputError(f"visual odometry needs time between its frames, got {dt} s")

@@ -42,8 +42,7 @@ _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
 class Board:
     """A printed chessboard, by its inner corners in a row and in a column, and the side of its squares.
 
-    Raises:
-        InputError: there are fewer than three of either, or the squares have no size.
+    Raises InputError: there are fewer than three of either, or the squares have no size.
     """
 
     columns: int
@@ -77,8 +76,7 @@ class Board:
 def find_board(image: np.ndarray, board: Board) -> KnownPixels:
     """Well-spread corners of a board in an image (H, W) uint8, as exact known points, named by their numbers, row by row.
 
-    Raises:
-        InputError: the board is not seen whole, or it is too small in the image.
+    Raises InputError: the board is not seen whole, or it is too small in the image.
     """
     image = checked_image(image)
     px = board_corners(image, board)
@@ -146,10 +144,8 @@ def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
 class MarkerBoard:
     """A printed grid of markers of a dictionary in `DICTIONARIES`, `gap_m` apart.
 
-    A marker's `side_m` includes its black border.
-
-    Raises:
-        InputError: a number makes no sense, or the dictionary is not known or too small.
+    A marker's `side_m` includes its black border. Raises InputError: a number makes no sense, or the dictionary is not
+    known or too small.
     """
 
     columns: int
@@ -186,10 +182,8 @@ class MarkerBoard:
 def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
     """Well-spread corners of the markers seen in an image (H, W) uint8, as exact known points.
 
-    Corner k of marker i is named 4 i + k.
-
-    Raises:
-        InputError: no marker of the board is seen, or all are too small in the image.
+    Corner k of marker i is named 4 i + k. Raises InputError: no marker of the board is seen, or all are too small in
+    the image.
     """
     import cv2
 
@@ -277,10 +271,8 @@ def calibrate(
 ) -> BoardCalibration:
     """The camera that explains the views of a board, all in images of one size [px].
 
-    Its lens's distortion is radial-tangential or equidistant.
-
-    Raises:
-        InputError: there are too few views, or they are too much alike to determine the camera.
+    Its lens's distortion is radial-tangential or equidistant. Raises InputError: there are too few views, or they are
+    too much alike to determine the camera.
     """
     used = list(views)
     left_out: list[str] = []
@@ -319,8 +311,7 @@ def _fitted(
 ) -> BoardCalibration:
     """The camera of least squared error, whose lens has so many coefficients; the others are zero.
 
-    Raises:
-        InputError: OpenCV finds none, or what it finds is no camera.
+    Raises InputError: OpenCV finds none, or what it finds is no camera.
     """
     import cv2
 

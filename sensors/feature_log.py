@@ -30,9 +30,8 @@ class FeatureFrame:
 class KnownPoints:
     """Landmarks known beforehand, such as the corners of a calibration target.
 
-    Raises:
-        InputError: a shape or a type is another one, a number is not finite, a name comes twice,
-            or a cov is no covariance.
+    Raises InputError: a shape or a type is another one, a number is not finite, a name comes twice, or a cov is no
+    covariance.
     """
 
     names: np.ndarray  #: (M,) int64, each once.
@@ -51,9 +50,8 @@ class KnownPoints:
 class CameraTruth:
     """Ground truth of a `FeatureLog`.
 
-    Raises:
-        InputError: a shape or a type is another one, a number is not finite, the stamps are out of order,
-            or a quaternion is not of unit length.
+    Raises InputError: a shape or a type is another one, a number is not finite, the stamps are out of order, or a
+    quaternion is not of unit length.
     """
 
     stamps_ns: np.ndarray  #: (T,) int64 times of the poses, in order.
@@ -84,9 +82,8 @@ class CameraTruth:
 class FeatureLog:
     """A recording of a camera that sees landmarks.
 
-    Raises:
-        InputError: there is no frame, or one is out of order, names a landmark twice, has a shape or a type that
-            does not fit the camera, a number that is not finite, or a cov_z that is no covariance.
+    Raises InputError: there is no frame, or one is out of order, names a landmark twice, has a shape or a type that
+    does not fit the camera, a number that is not finite, or a cov_z that is no covariance.
     """
 
     name: str  #: short name of the recording.

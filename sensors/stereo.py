@@ -136,11 +136,7 @@ REMEMBERED = 0.9  #: Of the matches that were counted, what still counts a pair 
 
 @dataclass(frozen=True)
 class PairConfig(Ranged):
-    """How the two images are matched, and how exact the result is.
-
-    Raises:
-        InputError: a number is out of its range.
-    """
+    """How the two images are matched, and how exact the result is. Raises InputError: a number is out of its range."""
 
     row_px: NotNegative = 1.0  #: rows of a match differ by at most this …
     row_per_scale: NotNegative = 0.25  #: … and this fraction of the keypoint's scale.
@@ -192,8 +188,7 @@ class StereoMatcher:
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
         """Features of a pair of images (H, W) uint8; none where there is no texture.
 
-        Raises:
-            InputError: the images are not of the camera's size, or they are swapped.
+        Raises InputError: the images are not of the camera's size, or they are swapped.
         """
         self.check(left, right)
         self.impulse_fraction = 0.0
@@ -229,11 +224,7 @@ class StereoMatcher:
         return f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"
 
     def match(self, images: tuple[np.ndarray, np.ndarray], left: Features, right: Features) -> StereoFeatures:
-        """Features of a pair of images whose keypoints are known.
-
-        Raises:
-            InputError: the images are swapped.
-        """
+        """Features of a pair of images whose keypoints are known. Raises InputError: the images are swapped."""
         matches = self._along_rows(left, right)
         # A pair is refused whose keypoints match far better the other way round.
         if FEWER * len(matches) < min(len(left), len(right)):
@@ -290,8 +281,7 @@ class StereoMatcher:
     def check(self, left: np.ndarray, right: np.ndarray) -> None:
         """Refuses images that these cameras cannot have taken.
 
-        Raises:
-            InputError: they are no (H, W) uint8, or not of the camera's size.
+        Raises InputError: they are no (H, W) uint8, or not of the camera's size.
         """
         left, right, camera = checked_image(left), checked_image(right), self.rig.camera
         one, other = (f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))

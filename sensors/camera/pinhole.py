@@ -26,9 +26,8 @@ LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidis
 class Pinhole:
     """Pinhole camera with distortion (OpenCV's models and pixel convention).
 
-    Raises:
-        InputError: a size is no positive whole number, a focal length is not positive, a number is not finite,
-            there is no such model of distortion, or it has another number of coefficients.
+    Raises InputError: a size is no positive whole number, a focal length is not positive, a number is not finite, there
+    is no such model of distortion, or it has another number of coefficients.
     """
 
     width: int  #: of the image, px.
@@ -67,11 +66,7 @@ class Pinhole:
 
     @classmethod
     def from_params(cls, width: int, height: int, params: Float[np.ndarray, "10"]) -> Self:
-        """The camera with these `params`.
-
-        Raises:
-            InputError: as of the constructor, or no lens has this kind.
-        """
+        """The camera with these `params`. Raises InputError: as of the constructor, or no lens has this kind."""
         models = {lens.kind: name for name, lens in LENSES.items()}
         model = models.get(float(params[9]), f"of kind {params[9]:g}")
         count = len(LENSES[model].coefficient_names) if model in LENSES else 0
@@ -181,8 +176,7 @@ class Pinhole:
 class RectifiedStereo:
     """Two equal undistorted pinholes side by side; the left one is the reference.
 
-    Raises:
-        InputError: the camera is distorted, or the baseline is not positive.
+    Raises InputError: the camera is distorted, or the baseline is not positive.
     """
 
     camera: Pinhole  #: each of the two.

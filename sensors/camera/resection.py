@@ -17,10 +17,8 @@ def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
     """Pose world_from_camera (7,) of least reprojection error of points (M, 3) in the world, seen at px (M, 2).
 
     Every solution of the first triples of points is refined on all of them, because few points have several local
-    optima and a single start may find the wrong one.
-
-    Raises:
-        InputError: there are fewer than four points, they lie on a line, or no pose in front of them explains them.
+    optima and a single start may find the wrong one. Raises InputError: there are fewer than four points, they lie on a
+    line, or no pose in front of them explains them.
     """
     if points.shape[0] < 4:
         raise InputError(f"a start from known points needs at least four that are seen, got {points.shape[0]}")

@@ -100,8 +100,7 @@ class Detector(ABC):
             border_px: the least distance from the outermost pixels' centres.
             mask: (H, W) bool, where a keypoint may be; None for everywhere.
 
-        Raises:
-            InputError: the image is not (H, W) uint8, or the occupied pixels are not (M, 2).
+        Raises InputError: the image is not (H, W) uint8, or the occupied pixels are not (M, 2).
         """
         from rbpf.sensors.features.kernels import spread
 
@@ -132,8 +131,7 @@ class Descriptor(ABC):
             image: (H, W) uint8.
             keypoints: K of them, with the scale and the orientation at which they are described.
 
-        Raises:
-            InputError: the image is not (H, W) uint8.
+        Raises InputError: the image is not (H, W) uint8.
         """
 
     @final
@@ -160,8 +158,7 @@ class FeatureExtractor(ABC):
     def extract(self, image: np.ndarray) -> Features:
         """Features of an image (H, W) uint8, best first; none where there is no texture.
 
-        Raises:
-            InputError: the image is not (H, W) uint8.
+        Raises InputError: the image is not (H, W) uint8.
         """
 
 
@@ -186,11 +183,7 @@ class Extractor(FeatureExtractor):
 
 
 def checked_image(image: np.ndarray) -> np.ndarray:
-    """The image, its rows one after the other in memory.
-
-    Raises:
-        InputError: it is not (H, W) uint8.
-    """
+    """The image, its rows one after the other in memory. Raises InputError: it is not (H, W) uint8."""
     if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
         found = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
         raise InputError(f"an image must be grey, (H, W) uint8, got {found}: convert it first")

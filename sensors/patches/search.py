@@ -39,10 +39,7 @@ class PatchMatches:
 def cut(image: np.ndarray, px: np.ndarray, half: int = 15) -> np.ndarray | None:
     """A window (2 half + 1, 2 half + 1) uint8 around a place (2,), None where it reaches beyond the image.
 
-    Exact at a whole pixel, else interpolated by cubics (Catmull-Rom).
-
-    Raises:
-        InputError: the image is not (H, W) uint8.
+    Exact at a whole pixel, else interpolated by cubics (Catmull-Rom). Raises InputError: the image is not (H, W) uint8.
     """
     from rbpf.sensors.patches.kernels import cut_window
 
@@ -66,8 +63,7 @@ def warp(sources: np.ndarray, affines: np.ndarray, size: int = 11) -> np.ndarray
         affines: (K, 2, 2), source offset [px] by offset in the new view [px]: 2 I for a view of half the size.
         size: odd.
 
-    Raises:
-        InputError: a shape or type is another one, or a size is even.
+    Raises InputError: a shape or type is another one, or a size is even.
     """
     from rbpf.sensors.patches.kernels import warp_all
 
@@ -111,8 +107,7 @@ def search(
     Returns:
         The matches. Nothing is found for a template that is not finite, or where centre or covariance are none.
 
-    Raises:
-        InputError: a shape or type is another one.
+    Raises InputError: a shape or type is another one.
     """
     from rbpf.kernels.signature import run_driver
     from rbpf.sensors.patches.kernels import search_all

@@ -26,10 +26,8 @@ _log = logging.getLogger(__name__)
 def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
     """Read a robot log, a folder or a file, of any known format, which the modules of the readers describe.
 
-    `noise` are standard deviations to use in place of the log's.
-
-    Raises:
-        InputError: nothing is there, it is of no known format, or a file of it is malformed.
+    `noise` are standard deviations to use in place of the log's. Raises InputError: nothing is there, it is of no known
+    format, or a file of it is malformed.
     """
     path = existing(path, "a robot log")
     for one in ROBOT_LOGS:
@@ -50,9 +48,8 @@ def open_images(
         topics: of a ROS bag, where they have to be named.
         part: which of its images, and in which size.
 
-    Raises:
-        InputError: nothing is there, it is of no known format, no image of it can be read, or another of its files
-            is malformed; a topic is named that is not there.
+    Raises InputError: nothing is there, it is of no known format, no image of it can be read, or another of its files
+    is malformed; a topic is named that is not there.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics)
     return _opened(existing(path, "an image sequence"), options, part, stereo=False)
@@ -79,9 +76,8 @@ def open_stereo(
         topics: as of `open_images`.
         part: likewise.
 
-    Raises:
-        InputError: as of `open_images`, no two images belong together, the two cameras' images differ in size, the baseline
-            is zero, or the right camera is not to the right of the left one.
+    Raises InputError: as of `open_images`, no two images belong together, the two cameras' images differ in size, the
+    baseline is zero, or the right camera is not to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
     return _opened(existing(path, "a stereo sequence"), options, part, stereo=True)

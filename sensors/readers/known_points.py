@@ -23,8 +23,7 @@ COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
 class KnownPixels:
     """Landmarks of known position and where they are in the first image.
 
-    Raises:
-        InputError: a shape is another one, a number is not finite, or a standard deviation is negative.
+    Raises InputError: a shape is another one, a number is not finite, or a standard deviation is negative.
     """
 
     names: np.ndarray  #: (M,) int64, each once.
@@ -49,8 +48,7 @@ class KnownPixels:
 def read_known_points(path: str | Path) -> KnownPixels:
     """Read a table of known points.
 
-    Raises:
-        InputError: the file is missing, a column is, or a line is not as described above.
+    Raises InputError: the file is missing, a column is, or a line is not as described above.
     """
     path = Path(path)
     rows = numbered_lines(path, f"a table with the columns {', '.join(COLUMNS)}")

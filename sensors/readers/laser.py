@@ -62,11 +62,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LaserOptions(Ranged):
-    """What a recording may leave open.
-
-    Raises:
-        InputError: the greatest range is not positive.
-    """
+    """What a recording may leave open. Raises InputError: the greatest range is not positive."""
 
     scanner: str | None = None  #: name of the message (CARMEN) or topic (ROS) of its scans; None takes the first.
     #: the scanner is mounted upside down, or its readings run clockwise: the angles are mirrored.
@@ -106,19 +102,14 @@ class LaserFormat(ABC):
 
     @abstractmethod
     def read(self, path: Path, options: LaserOptions) -> ScansOfFile:
-        """At least one scan, each with odometry or none with it.
-
-        Raises:
-            InputError: as `read_laser_log`.
-        """
+        """At least one scan, each with odometry or none with it. Raises InputError: as `read_laser_log`."""
 
 
 def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> LaserLog:
     """Read a recording of a scanner, a CARMEN log or a ROS bag, which the head of this module describes.
 
-    Raises:
-        InputError: nothing is there, a line is not as described (it is named), there are no scans or none of the scanner
-            that is asked for, all are outside of the part, or the clock runs backwards.
+    Raises InputError: nothing is there, a line is not as described (it is named), there are no scans or none of the
+    scanner that is asked for, all are outside of the part, or the clock runs backwards.
     """
     kinds, options = "; or ".join(one.kind for one in LASERS), options or LaserOptions()
     path = existing(path, kinds)

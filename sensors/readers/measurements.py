@@ -24,8 +24,7 @@ _UNIT = 1e-6
 class Measurements:
     """Odometry, and observations of landmarks whose association is settled; T steps, K observations.
 
-    Raises:
-        InputError: shapes do not fit together, or a number is not as described.
+    Raises InputError: shapes do not fit together, or a number is not as described.
     """
 
     recording: str  #: short name of the recording, one line.

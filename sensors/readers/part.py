@@ -16,8 +16,7 @@ from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Sour
 class Part:
     """Which frames of a recording are used, and images in which size.
 
-    Raises:
-        InputError: a number is out of its range.
+    Raises InputError: a number is out of its range.
     """
 
     start_s: float = 0.0  #: the first is the first one so long after the recording's first, s.
@@ -47,8 +46,7 @@ class Part:
     def apply(self, sequence: ImageSequence) -> ImageSequence:
         """The part of a sequence, with its camera; the images keep their times.
 
-        Raises:
-            InputError: no image is left, or they would become larger.
+        Raises InputError: no image is left, or they would become larger.
         """
         stamps, camera = np.asarray(sequence.stamps_ns), sequence.camera
         rows = self.rows((stamps - stamps[:1]) * 1e-9, f"{sequence.name}: no image is left")
@@ -63,8 +61,7 @@ class Part:
     def rows(self, after_s: np.ndarray, problem: str) -> np.ndarray:
         """Numbers of the frames used, of all (T,) that come so long after the first, s.
 
-        Raises:
-            InputError: none is left, with the problem as its beginning.
+        Raises InputError: none is left, with the problem as its beginning.
         """
         end_s = np.inf if self.end_s is None else self.end_s
         rows = np.flatnonzero((after_s >= self.start_s) & (after_s <= end_s))[:: self.every]

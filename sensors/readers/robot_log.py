@@ -70,8 +70,7 @@ class RobotLog:
 class LogNoise(Ranged):
     """Noise of a log; None takes what the log says, or the reader's documented default where it says nothing.
 
-    Raises:
-        InputError: one is not finite, or negative, or zero where only a positive one makes sense.
+    Raises InputError: one is not finite, or negative, or zero where only a positive one makes sense.
     """
 
     std_range_m: Positive | None = None  #: of a measured range [m].
@@ -113,8 +112,7 @@ class RobotLogFormat(ABC):
     def read(self, path: Path, noise: LogNoise) -> RobotLog:
         """Read the log in a file or folder, with standard deviations in place of the log's or of the format's defaults.
 
-        Raises:
-            InputError: a file is missing or a line is not as the format's module describes; names file and line.
+        Raises InputError: a file is missing or a line is not as the format's module describes; names file and line.
         """
 
 

@@ -40,8 +40,7 @@ def quoted(text: str) -> str:
 def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
     """Content of a file of at most so many bytes, or `MOST_BYTES`; `hint` is what is expected to lie there, for messages.
 
-    Raises:
-        InputError: the file is missing, too large or cannot be read.
+    Raises InputError: the file is missing, too large or cannot be read.
     """
     most, expected = MOST_BYTES if most is None else most, hint and f"; expected {hint}"
     try:
@@ -80,8 +79,7 @@ def _unpacked(path: Path, data: bytes) -> bytes:
 def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
     """Text of a file, which may be packed by gzip, without a byte-order mark.
 
-    Raises:
-        InputError: as `read_bytes`, or the file is empty, but for a byte-order mark, or not UTF-8.
+    Raises InputError: as `read_bytes`, or the file is empty, but for a byte-order mark, or not UTF-8.
     """
     data = _unpacked(path, read_bytes(path, hint, most))
     if not data.removeprefix(BOM_UTF8).strip():

@@ -62,8 +62,7 @@ class WheelOdometry:
 def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
     """Reads `odometry.csv` and `odometry.yaml` in a folder.
 
-    Raises:
-        InputError: a file is missing or not as described above.
+    Raises InputError: a file is missing or not as described above.
     """
     path = Path(folder) / NAME
     rows = read_stamped(path, KIND, nanoseconds=True)

@@ -89,8 +89,7 @@ class YamlValue:
 def read_yaml(path: Path, hint: str) -> YamlValue:
     """Content of a YAML file; `hint` is what is expected to lie there, for messages.
 
-    Raises:
-        InputError: the file is missing, too large, empty, or no YAML.
+    Raises InputError: the file is missing, too large, empty, or no YAML.
     """
     text = read_text(path, hint, MOST_BYTES)
     if text.startswith("%YAML:"):
@@ -123,8 +122,7 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
 def read_plain_yaml(path: Path, hint: str = "settings") -> Any:
     """What a YAML file says in plain values: mappings, lists, text, numbers, dates.
 
-    Raises:
-        InputError: as `read_yaml`, a key comes twice, a tag is not plain, or a value is none of its type.
+    Raises InputError: as `read_yaml`, a key comes twice, a tag is not plain, or a value is none of its type.
     """
     whole = read_yaml(path, hint)
     _require_plain(whole)

@@ -197,8 +197,7 @@ def _unpacked(unpack: Callable[[bytes], bytes], data: bytes) -> bytes:
 def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | None = None) -> Grey:
     """Image (H, W) of a message, which `where` names in messages; of this height and width, if they are given.
 
-    Raises:
-        InputError: it is damaged, of an encoding that is not known, or of another size.
+    Raises InputError: it is damaged, of an encoding that is not known, or of another size.
     """
     import cv2
 

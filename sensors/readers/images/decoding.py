@@ -28,8 +28,7 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", "
 def read_grey(path: Path, shape: tuple[int, int] | None = None) -> Grey:
     """Image of a file, (H, W); of this height and width, if they are given.
 
-    Raises:
-        InputError: the file is missing, is no complete image of a format that OpenCV knows, or has another size.
+    Raises InputError: the file is missing, is no complete image of a format that OpenCV knows, or has another size.
     """
     return decode(path, np.frombuffer(read_bytes(path), dtype=np.uint8), shape)
 
@@ -66,8 +65,7 @@ def decode(path: Path | str, data: NDArray[np.uint8], shape: tuple[int, int] | N
 def to_grey(path: Path | str, image: np.ndarray) -> Grey:
     """Grey image (H, W) of a decoded video image (H, W), (H, W, 1) or (H, W, 3) in the order blue, green, red.
 
-    Raises:
-        InputError: it has another depth than 8 or 16 bits.
+    Raises InputError: it has another depth than 8 or 16 bits.
     """
     import cv2
 

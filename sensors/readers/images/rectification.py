@@ -105,8 +105,7 @@ def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, w
         where: its calibration, for messages.
         note: what is said if images are rectified.
 
-    Raises:
-        InputError: the right camera is not to the right of the left one.
+    Raises InputError: the right camera is not to the right of the left one.
     """
     # They are a rectified pair already if both have one size and one set of intrinsics, no distortion and equal axes, and
     # the right one lies to the right of the left one along the rows.

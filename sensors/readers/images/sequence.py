@@ -39,11 +39,8 @@ class Source(ABC):
 class ImageSequence:
     """A recording of a camera or of a rectified stereo pair.
 
-    Nothing of it but its first image is decoded before `frames` is called.
-
-    Raises:
-        InputError: the stamps are no whole numbers, or one is before the one it follows; the camera of a pair is distorted,
-            or its baseline is not positive.
+    Nothing of it but its first image is decoded before `frames` is called. Raises InputError: the stamps are no whole
+    numbers, or one is before the one it follows; the camera of a pair is distorted, or its baseline is not positive.
     """
 
     name: str  #: short name of the recording.
@@ -71,11 +68,7 @@ class ImageSequence:
 
     @property
     def rig(self) -> RectifiedStereo:
-        """The two cameras of a stereo sequence.
-
-        Raises:
-            InputError: there is one camera.
-        """
+        """The two cameras of a stereo sequence. Raises InputError: there is one camera."""
         if self.baseline_m is None:
             raise InputError(f"{self.name}: a sequence of one camera has no stereo rig; open it by open_stereo")
         return RectifiedStereo(self.camera, self.baseline_m)
@@ -84,10 +77,7 @@ class ImageSequence:
         """Images, or pairs of one size, in order of time, from number `start` on.
 
         A frame of which an image cannot be read comes without that image and with the problem. A video that ends before
-        its last announced image ends with such a frame.
-
-        Raises:
-            InputError: there is no image of that number.
+        its last announced image ends with such a frame. Raises InputError: there is no image of that number.
         """
         if not 0 <= start < len(self):
             raise InputError(f"{self.name}: expected a start from 0 to {len(self) - 1}, got {start}.")
@@ -106,8 +96,7 @@ class Topics:
     def parse(cls, images: str | None = None, truth: str | None = None) -> Self:
         """The topics of a command line or a run's config.yaml: one name or two with a comma between them, and the truth's.
 
-        Raises:
-            InputError: there are more than two, or a name is empty.
+        Raises InputError: there are more than two, or a name is empty.
         """
         names = () if images is None else tuple(name.strip() for name in images.split(","))
         if len(names) > 2 or not all(names) or truth == "":
@@ -148,14 +137,12 @@ class ImageFormat(ABC):
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         """Open the images of one camera, the left one of two.
 
-        Raises:
-            InputError: a file is missing or not as the format's module describes.
+        Raises InputError: a file is missing or not as the format's module describes.
         """
 
     def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
         """Open the images of two cameras, rectified; overridden where there is a `stereo_kind`.
 
-        Raises:
-            InputError: as `read`, or the two cameras are not one pair.
+        Raises InputError: as `read`, or the two cameras are not one pair.
         """
         raise NotImplementedError

@@ -93,8 +93,7 @@ def read_header(path: Path) -> tuple[np.ndarray, tuple[int, int], int]:
         Times (T,) int64 ns of its images, from 0; height and width of the first; quarters of a turn, clockwise, by which the
         stored images are turned.
 
-    Raises:
-        InputError: it cannot be opened, or no image of it can be decoded.
+    Raises InputError: it cannot be opened, or no image of it can be decoded.
     """
     import cv2
 
@@ -143,10 +142,8 @@ def opened(path: Path) -> Iterator[Any]:
 def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[tuple[str, Grey]]]:
     """Up to `most` images, evenly spread, of a video or of a folder that has them in it or in its `images`, and how many.
 
-    Each comes with what it is called in messages; those that cannot be read are left out.
-
-    Raises:
-        InputError: there is nothing of that name, or no image in it.
+    Each comes with what it is called in messages; those that cannot be read are left out. Raises InputError: there is
+    nothing of that name, or no image in it.
     """
     video = path.is_file() and path.suffix.lower() in SUFFIXES
     if not (video or path.is_dir()):
@@ -188,8 +185,7 @@ class LiveCamera:
         number: as OpenCV counts cameras, from 0.
         calibration: its camera.yaml.
 
-    Raises:
-        InputError: there is no calibration, no such camera, or it gives images of another size.
+    Raises InputError: there is no calibration, no such camera, or it gives images of another size.
     """
 
     stamps_ns = None
