@@ -39,48 +39,14 @@ def _horner(coefficients, x):
 
 
 @njit(cache=True, error_model="numpy")
-def coefficient_b(x):
-    """(1 − cos θ)/θ², from the half angle, which does not cancel."""
-    theta = math.sqrt(x + TINY)
-    fraction = math.sin(0.5 * theta) / theta
-    return 2.0 * (fraction * fraction)
-
-
-@njit(cache=True, error_model="numpy")
-def coefficient_c(x):
-    """(θ − sin θ)/θ³."""
+def _coefficients(x):
+    """The coefficients c, d and e."""
     if x < 1.0:
-        return _horner(_C, x)
+        return _horner(_C, x), _horner(_D, x), _horner(_E, x)
     theta = math.sqrt(x)
-    return (theta - math.sin(theta)) / (x * theta)
-
-
-@njit(cache=True, error_model="numpy")
-def coefficient_d(x):
-    """(θ²/2 + cos θ − 1)/θ⁴."""
-    if x < 1.0:
-        return _horner(_D, x)
-    return (0.5 * x + math.cos(math.sqrt(x)) - 1.0) / (x * x)
-
-
-@njit(cache=True, error_model="numpy")
-def coefficient_e(x):
-    """(2θ − 3 sin θ + θ cos θ)/(2θ⁵)."""
-    if x < 1.0:
-        return _horner(_E, x)
-    theta = math.sqrt(x)
-    return (2.0 * theta - 3.0 * math.sin(theta) + theta * math.cos(theta)) / (2.0 * (x * x) * theta)
-
-
-@njit(cache=True, error_model="numpy")
-def inverse_coefficient(x):
-    """(1 − (θ/2) cot(θ/2))/θ², singular at 2π.
-
-    Its rounding error is that of 1/θ², and every use multiplies it by θ².
-    """
-    squared = x + TINY
-    half = 0.5 * math.sqrt(squared)
-    return (1.0 - half * math.cos(half) / math.sin(half)) / squared
+    sine, cosine = math.sin(theta), math.cos(theta)
+    e = (2.0 * theta - 3.0 * sine + theta * cosine) / (2.0 * (x * x) * theta)
+    return (theta - sine) / (x * theta), (0.5 * x + cosine - 1.0) / (x * x), e
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -308,7 +274,7 @@ def _add_skew(out, scale, w):
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_coupling(w, v, out):
+def _fill_coupling(w, v, c, d, e, out):
     """The block Q of the left Jacobian, Barfoot (2017) (7.86).
 
     With the skew matrices W and V, Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW − 3 WVW) + e (WVWW + WWVW), and with
@@ -316,7 +282,6 @@ def _fill_coupling(w, v, out):
     """
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     s = w[0] * v[0] + w[1] * v[1] + w[2] * v[2]
-    c, d, e = coefficient_c(squared), coefficient_d(squared), coefficient_e(squared)
     for j in range(3):
         for k in range(3):
             out[j, k] = w[j] * (c * v[k] - (2.0 * e * s) * w[k]) + c * (v[j] * w[k])
@@ -339,9 +304,13 @@ def left_jacobian(xi, out):
     for i in range(out.shape[0]):
         w, v = (xi[i, 0], xi[i, 1], xi[i, 2]), (xi[i, 3], xi[i, 4], xi[i, 5])
         squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-        _fill_rotation(w, coefficient_b(squared), coefficient_c(squared), out[i, :3, :3])
+        c, d, e = _coefficients(squared)
+        # (1 − cos θ)/θ² from the half angle, which does not cancel.
+        theta = math.sqrt(squared + TINY)
+        fraction = math.sin(0.5 * theta) / theta
+        _fill_rotation(w, 2.0 * (fraction * fraction), c, out[i, :3, :3])
         out[i, 3:, 3:] = out[i, :3, :3]
-        _fill_coupling(w, v, out[i, 3:, :3])
+        _fill_coupling(w, v, c, d, e, out[i, 3:, :3])
 
 
 @njit(void(READ_ONLY, CUBE), cache=True, error_model="numpy")
@@ -352,9 +321,14 @@ def left_jacobian_inverse(xi, out):
     for i in range(out.shape[0]):
         w, v = (xi[i, 0], xi[i, 1], xi[i, 2]), (xi[i, 3], xi[i, 4], xi[i, 5])
         squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-        _fill_rotation(w, -0.5, inverse_coefficient(squared), out[i, :3, :3])
+        # (1 − (θ/2) cot(θ/2))/θ², singular at 2π. Its rounding error is that of 1/θ², and every use multiplies it by θ².
+        shifted = squared + TINY
+        angle = 0.5 * math.sqrt(shifted)
+        cotangent = (1.0 - angle * math.cos(angle) / math.sin(angle)) / shifted
+        _fill_rotation(w, -0.5, cotangent, out[i, :3, :3])
         out[i, 3:, 3:] = out[i, :3, :3]
-        _fill_coupling(w, v, middle)
+        c, d, e = _coefficients(squared)
+        _fill_coupling(w, v, c, d, e, middle)
         _product(out[i, :3, :3], middle, half)
         _product(half, out[i, :3, :3], middle)
         out[i, 3:, :3] = -middle

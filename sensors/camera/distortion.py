@@ -47,10 +47,7 @@ class RadialTangential:
         The smallest positive root of d(r ρ(r²))/dr = 1 + 3 k1 r² + 5 k2 r⁴ + 7 k3 r⁶; infinite where there is none.
         """
         k1, k2, _, _, k3 = self.coefficients
-        # As a polynomial in 1/r² its first coefficient is 1: no division by a small k3.
-        roots = np.roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3])
-        positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
-        return float(1.0 / np.sqrt(positive.max())) if positive.size else float("inf")
+        return _fold(k1, k2, k3)
 
     def distort(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Distorted coordinates (…, 2) of normalised ones."""
@@ -125,6 +122,14 @@ class RadialTangential:
         return miss / (1.0 + np.linalg.norm(target, axis=-1))
 
 
+def _fold(*k: float) -> float:
+    """The smallest positive root x of 1 + 3 k1 x² + 5 k2 x⁴ + …; infinite where there is none."""
+    # As a polynomial in 1/x² its first coefficient is 1: no division by a small last one.
+    roots = np.roots([1.0, *((2 * i + 3) * each for i, each in enumerate(k))])
+    positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
+    return float(1.0 / np.sqrt(positive.max())) if positive.size else float("inf")
+
+
 def _determinant(matrix: np.ndarray) -> np.ndarray:
     """Of (…, 2, 2) matrices."""
     return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
@@ -160,11 +165,7 @@ class Equidistant:
 
         There is the smallest positive root of 1 + 3 k1 θ² + 5 k2 θ⁴ + 7 k3 θ⁶ + 9 k4 θ⁸.
         """
-        k1, k2, k3, k4 = self.coefficients
-        # As a polynomial in 1/θ² its first coefficient is 1: no division by a small k4.
-        roots = np.roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4])
-        positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
-        return float(min(MAX_ANGLE, 1.0 / np.sqrt(positive.max()))) if positive.size else float(MAX_ANGLE)
+        return min(float(MAX_ANGLE), _fold(*self.coefficients))
 
     @cached_property
     def monotonic_radius(self) -> float:
