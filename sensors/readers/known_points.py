@@ -65,9 +65,4 @@ def read_known_points(path: str | Path) -> KnownPixels:
         picked.append((i, ",".join(fields[names.index(column)] for column in COLUMNS)))
     table = parse_table(path, COLUMNS, picked, ",")
     table.require(table["sigma_m"] >= 0.0, "sigma_m", "zero or positive")
-    return KnownPixels(
-        names=table.names("id"),
-        px=table.block("u_px", "v_px"),
-        positions=table.block("x_m", "z_m"),
-        std_m=table["sigma_m"],
-    )
+    return KnownPixels(table.names("id"), table.block("u_px", "v_px"), table.block("x_m", "z_m"), table["sigma_m"])

@@ -212,14 +212,8 @@ def assemble(
         cov_z: (S, p, p) its covariance.
     """
     bounds = np.searchsorted(frame, np.arange(len(stamps_ns) + 1))
+    motions = [(None, None), *zip(delta, cov_delta, strict=True)]
     return [
-        Frame(
-            stamp_ns=int(stamps_ns[t]),
-            delta=delta[t - 1] if t else None,
-            cov_delta=cov_delta[t - 1] if t else None,
-            landmarks=landmarks[start:stop],
-            z=z[start:stop],
-            cov_z=cov_z[start:stop],
-        )
+        Frame(int(stamps_ns[t]), *motions[t], landmarks[start:stop], z[start:stop], cov_z[start:stop])
         for t, (start, stop) in enumerate(pairwise(bounds))
     ]

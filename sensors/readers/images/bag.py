@@ -102,12 +102,6 @@ class Bag:
         #: Types of the topics that hold messages, by their names.
         self.topics: dict[str, str] = {c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted}
 
-    @property
-    def name(self) -> str:
-        """Of the recording."""
-        whole = self.path.resolve()
-        return whole.stem if whole.is_file() else whole.name
-
     def of_type(self, *types: str) -> list[str]:
         """Topics of some types, in alphabetical order."""
         return sorted(topic for topic, kind in self.topics.items() if kind in types)
@@ -374,7 +368,9 @@ class RosBag(ImageFormat):
             stamps_ns = streams[0].stamps_ns[rows[0]]
             truth = topics.truth and read_poses(bag, topics.truth, stamps_ns, streams[0].frame)
         source = BagImages(path, stamps_ns, shape, tuple(names), tuple(rows))
-        sequence = ImageSequence(bag.name, used.camera, stamps_ns, truth or None, None, source, notes)
+        whole = path.resolve()
+        name = whole.stem if whole.is_file() else whole.name
+        sequence = ImageSequence(name, used.camera, stamps_ns, truth or None, None, source, notes)
         if cameras == 1:
             return sequence
         if not infos:
@@ -407,7 +403,6 @@ class ImageStream:
     `frame` is the name of the camera's frame.
     """
 
-    topic: str
     stamps_ns: np.ndarray
     shape: tuple[int, int]
     frame: str
@@ -440,7 +435,7 @@ class ImageStream:
         if gaps.size and not gaps.any():
             alike = f"all {len(stamps)} images have the time {stamps_ns[0]}"
             raise InputError(f"{where}: {alike}, their headers are not filled in.")
-        return cls(topic, stamps_ns, *first)
+        return cls(stamps_ns, *first)
 
 
 @final

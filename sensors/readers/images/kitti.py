@@ -83,15 +83,9 @@ class Kitti(ImageFormat):
             for folder, number in zip(folders, held, strict=False)
             if stereo and number < count
         )
-        return ImageSequence(
-            name=path.resolve().name,
-            camera=used.camera,
-            stamps_ns=rows.stamps_ns,
-            truth=_read_truth(path, projection.first_from_camera, rows.stamps_ns),
-            baseline_m=baseline_m,
-            source=FileImages(rows.stamps_ns, shape, *files),
-            notes=notes,
-        )
+        truth = _read_truth(path, projection.first_from_camera, rows.stamps_ns)
+        source = FileImages(rows.stamps_ns, shape, *files)
+        return ImageSequence(path.resolve().name, used.camera, rows.stamps_ns, truth, baseline_m, source, notes)
 
 
 @dataclass(frozen=True)
