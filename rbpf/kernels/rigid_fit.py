@@ -34,30 +34,6 @@ def _linearise(quat, shift, world, shape, weight, weighed, info, vector):
 
 
 @njit(cache=True, error_model="numpy")
-def _by_points(back, weighed, chol, slope):
-    """Fills the fit's derivative by the points (6, 3M), −Λ⁻¹ JᵀW Rᵀ, with `back` the entries of Rᵀ by rows."""
-    for m in range(weighed.shape[0]):
-        for f in range(3):
-            column, u, v, w = slope[:, 3 * m + f], back[f], back[3 + f], back[6 + f]
-            for e in range(6):
-                column[e] = -(weighed[m, e, 0] * u + weighed[m, e, 1] * v + weighed[m, e, 2] * w)
-            solve(chol, column)
-
-
-@njit(cache=True, error_model="numpy")
-def _invert(chol, inverse):
-    """(L Lᵀ)⁻¹, symmetric to the bit."""
-    for f in range(6):
-        column = inverse[:, f]
-        column[:] = 0.0
-        column[f] = 1.0
-        solve(chol, column)
-    for e in range(6):
-        for f in range(e):
-            inverse[e, f] = inverse[f, e]
-
-
-@njit(cache=True, error_model="numpy")
 def _spread(slope, cov, out):
     """Out += slope P slopeᵀ, symmetric to the bit."""
     size = cov.shape[0]
@@ -99,7 +75,22 @@ def rigid_fit(world, cov, shape, weight, start, rounds, settled, frame, slope, c
                 break
         frame[i, 0], frame[i, 1], frame[i, 2], frame[i, 3] = quat
         frame[i, 4], frame[i, 5], frame[i, 6] = shift
-        _by_points(rotation(-quat[0], -quat[1], -quat[2], quat[3]), weighed, info, slope[i])
-        _invert(info, cov_fit[i])
+        # The fit's derivative by the points, −Λ⁻¹ JᵀW Rᵀ.
+        back = rotation(-quat[0], -quat[1], -quat[2], quat[3])
+        for m in range(weighed.shape[0]):
+            for f in range(3):
+                column, u, v, w = slope[i, :, 3 * m + f], back[f], back[3 + f], back[6 + f]
+                for e in range(6):
+                    column[e] = -(weighed[m, e, 0] * u + weighed[m, e, 1] * v + weighed[m, e, 2] * w)
+                solve(info, column)
+        # Λ⁻¹, symmetric to the bit.
+        for f in range(6):
+            column = cov_fit[i, :, f]
+            column[:] = 0.0
+            column[f] = 1.0
+            solve(info, column)
+        for e in range(6):
+            for f in range(e):
+                cov_fit[i, e, f] = cov_fit[i, f, e]
         cov_frame[i] = cov_fit[i]
         _spread(slope[i], cov[i], cov_frame[i])

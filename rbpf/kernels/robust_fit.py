@@ -7,51 +7,6 @@ from rbpf.kernels import dense
 from rbpf.kernels.signature import CUBE, MATRIX, VECTOR
 
 
-@njit(cache=True, error_model="numpy")
-def _whiten(nu, jac, cov, factor, white_nu, white_jac):
-    """L⁻¹ν and L⁻¹H F of one measurement."""
-    chol = cov.copy()
-    dense.factor(chol)
-    white_nu[:] = nu
-    dense.solve_lower(chol, white_nu)
-    for r in range(factor.shape[1]):
-        for a in range(nu.size):
-            total = 0.0
-            for e in range(factor.shape[0]):
-                total += jac[a, e] * factor[e, r]
-            white_jac[a, r] = total
-        dense.solve_lower(chol, white_jac[:, r])
-
-
-@njit(cache=True, error_model="numpy")
-def _fit(white_nu, white_jac, weight, info, u):
-    """The weighted estimate u of an unknown that is N(0, I) before."""
-    info[:], u[:] = 0.0, 0.0
-    for k in range(weight.size):
-        for a in range(white_nu.shape[1]):
-            row = white_jac[k, a]
-            for r in range(u.size):
-                scaled = weight[k] * row[r]
-                u[r] += scaled * white_nu[k, a]
-                for s in range(r + 1):
-                    info[r, s] += scaled * row[s]
-    for r in range(u.size):
-        info[r, r] += 1.0
-    dense.factor(info)
-    dense.solve(info, u)
-
-
-@njit(cache=True, error_model="numpy")
-def _distances(white_nu, white_jac, u, squared):
-    for k in range(squared.size):
-        squared[k] = 0.0
-        for a in range(white_nu.shape[1]):
-            left = white_nu[k, a]
-            for r in range(u.size):
-                left -= white_jac[k, a, r] * u[r]
-            squared[k] += left * left
-
-
 @njit(void(MATRIX, CUBE, CUBE, MATRIX, int64, float64, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy")
 def robust_fit(nu, jac, cov, factor, rounds, scale, squared, u, info):
     """Fills `squared` (K,) with the Mahalanobis distances that a robust fit leaves, `u` (r,) with the fit.
@@ -64,11 +19,41 @@ def robust_fit(nu, jac, cov, factor, rounds, scale, squared, u, info):
     white_nu, white_jac = np.empty((count, p)), np.empty((count, p, rank))
     weight = np.empty(count)
     u[:] = 0.0
+    # L⁻¹ν and L⁻¹H F of each measurement.
     for k in range(count):
-        _whiten(nu[k], jac[k], cov[k], factor, white_nu[k], white_jac[k])
-    _distances(white_nu, white_jac, u, squared)
-    for _ in range(rounds):
+        chol = cov[k].copy()
+        dense.factor(chol)
+        white_nu[k] = nu[k]
+        dense.solve_lower(chol, white_nu[k])
+        for r in range(rank):
+            for a in range(p):
+                total = 0.0
+                for e in range(factor.shape[0]):
+                    total += jac[k, a, e] * factor[e, r]
+                white_jac[k, a, r] = total
+            dense.solve_lower(chol, white_jac[k, :, r])
+    for fitted in range(rounds + 1):
         for k in range(count):
+            squared[k] = 0.0
+            for a in range(p):
+                left = white_nu[k, a]
+                for r in range(rank):
+                    left -= white_jac[k, a, r] * u[r]
+                squared[k] += left * left
             weight[k] = 1.0 / (1.0 + squared[k] / (scale * scale))
-        _fit(white_nu, white_jac, weight, info, u)
-        _distances(white_nu, white_jac, u, squared)
+        if fitted == rounds:
+            break
+        # The weighted estimate of an unknown that is N(0, I) before.
+        info[:], u[:] = 0.0, 0.0
+        for k in range(count):
+            for a in range(p):
+                row = white_jac[k, a]
+                for r in range(rank):
+                    scaled = weight[k] * row[r]
+                    u[r] += scaled * white_nu[k, a]
+                    for s in range(r + 1):
+                        info[r, s] += scaled * row[s]
+        for r in range(rank):
+            info[r, r] += 1.0
+        dense.factor(info)
+        dense.solve(info, u)

@@ -172,7 +172,7 @@ def test_looking_ahead_draws_what_the_step_will(rng):
 
 
 def test_a_failing_step_leaves_the_generator(rng):
-    fails(sampled(Drawn(), Weights(), rng), "must have shape", np.zeros(240).reshape(-1, 1))
+    fails(sampled(Drawn(), Weights(), rng), "a log-likelihood of states must be", np.zeros(240).reshape(-1, 1))
 
 
 def test_what_a_sampled_motion_cannot(rng):
