@@ -15,6 +15,7 @@ from rbpf import gaussian
 from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
+from rbpf.motion.odometry import deviations
 
 #: State (N, 13) of `SampledVelocity`: world_from_body, then its velocity.
 POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
@@ -57,7 +58,7 @@ class MarginalVelocity(MotionModel):
     space = SE3
 
     def __init__(self, std_walk: np.ndarray) -> None:
-        self.std_walk = _checked(std_walk)
+        self.std_walk = deviations(std_walk, 6, "std_walk")
 
     def transition(self, state: np.ndarray, control: PosePrior | None, dt: float) -> Transition:
         """Chart at the previous pose: ε = δ v + w₁."""
@@ -86,8 +87,8 @@ class SampledVelocity(MotionModel):
     def __init__(
         self, std_walk: np.ndarray, mode: Literal["paper", "joint"] = "joint", std_start: np.ndarray | float = 0.0
     ) -> None:
-        self.std_walk = _checked(std_walk)
-        self.std_start = _checked(std_start)
+        self.std_walk = deviations(std_walk, 6, "std_walk")
+        self.std_start = deviations(std_start, 6, "std_start")
         if mode not in ("paper", "joint"):
             raise InputError(f"a sampled velocity has the mode 'paper' or 'joint', got {mode!r}")
         self.columns = 6 if mode == "paper" else 12
@@ -119,13 +120,5 @@ def _with_prior(factor: np.ndarray, prior: PosePrior) -> np.ndarray:
     walk = np.linalg.norm(factor[6:], axis=1)
     placed = np.zeros((12, 12))
     placed[:6, :6] = gaussian.psd_factor(prior.cov)
-    placed[6:, 6:] = np.diag(walk if prior.std_velocity is None else _checked(prior.std_velocity))
+    placed[6:, 6:] = np.diag(walk if prior.std_velocity is None else deviations(prior.std_velocity, 6, "std_velocity"))
     return placed
-
-
-def _checked(std: np.ndarray | float) -> np.ndarray:
-    array = np.asarray(std, dtype=float)
-    if array.shape not in ((), (6,)) or not (np.isfinite(array).all() and (array >= 0.0).all()):
-        what = "standard deviations of a velocity must be one number or six, finite and not negative"
-        raise InputError(f"{what}, got {std}")
-    return np.broadcast_to(array, (6,)).copy()

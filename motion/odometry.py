@@ -76,11 +76,8 @@ class OdometryMotion(MotionModel):
     """
 
     def __init__(self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None) -> None:
-        std = np.asarray(std_added, dtype=float)
-        if std.shape not in ((), (space.dim,)) or not (np.isfinite(std).all() and (std >= 0.0).all()):
-            raise InputError(f"std_added must be one or {space.dim} numbers from 0 up, got {std_added!r}")
         self.space = space
-        self.cov_added = np.diag(np.broadcast_to(std, space.dim) ** 2)
+        self.cov_added = np.diag(deviations(std_added, space.dim, "std_added") ** 2)
         self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
     def transition(self, state: np.ndarray, control: Odometry | None, dt: float) -> Transition:
@@ -109,3 +106,11 @@ class OdometryMotion(MotionModel):
             return Odometry(measured.delta, cov)
         delta = self.space.exp(self._free @ self.space.log(measured.delta))
         return Odometry(delta, self._free @ cov @ self._free)
+
+
+def deviations(std: ArrayLike, dim: int, name: str) -> np.ndarray:
+    """Standard deviations (dim,), of one for all or one each. Raises InputError: they are none."""
+    array = np.asarray(std, dtype=float)
+    if array.shape not in ((), (dim,)) or not (np.isfinite(array).all() and (array >= 0.0).all()):
+        raise InputError(f"{name} must be one or {dim} numbers from 0 up, got {std!r}")
+    return np.broadcast_to(array, (dim,)).copy()

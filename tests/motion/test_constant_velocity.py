@@ -131,7 +131,7 @@ def test_sound_models(motion, control):
 def test_bad_standard_deviations(std):
     np.testing.assert_array_equal(MarginalVelocity(0.5).std_walk, np.full(6, 0.5))
     for build in (MarginalVelocity, SampledVelocity, lambda std: SampledVelocity(1.0, std_start=std)):
-        with pytest.raises(InputError, match="must be one number or six, finite and not negative"):
+        with pytest.raises(InputError, match="must be one or 6 numbers from 0 up"):
             build(std)
 
 
