@@ -180,7 +180,7 @@ class TestDegenerate:
 @pytest.mark.parametrize(
     ("z_prev", "z_now", "cov", "complaint"),
     [
-        (np.zeros((5, 2)), np.zeros((5, 2)), COV, r"\(K, 3\) arrays of \(u_left, v, u_right\), got \(5, 2\)"),
+        (np.zeros((5, 2)), np.zeros((5, 2)), COV, r"\(K, 3\) arrays \(u_left, v, u_right\), got \(5, 2\)"),
         (np.zeros((5, 3)), np.full((5, 3), np.nan), COV, "NaN or infinity"),
         (np.zeros((5, 3)), np.zeros((5, 3)), np.ones((3, 3)), "cov_prev is no covariance of pixels"),
         (np.zeros((5, 3)), np.zeros((5, 3)), np.ones(3), r"cov_prev must be \(3, 3\) or \(5, 3, 3\), got \(3,\)"),
