@@ -217,12 +217,9 @@ def entry(*shape: int | str, **options: Any) -> Entry:
     return Entry(shape=shape, **options)
 
 
-numbers, integers = (
-    partial(entry, dtype=np.float64),
-    partial(entry, dtype=np.int64),
-)  #: Of an `Entry`'s shape and options.
-truths, text = partial(entry, dtype=np.bool_), partial(entry, dtype=np.str_)  #: Likewise.
-grey = partial(entry, dtype=np.uint8)  #: Grey levels of images.
+#: Arrays of an `Entry`'s shape and options: numbers, whole numbers, truth values, text, grey levels of images.
+numbers, integers = partial(entry, dtype=np.float64), partial(entry, dtype=np.int64)
+truths, text, grey = (partial(entry, dtype=kind) for kind in (np.bool_, np.str_, np.uint8))
 
 
 def elements(space: LieGroup, *shape: int | str) -> Entry:
