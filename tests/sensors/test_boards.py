@@ -150,7 +150,7 @@ def test_what_is_no_such_board_of_markers_is_refused():
     ("size", "side_m", "gap_m", "dictionary", "words"),
     [
         ("5", 0.04, 0.01, "4x4_50", "their number as 5x7"),
-        ("4x3", 0.0, 0.01, "4x4_50", "must be positive"),
+        ("4x3", 0.0, 0.01, "4x4_50", "is positive"),
         ("4x3", 0.04, -0.01, "4x4_50", "not negative"),
         ("4x3", 0.04, 0.01, "9x9_50", "no dictionary"),
     ],
