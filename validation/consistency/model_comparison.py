@@ -76,7 +76,8 @@ def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> Evi
             raise InputError("log-evidences are compared over 2 seeds or more, which tell their error")
         if not np.isfinite(logs).all():
             raise InputError(
-                f"the {name} filter has no evidence: a likelihood is no density, or updates only the particles or the map"
+                f"the {name} filter has no evidence: one of its likelihoods is not a density, or some observations updated "
+                "only the particles or only the map"
             )
     (a, error_a), (b, error_b) = map(_log_evidence, pair)
     spread = float(max(logs.std(ddof=1) for logs in pair))
@@ -117,7 +118,8 @@ def compare_evidence(
             )
     if getattr(config_a, "association", None) != getattr(config_b, "association", None):
         raise InputError(
-            "a filter that is told the landmarks' names and one that is not are incomparable: set the same association"
+            "a filter that is given the landmarks' names and one that is not do not explain the same data: set the "
+            "same association in both configurations"
         )
     # What moves the particles of a stereo filter is given, not explained: both must be given the same.
     if isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig):
@@ -129,7 +131,8 @@ def compare_evidence(
         for name in ("odometry", "trigger", "dof"):
             if getattr(config_a, name) != getattr(config_b, name):
                 raise InputError(
-                    f"two stereo filters of another {name} explain other data: what odometry says is given to them"
+                    f"two stereo configurations that differ in {name} do not explain the same data: what odometry says "
+                    "is given to the filter, and differs between them"
                 )
     in_batch = _in_batch(config_a, data, len(seeds)), _in_batch(config_b, data, len(seeds))
     if in_batch[0] and in_batch[1]:
@@ -161,7 +164,9 @@ def compare_runs(
             raise InputError(f"{record.folder}: runs of the system {record.system!r} cannot be compared by evidence")
     one, other = (RobotRecording(Path(str(record.config["recording"])), Part.of(record.config)) for record in records)
     if one != other:
-        raise InputError(f"{run_a} and {run_b} are of different recordings, or parts: evidences say nothing about them")
+        raise InputError(
+            f"{run_a} and {run_b} are runs over different recordings, or parts of one: evidences say nothing about them"
+        )
     files = [record.folder / "config.yaml" for record in records]
     configs = [load_settings(RangeBearingConfig, "range-bearing", file, (), {}) for file in files]
     return compare_evidence(configs[0], configs[1], one, range(seeds), workers, on_run)

@@ -116,7 +116,7 @@ def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
     table, path = problem.table, np.asarray(start.world_from_body, dtype=float)
     if path.shape != (problem.frames, 7) or not np.isfinite(path).all():
         raise InputError(
-            f"Expected finite initial poses {(problem.frames, 7)}, one a frame of {problem.name}, found {path.shape}."
+            f"Expected finite initial poses {(problem.frames, 7)}, one for each frame of {problem.name}, found {path.shape}."
         )
     given = {name: mean for name, (mean, _) in problem.known.items()} | dict(start.landmarks)
     points = observations.triangulate(table, path)
