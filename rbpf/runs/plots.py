@@ -351,10 +351,11 @@ class Views:
 
         planes = [plane for plane in (self.top, self.side) if plane is not None]
         figure = Figure(figsize=(6.5 * len(planes), 6.0), layout="constrained")
+        figure.suptitle(title)
         panels = figure.subplots(1, len(planes), squeeze=False)[0]
         shown = [(axes, list(plane)) for axes, plane in zip(panels, planes, strict=True)]
         for (axes, (right, up)), view in zip(shown, ("from above", "from the side"), strict=False):
-            label(axes, f"{title}, seen {view}", f"{'xyz'[right]} [m]", f"{'xyz'[up]} [m]", equal=True)
+            label(axes, f"seen {view}", f"{'xyz'[right]} [m]", f"{'xyz'[up]} [m]", equal=True)
         if self.down:
             shown[1][0].invert_yaxis()
         return figure, shown
