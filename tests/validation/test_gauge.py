@@ -93,5 +93,5 @@ def test_the_batch_is_moved_as_the_filter_is(folder):
     lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
     assert lines["batch optimum"] == pytest.approx(lines["truth"], abs=1e-6)
     assert np.abs(lines["filter"][truth.rows] - lines["truth"]).max() < 1.0
-    assert "truth's world" in figure.axes[0].get_title()
+    assert "truth's world" in figure.get_suptitle()
     assert len(read_tum(folder / "batch.tum")) == truth.rows.size
