@@ -21,7 +21,7 @@ from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
 SETTLING, TIMED, MEASUREMENTS = 30, 90, 25
-AIM_HZ = {320: 50.0, 640: 50.0}
+AIM_HZ = {320: 100.0, 640: 60.0}
 FRACTION_OF_WIDTH = 0.625
 """Focal length over the image's width, the desk world's 400 px at 640."""
 

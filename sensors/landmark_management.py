@@ -150,3 +150,14 @@ class LandmarkManager:
         if not known.all():
             raise InputError(f"there is no landmark named {names[~known][0]}")
         return rows
+
+
+def surplus(held: np.ndarray, observations: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
+    """Landmarks that a joint map drops so that at most so many are left: of those not seen now, the least often seen.
+
+    To drop a landmark is to marginalise it: what is left stays exactly as uncertain as it is, and a place whose landmarks
+    were all dropped is a new one. Landmarks (M,), how often each was seen (M,), and those seen now (k,).
+    """
+    rows = np.flatnonzero(~np.isin(held, seen))
+    rows = rows[np.argsort(observations[rows], kind="stable")]
+    return held[rows[: max(held.size - most, 0)]]

@@ -10,7 +10,8 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.landmarks import Pair, PlaceNoise, log_support
+from rbpf.systems.stereo.landmarks import Pair, log_support
+from rbpf.systems.stereo.place_noise import PlaceNoise
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import MAP_IDS
 from tests.systems.stereo_sequences import pairs

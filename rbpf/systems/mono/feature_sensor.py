@@ -21,6 +21,7 @@ from rbpf.maps.rows import BOTH, MAP, STATE
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
+from rbpf.sensors.landmark_management import surplus
 from rbpf.systems.mono.config import InverseDepthConfig
 
 MIN_DEPTHS = 4
@@ -241,7 +242,7 @@ class FeatureSensor(Sensor):
         started = self.start(frame, belief, observed)
         if self.most is not None:
             held, new = belief.map.ids, sum(len(group.z) for group in started)
-            belief.map.remove(held[~np.isin(held, frame.landmarks)][: max(held.size + new - self.most, 0)])
+            belief.map.remove(surplus(held, np.arange(held.size), frame.landmarks, self.most - new))
         return started
 
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:

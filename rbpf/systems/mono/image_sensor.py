@@ -15,6 +15,7 @@ from rbpf.maps.rows import MAP
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
+from rbpf.sensors.landmark_management import surplus
 from rbpf.sensors.patches.search import cut
 from rbpf.systems.mono.active_search import ActiveSearch, OutlierGate, SearchResult
 from rbpf.systems.mono.config import SearchConfig
@@ -227,7 +228,11 @@ class ImageSensor(Sensor):
             x, w = self.features.unknown_depth.model.world_point(records.mean[0], const)
             self.table.position[group.ids] = np.concatenate([x, w], axis=-1)
         if self.features.most is not None:
-            failing = np.append(failing, self._beyond(belief, self.features.most - frame.started.landmarks.size, rows))
+            held, most = belief.map.ids, self.features.most - frame.started.landmarks.size
+            held = held[table.alive[held]]
+            dropped = surplus(held, table.found[held], rows, most)
+            table.alive[dropped] = False
+            failing = np.append(failing, dropped)
         self.features.remove(belief, failing)
         frame.seconds_new_landmarks = time.perf_counter() - started
         return new_landmarks
@@ -287,15 +292,6 @@ class ImageSensor(Sensor):
         found = found[radius <= config.max_radius_px]
         fraction = config.lost_fraction if recognised else config.recovered_fraction
         return bool(found.sum() < max(least, fraction * found.size))
-
-    def _beyond(self, belief: Belief, most: int, looked_for: np.ndarray) -> np.ndarray:
-        """Features (K,) that are more than the map may hold: of those not looked for, the ones that were found least often."""
-        held = np.setdiff1d(belief.map.ids, looked_for)
-        held = held[self.table.alive[held]]
-        count = max(belief.map.ids.size - most, 0)
-        dropped = held[np.argsort(self.table.found[held], kind="stable")[:count]]
-        self.table.alive[dropped] = False
-        return dropped
 
     def _keep_appearances(self, image: np.ndarray, used: FeatureFrame, pose: np.ndarray) -> None:
         """Renews the last appearance of the features that look different by now.

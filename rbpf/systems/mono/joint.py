@@ -7,18 +7,20 @@ particle forgets, for none has a past.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import load_arrays
+from rbpf.core.checkpoint import integers, load_arrays, read_one
 from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import Belief, Observations, Part, Records, Sensor
+from rbpf.core.models import Belief, Observations, Part, Records
 from rbpf.core.particles import Particles, take, uniform_log_weights
 from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import Consolidation, Systematic
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
@@ -29,6 +31,8 @@ from rbpf.sensors.camera.points import CameraModel, CameraRay
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
+from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.known_start import world_of
 
 LINEARISATIONS = 3
 """Of the proposal: moments of the samples hand on what a few weights cannot mend."""
@@ -75,25 +79,92 @@ class JointRays(UnknownDepth):
         return self.own.extent(records, sigmas, min_weight)
 
 
-def are_known(belief: Belief, features: FeatureSensor, seen: FeatureFrame, ratio: float) -> bool:
-    """Whether the depths of enough of what a frame has shown are known, to a fraction of them."""
-    return seen.landmarks.size > 0 and features.depth_known(belief, seen.landmarks, ratio).mean() >= KNOWN_FRACTION
+@final
+class HandOver:
+    """Whether and when the map becomes a joint one, and the filter that goes on with it.
 
+    Args:
+        config: all settings.
+        rays: how features are kept as long as their depth is not known.
+        fixed: whether the map was made before and is not changed; it is then never joint.
 
-def is_joint(checkpoint: Path) -> bool:
-    """Whether a checkpoint was saved after the map became a joint one; errors as `rbpf.core.checkpoint.load_arrays`."""
-    return bool(load_arrays(checkpoint, JOINT))
+    Raises InputError: a joint map is asked for that cannot be.
+    """
 
+    def __init__(self, config: MonoConfig, rays: UnknownDepth, fixed: bool) -> None:
+        own, velocity = isinstance(rays, InverseDepthRays), config.velocity.mode
+        fits = own and velocity == "marginal" and config.lag is None
+        wanted = not fixed and (config.map == "joint" or (config.map == "auto" and fits))
+        if wanted and velocity != "marginal":
+            raise InputError(f"a joint map holds the velocity: set velocity.mode=marginal, not {velocity}")
+        self.config = config
+        self.joint: JointMap | None = None
+        """The joint map; None as long as every particle has a map of its own."""
+        self.particles = max(config.particles, config.starting_particles) if wanted else config.particles
+        """So many begin."""
+        self._rays: JointRays | None = None
+        if wanted:
+            if not isinstance(rays, InverseDepthRays):
+                raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
+            self._rays = JointRays(rays)
+        self._settled = 0  # frames in a row in which depths were known
 
-def joint_filter(config: MonoConfig, rays: JointRays, sensor: Sensor, rng: np.random.Generator) -> Filter:
-    """A filter on a joint map that holds nothing yet; the parametrisations are named in it."""
-    joint = JointMap(SE3, (np.zeros(6), np.diag(config.velocity.start_std() ** 2)), config.compiled)
-    joint.register(rays.landmark)
-    consolidation = Consolidation(config.window, config.resampling.ess_threshold)
-    return Filter(
-        MarginalVelocity(config.velocity.walk_std()), sensor, joint, EkfProposal(iterations=LINEARISATIONS),
-        n=config.particles, rng=rng, lag=1, consolidation=consolidation,
-    )  # fmt: skip
+    def after_frame(self, filter_: Filter, sensor: ImageSensor, seen: FeatureFrame) -> Filter | None:
+        """Takes note of what a frame has shown that was tracked; the filter on the joint map, when it is time for it."""
+        if self._rays is None or self.joint is not None:
+            return None
+        ratio, belief = self.config.inverse_depth.promote_std_ratio, filter_.belief()
+        known = sensor.features.depth_known(belief, seen.landmarks, ratio)
+        self._settled = self._settled + 1 if known.size and known.mean() >= KNOWN_FRACTION else 0
+        return self.become(filter_, sensor) if self._settled >= self.config.settled_frames else None
+
+    def become(self, filter_: Filter, sensor: ImageSensor) -> Filter:
+        """The filter on a joint map of what the particles hold; its world is that of the known points, if there are some."""
+        assert self._rays is not None
+        new, world = self._new_filter(self._rays, sensor, filter_.rng), world_of(filter_)
+        hand_over(filter_, sensor.features, self._rays, new)
+        if world is not None:
+            sensor.move(SE3.inverse(world.mean[filter_.belief().mode]))
+        return self._use(new, self._rays, sensor)
+
+    def taken_up(self, checkpoint: Path, sensor: ImageSensor, rng: np.random.Generator) -> Filter | None:
+        """The filter that a checkpoint is of, if it was saved on a joint map; errors as `load_arrays`."""
+        if self._rays is None or self.joint is not None or not load_arrays(checkpoint, JOINT):
+            return None
+        return self._use(self._new_filter(self._rays, sensor, rng), self._rays, sensor)
+
+    def hold(self, filter_: Filter, lost: bool) -> None:
+        """The joint map's frame stays where it is while the camera is lost."""
+        due = filter_.consolidation
+        if due is not None and due.held != lost:
+            filter_.consolidation = replace(due, held=lost)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {} if self._rays is None else {"mono/settled": np.array(self._settled)}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        if self._rays is not None:
+            self._settled = int(read_one(arrays, "mono/settled", integers(least=0)))
+
+    def _new_filter(self, rays: JointRays, sensor: ImageSensor, rng: np.random.Generator) -> Filter:
+        """On a joint map that holds nothing yet; the parametrisations are named in it."""
+        config = self.config
+        joint = JointMap(SE3, (np.zeros(6), np.diag(config.velocity.start_std() ** 2)), config.compiled)
+        joint.register(rays.landmark)
+        consolidation = Consolidation(config.window, config.resampling.ess_threshold)
+        return Filter(
+            MarginalVelocity(config.velocity.walk_std()), sensor, joint, EkfProposal(iterations=LINEARISATIONS),
+            n=config.particles, rng=rng, lag=1, consolidation=consolidation,
+        )  # fmt: skip
+
+    def _use(self, filter_: Filter, rays: JointRays, sensor: ImageSensor) -> Filter:
+        joint = filter_.belief().map
+        assert isinstance(joint, JointMap)
+        self.joint = joint
+        sensor.features.become_joint(rays, self.config.active)
+        return filter_
 
 
 def hand_over(old: Filter, features: FeatureSensor, rays: JointRays, new: Filter) -> None:
@@ -136,7 +207,7 @@ def hand_over(old: Filter, features: FeatureSensor, rays: JointRays, new: Filter
         turn[:, :6, :6] = -SE3.adjoint(frame)
         cov = turn @ cov @ np.swapaxes(turn, 1, 2)
     joint.begin_at(world, (means, covs), names, cov)
-    new.steps, new.stamp_ns = old.steps, old.stamp_ns
+    new.steps, new.stamp_ns, new.log_evidence = old.steps, old.stamp_ns, old.log_evidence
     here = joint.consolidate(Particles(particles.state[chosen], uniform_log_weights(n)))
     joint.resample(np.arange(new.n))  # they are all alike now
     new.particles = Particles(here.state[: new.n], uniform_log_weights(new.n))

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from rbpf import gaussian
 from rbpf.core.diagnostics import chi_square_quantile
+from rbpf.core.filter import Filter
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -18,6 +19,7 @@ from rbpf.sensors.camera.resection import resect
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.sensors.features.corners import corner_score
 from rbpf.sensors.readers import KnownPixels
+from rbpf.systems.anchoring import Anchored
 
 MAX_SIGMAS, MAX_PX = 6.0, 4.0
 """A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""
@@ -141,6 +143,16 @@ def constellation_records(
     moved = half[6:].reshape(*local.shape, -1) - by_frame(local) @ half[:6]
     turned = (SE3.rotation(frame) @ moved).reshape(-1, half.shape[1])
     return group.started(n, SE3.transform(frame, local), gaussian.symmetrise(turned @ turned.T))
+
+
+def world_of(filter_: Filter) -> Anchored | None:
+    """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
+    landmark_map = filter_.belief().map
+    first = landmark_map.ids[:1]  # it was the first landmark: no other one has to be asked
+    group = landmark_map.landmark_of(int(first[0])) if first.size else None
+    if not isinstance(group, Constellation | UncertainConstellation):
+        return None
+    return Anchored(*group.frame(landmark_map.read(first)))
 
 
 class _FirstImage:

@@ -16,14 +16,12 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Conditional, MotionModel, Records, Sensor
 from rbpf.core.particles import mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
@@ -39,9 +37,9 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
-from rbpf.systems.mono.joint import JointRays, are_known, hand_over, is_joint, joint_filter
+from rbpf.systems.mono.joint import HandOver
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
-from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
+from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture, world_of
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
 from rbpf.systems.mono.unknown_start import UnknownStart
 from rbpf.systems.system import (
@@ -155,22 +153,11 @@ class MonoSlam(System):
 
         rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
         is_fixed = known_map is not None
-        fits = isinstance(rays, InverseDepthRays) and config.velocity.mode == "marginal" and config.lag is None
-        self._becomes_joint = not is_fixed and (config.map == "joint" or (config.map == "auto" and fits))
-        if self._becomes_joint:
-            config = replace(config, particles=max(config.particles, config.starting_particles))
-        self._begins_with = config
+        self.hand_over = HandOver(config, rays, is_fixed)
         self.features = FeatureSensor(camera, rays, config.max_new_per_frame, group, is_fixed)
         self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
         self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
         self.filter = self._new_filter(self.sensor)
-        self.joint: JointMap | None = None
-        """One Gaussian of the whole map; None as long as every particle has a map of its own."""
-        self._settled = 0  # frames in a row in which depths were known
-        if self._becomes_joint and not isinstance(rays, InverseDepthRays):
-            raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
-        if self._becomes_joint and config.velocity.mode != "marginal":
-            raise InputError(f"a joint map holds the velocity: set velocity.mode=marginal, not {config.velocity.mode}")
         self.screen = ImageScreen(camera)
         if known_map is not None:
             self._add_points(known_map.points)
@@ -194,6 +181,11 @@ class MonoSlam(System):
         """How far the camera was recognised in the last frame; None where it was not lost before it."""
         self.report: StepReport | None = None
         """What the filter did in the last frame."""
+
+    @property
+    def joint(self) -> JointMap | None:
+        """One Gaussian of the whole map; None as long as every particle has a map of its own."""
+        return self.hand_over.joint
 
     def track(self, image: np.ndarray | None, stamp_ns: int) -> Tracked:
         """Takes an image (H, W) uint8, grey, of the camera's size; None where there is none at this time.
@@ -298,15 +290,14 @@ class MonoSlam(System):
             messages = [words, *messages] if words is not None else messages
 
         # 7. Once depths are known: one Gaussian, if there is to be one. It stays where it is while the camera is lost.
-        if self._becomes_joint and self.joint is None and self.start.over and not sensor.bad_frames:
+        if self.start.over and not sensor.bad_frames:
             seen = measured.used if isinstance(measured, Measurement) else measured
-            known = are_known(self.filter.belief(), self.features, seen, self.config.inverse_depth.promote_std_ratio)
-            self._settled = self._settled + 1 if known else 0
-            if self._settled >= self.config.settled_frames:
-                self._become_joint()
+            handed = self.hand_over.after_frame(self.filter, sensor, seen)
+            if handed is not None:
+                self.filter = handed
                 if isinstance(measured, Measurement):
                     self.loss.trust(self.filter, measured.image)
-        self._hold_frame()
+        self.hand_over.hold(self.filter, sensor.lost)
 
         # 8. How it stands.
         if sensor.lost and not was_lost:
@@ -416,24 +407,20 @@ class MonoSlam(System):
     def arrays(self) -> dict[str, np.ndarray]:
         """The sensor's table, the last trusted pose, and the frames of a start that is not over."""
         arrays: dict[str, np.ndarray] = {}
-        for part in (self.sensor, self.screen, self.loss, self.start):
+        for part in (self.sensor, self.screen, self.loss, self.start, self.hand_over):
             arrays |= part.arrays()
-        return arrays | ({"mono/settled": np.array(self._settled)} if self._becomes_joint else {})
+        return arrays
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
         """As `System.load`; what is saved after the map became a joint one has another filter."""
-        if self._becomes_joint and self.joint is None and is_joint(Path(path)):
-            rays = self._joint_rays()
-            self._use_joint(joint_filter(self.config, rays, self.sensor, self.filter.rng), rays)
+        self.filter = self.hand_over.taken_up(Path(path), self.sensor, self.filter.rng) or self.filter
         return super().load(path)
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        for part in (self.sensor, self.screen, self.loss, self.start):
+        for part in (self.sensor, self.screen, self.loss, self.start, self.hand_over):
             part.restore(arrays)
-        if self._becomes_joint:
-            self._settled = int(read_one(arrays, "mono/settled", integers(least=0)))
-        self._hold_frame()
+        self.hand_over.hold(self.filter, self.sensor.lost)
         table, landmark_map = self.sensor.table, self.filter.belief().map
         own = np.flatnonzero(table.alive & (table.member < 0))
         if not landmark_map.holds(own).all():
@@ -443,7 +430,7 @@ class MonoSlam(System):
 
     def _new_filter(self, sensor: Sensor) -> Filter:
         """A filter with an empty map; the parametrisations are named in it, so that a checkpoint can be read back."""
-        config, velocity = self._begins_with, self.config.velocity
+        config, velocity = self.config, self.config.velocity
         motion: MotionModel = MarginalVelocity(velocity.walk_std())
         if velocity.mode != "marginal":
             motion = SampledVelocity(velocity.walk_std(), velocity.mode, velocity.start_std())
@@ -457,36 +444,11 @@ class MonoSlam(System):
         parts: list[Conditional] = [landmark_map]
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
-        return Filter(motion, sensor, parts, proposal, resampling, config.particles, rng, lag=self.lag)
-
-    def _become_joint(self) -> None:
-        """Takes what the particles hold into one Gaussian; its world is that of the known points, where there are some."""
-        belief, world = self.filter.belief(), world_of(self.filter)
-        rays = self._joint_rays()
-        new = joint_filter(self.config, rays, self.sensor, self.filter.rng)
-        hand_over(self.filter, self.features, rays, new)
-        if world is not None:
-            self.sensor.move(SE3.inverse(world.mean[belief.mode]))
-        self._use_joint(new, rays)
-
-    def _joint_rays(self) -> JointRays:
-        assert isinstance(self.features.unknown_depth, InverseDepthRays)
-        return JointRays(self.features.unknown_depth)
-
-    def _use_joint(self, filter_: Filter, rays: JointRays) -> None:
-        joint = filter_.belief().map
-        assert isinstance(joint, JointMap)
-        self.filter, self.joint = filter_, joint
-        self.features.become_joint(rays, self.config.active)
-
-    def _hold_frame(self) -> None:
-        """A joint map's frame stays where it is while the camera is lost."""
-        if self.filter.consolidation is not None:
-            self.filter.consolidation = replace(self.filter.consolidation, held=self.sensor.lost)
+        return Filter(motion, sensor, parts, proposal, resampling, self.hand_over.particles, rng, lag=self.lag)
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
-        known, config = self.known, self._begins_with
+        known, config = self.known, self.config
         if self.known_map is not None:
             return measured, None
         if known is None:
@@ -515,7 +477,7 @@ class MonoSlam(System):
 
         # One landmark, placed by what the frame shows of it: the frame is not used again.
         landmark_map, group = self.filter.belief().map, constellation(start.points)
-        records = constellation_records(self.camera, start, group, config.particles, np.diag(std**2))
+        records = constellation_records(self.camera, start, group, self.filter.n, np.diag(std**2))
         landmark_map.add_records(records, group, ids=start.points.names[:1])
         if isinstance(measured, FeatureFrame):
             measured = measured.take(~np.isin(measured.landmarks, start.points.names))
@@ -594,13 +556,3 @@ class MonoSlam(System):
         messages = [*messages, "the run starts with the first image that shows the known points"]
         pose, cov = self._start.world_from_camera, np.diag(std**2)
         return Tracked(stamp_ns, pose, cov, TrackingState.INITIALISING, values, self._nothing(), tuple(messages))
-
-
-def world_of(filter_: Filter) -> Anchored | None:
-    """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
-    landmark_map = filter_.belief().map
-    first = landmark_map.ids[:1]  # it was the first landmark: no other one has to be asked
-    group = landmark_map.landmark_of(int(first[0])) if first.size else None
-    if not isinstance(group, Constellation | UncertainConstellation):
-        return None
-    return Anchored(*group.frame(landmark_map.read(first)))

@@ -162,7 +162,7 @@ class UnknownStart:
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         steps, optimum_ = best
         stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
-        drawn = optimum_.paths(self.config.particles, filter_.rng)
+        drawn = optimum_.paths(filter_.n, filter_.rng)
         paths = between(stamps[steps], drawn, stamps)
         filter_ = self._along(paths, set(steps.tolist()), filter_, frames)
         equal = uniform_log_weights(paths.shape[1])

@@ -33,27 +33,21 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
 from rbpf.sensors.descriptors import DescriptorStore, gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.landmark_management import LandmarkManager
+from rbpf.sensors.landmark_management import LandmarkManager, surplus
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
+from rbpf.systems.stereo.place_noise import PlaceNoise
 from rbpf.systems.system import MAP_IDS
 
 SEEN_AGAIN = 2
 """Observations of a landmark that stands still: one that moves is not where it was seen first."""
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
-OWN_NUMBERS, PRIOR_NUMBERS = 6.0, 30.0
-"""Measured numbers that a landmark's noise is worth before it is seen again, and that of all landmarks at first."""
 SIGMAS = 3.0
 """The image is widened by so many standard deviations of the camera's direction."""
 
 _PLACES = {"place": numbers("landmarks", 3), "seen_from": numbers("landmarks", 3)}
-_NOISE = {
-    "ids": integers("learnt", least=0, ascending=True, refers=MAP_IDS),
-    "own": numbers("learnt", 2),
-    "all": numbers(2),
-}
 _NAMES = {
     "held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
     "observations": integers("landmarks", least=1),
@@ -216,17 +210,6 @@ class Landmarks(Sensor, ABC, Generic[F]):
         """The inverse of `arrays`."""
 
 
-def surplus(held: np.ndarray, observations: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
-    """Landmarks that a joint map drops so that at most so many are left: of those not seen now, the least often seen.
-
-    To drop a landmark is to marginalise it: what is left stays exactly as uncertain as it is, and a place whose landmarks
-    were all dropped is a new one. Landmarks (M,), how often each was seen (M,), and those seen now (k,).
-    """
-    rows = np.flatnonzero(~np.isin(held, seen))
-    rows = rows[np.argsort(observations[rows], kind="stable")]
-    return held[rows[: max(held.size - most, 0)]]
-
-
 def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
     """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
 
@@ -350,48 +333,6 @@ class Places:
         """The inverse of `arrays`, of landmarks (M,); errors as `rbpf.core.checkpoint.read`."""
         found = read(arrays, _PLACES, "places/", landmarks=ids.size)
         self._ids, self._place, self._seen_from = ids.copy(), found["place"], found["seen_from"]
-
-
-class PlaceNoise:
-    """What each landmark's keypoint adds to its noise: a factor of the variance that its scale says, learnt as it is seen.
-
-    A keypoint on a corner of a thing keeps its place; one on an edge with something farther behind it has none, and moves
-    along as the view does. Given what the map knows after an update, Rᵢ⁻¹ (e eᵀ + cov e) has 3 times the factor on its trace,
-    on average (variational Bayes: S. Särkkä and A. Nummenmaa 2009). A new landmark has the mean of all others'.
-    """
-
-    def __init__(self) -> None:
-        self._ids = np.zeros(0, dtype=np.int64)
-        self._own = np.zeros((0, 2))  # of each landmark the sum of these traces, and how many numbers they are of
-        self._all = np.array(
-            [PRIOR_NUMBERS, PRIOR_NUMBERS]
-        )  # the same of all there ever were; at first as the scale says
-
-    def factor(self, ids: np.ndarray) -> np.ndarray:
-        """Of landmarks (k,), some of which may be new."""
-        own, known = np.zeros((ids.size, 2)), np.isin(ids, self._ids)
-        own[known] = self._own[np.searchsorted(self._ids, ids[known])]
-        return (OWN_NUMBERS * self._all[0] / self._all[1] + own[:, 0]) / (OWN_NUMBERS + own[:, 1])
-
-    def learn(self, ids: np.ndarray, error: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
-        """From residuals (k, 3) after an update, with covariances (k, 3, 3), of landmarks (k,) of such noise (k, 3, 3)."""
-        seen = np.einsum("kab,kba->k", np.linalg.inv(noise), error[:, :, None] * error[:, None] + cov)
-        held = np.union1d(self._ids, ids)
-        own = np.zeros((held.size, 2))
-        own[np.searchsorted(held, self._ids)] = self._own
-        found = np.column_stack([seen, np.full(ids.size, error.shape[1])])
-        own[np.searchsorted(held, ids)] += found
-        self._ids, self._own, self._all = held, own, self._all + found.sum(axis=0)
-
-    def remove(self, ids: np.ndarray) -> None:
-        kept = ~np.isin(self._ids, ids)
-        self._ids, self._own = self._ids[kept], self._own[kept]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"noise/ids": self._ids, "noise/own": self._own, "noise/all": self._all}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._ids, self._own, self._all = read(arrays, _NOISE, "noise/").values()
 
 
 class AssociationGate(ABC):
