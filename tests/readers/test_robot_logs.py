@@ -158,7 +158,7 @@ def test_truth_may_be_whole_partial_or_missing(tmp_path, files, path, landmarks,
     assert all(position.shape == (2,) for position in truth.landmarks.values())
     (tmp_path / path).unlink()
     partial = open_log(tmp_path).truth
-    assert partial.world_from_robot.shape == (0, 3) and len(partial.landmarks) == 2
+    assert partial.poses.shape == (0, 3) and len(partial.landmarks) == 2
     write(tmp_path, {path: files[path]})
     (tmp_path / landmarks).unlink()
     assert open_log(tmp_path).truth.landmarks == {}
