@@ -76,7 +76,7 @@ class TestKnownPoints:
             replace(self.good, **wrong)
 
 
-class TestCameraTruth:
+class TestTruth:
     poses = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0], (3, 1))
     good = Truth(np.array([0, 5, 5]), poses, {3: np.zeros(3)})
 
