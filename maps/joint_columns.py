@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbpf.core import checkpoint
 from rbpf.core.models import Landmark
 from rbpf.errors import InputError
+from rbpf.lie import Euclidean, SE2Group, SE3Group, skew
 
 
 class Table(NamedTuple):
@@ -24,25 +26,66 @@ class Kind(NamedTuple):
     rows: np.ndarray
     columns: np.ndarray  #: (K, D) of their means.
     clones: np.ndarray  #: (K, d) columns of what they are anchored at; (K, 0) where they are not.
-    by_clone: np.ndarray  #: (K,) which clones these are.
+    origins: np.ndarray  #: (K, E) K of these clones; (0, E) where there are none.
+
+
+def by_frame(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
+    """∂(Exp(ε) l)/∂ε (…, D, d) at ε = 0 and points (…, D): of a turn a column in the plane, −[l]× in space; then I."""
+    moved = np.broadcast_to(np.eye(points.shape[-1]), (*points.shape, points.shape[-1]))
+    if isinstance(space, Euclidean):
+        return moved
+    turned = -skew(points) if isinstance(space, SE3Group) else np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
+    return np.concatenate([turned, moved], axis=-1)
 
 
 class JointColumns:
     """Finds landmarks by name and by kind.
 
     Args:
-        dim: d, columns of a clone.
+        space: of the clones, which have its d columns each.
+        first: columns before those of landmarks and clones: the frame's pose and the substate.
         kinds: the parametrisations, by their numbers.
 
     Attributes:
+        size: n, columns in all.
         table: the landmarks held; `hold` replaces it.
-        clone_first: (C,) first columns of the clones.
+        clones: (C, E) K of the clones.
+        clone_first: (C,) their first columns.
     """
 
-    def __init__(self, dim: int, kinds: list[Landmark]) -> None:
+    def __init__(self, space: SE2Group | SE3Group | Euclidean, first: int, kinds: list[Landmark]) -> None:
         none = np.zeros(0, dtype=np.int64)
-        self.dim, self.kinds, self.clone_first = dim, kinds, none
+        self.space, self.first, self.kinds = space, first, kinds
+        self.size, self.clones, self.clone_first = first, np.zeros((0, space.size)), none
         self.hold(Table(none, none, none, none))
+
+    def add(self, ids: np.ndarray, landmark: Landmark, clone: np.ndarray, origins: np.ndarray) -> np.ndarray:
+        """Takes landmarks (K,) behind all others and behind new clones (C, E), of which each is at one by its row, or −1.
+
+        Returns their columns (K, D).
+        """
+        first = self.size + self.space.dim * len(origins) + landmark.dim * np.arange(ids.size)
+        clone = np.where(clone < 0, -1, clone + len(self.clones))
+        self.clone_first = np.append(self.clone_first, self.size + self.space.dim * np.arange(len(origins)))
+        self.clones = np.concatenate([self.clones, origins])
+        self.size += self.space.dim * len(origins) + landmark.dim * ids.size
+        new = Table(ids, np.full(ids.size, self.number(landmark)), first, clone)
+        self.hold(Table(*(np.concatenate(pair) for pair in zip(self.table, new, strict=True))))
+        return first[:, None] + np.arange(landmark.dim)
+
+    def drop(self, rows: np.ndarray) -> np.ndarray:
+        """Lets landmarks go by their rows, and clones at which nothing is anchored any more; the columns that are kept."""
+        gone = np.isin(np.arange(self.table.ids.size), rows)
+        columns = [kind.columns[gone[kind.rows]].ravel() for kind in self.by_kind()]
+        table = Table(*(column[~gone] for column in self.table))
+        used = np.isin(np.arange(len(self.clones)), table.clone)
+        kept = np.ones(self.size, dtype=bool)
+        kept[np.concatenate([*columns, self.clone_columns(np.flatnonzero(~used)).ravel()])] = False
+        place, number = np.cumsum(kept) - 1, np.append(np.cumsum(used) - 1, -1)
+        self.clones, self.clone_first = self.clones[used], place[self.clone_first[used]]
+        self.hold(table._replace(first=place[table.first], clone=number[table.clone]))
+        self.size = int(kept.sum())
+        return np.flatnonzero(kept)
 
     def hold(self, table: Table) -> None:
         self.table = table
@@ -81,10 +124,52 @@ class JointColumns:
 
     def clone_columns(self, clones: np.ndarray) -> np.ndarray:
         """Columns (K, d) of clones (K,)."""
-        return self.clone_first[clones, None] + np.arange(self.dim)
+        return self.clone_first[clones, None] + np.arange(self.space.dim)
+
+    def poses(self, kind: Kind, mean: np.ndarray) -> np.ndarray:
+        """Where anchored landmarks are anchored (…, K, E), in the frame, by means (…, n)."""
+        return self.space.retract(kind.origins, mean[..., kind.clones])
+
+    def points(self, kind: Kind, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Landmarks as points (…, K, dim) in the frame, of means (…, n), and how they move by their columns and clones."""
+        if not kind.landmark.anchored:
+            return kind.landmark.point(mean[..., kind.columns])
+        anchor = self.poses(kind, mean)
+        points, slope = kind.landmark.point(mean[..., kind.columns], anchor)
+        # p = K Exp(δ) l: ∂p/∂δ = R [l's turn | I] J_r.
+        near = self.space.inverse_transform(anchor, points)
+        by_clone = self.space.rotation(anchor) @ by_frame(self.space, near)
+        return points, np.concatenate([slope, by_clone @ self.space.right_jacobian(mean[..., kind.clones])], axis=-1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {"clones": self.clones, "clone_first": self.clone_first, **self.table._asdict()}
+
+    def restore(self, arrays: dict[str, np.ndarray], prefix: str, size: int) -> None:
+        """Takes up what `arrays` gave, of n columns. Raises InputError: it is damaged."""
+        rows, kinds = checkpoint.integers("landmarks", least=0), len(self.kinds)
+        schema = {
+            "ids": rows, "first": rows, "kind": checkpoint.integers("landmarks", least=0, below=kinds),
+            "clone": checkpoint.integers("landmarks", least=-1, below="clones"),
+            "clones": checkpoint.elements(self.space, "clones"), "clone_first": checkpoint.integers("clones", least=0),
+        }  # fmt: skip
+        found = checkpoint.read(arrays, schema, prefix)
+        table, self.size = Table(*(found[name] for name in Table._fields)), size
+        anchored = np.array([kind.anchored for kind in self.kinds])[table.kind]
+        if ((table.clone >= 0) != anchored).any():
+            raise InputError(f"the array {prefix}clone does not fit the landmarks' kinds")
+        self.clones, self.clone_first = found["clones"], found["clone_first"]
+        self.hold(table)
+        own = [kind.columns.ravel() for kind in self.by_kind()]
+        own.append(self.clone_columns(np.arange(len(self.clones))).ravel())
+        if not np.array_equal(np.sort(np.concatenate(own)), np.arange(self.first, size)):
+            raise InputError(
+                f"the arrays {prefix}first and {prefix}clone_first do not share the columns of {prefix}mean out"
+            )
 
     def _of_kind(self, number: int, rows: np.ndarray) -> Kind:
         landmark, clones = self.kinds[number], self.table.clone[rows]
         columns = self.table.first[rows, None] + np.arange(landmark.dim)
-        at = self.clone_columns(clones) if landmark.anchored else np.zeros((rows.size, 0), dtype=np.int64)
-        return Kind(landmark, rows, columns, at, clones)
+        if not landmark.anchored:
+            return Kind(landmark, rows, columns, np.zeros((rows.size, 0), dtype=np.int64), self.clones[:0])
+        return Kind(landmark, rows, columns, self.clone_columns(clones), self.clones[clones])

@@ -21,16 +21,12 @@ from dataclasses import replace
 from typing import final
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
-from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import (
-    NEW,
-    NULL,
     Belief,
     Jacobians,
     Landmark,
@@ -46,30 +42,25 @@ from rbpf.core.models import (
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
-from rbpf.maps.joint_columns import JointColumns, Kind, Table
+from rbpf.maps.joint_columns import JointColumns, by_frame
 from rbpf.maps.joint_rows import (
+    Given,
     Group,
     Rows,
     apart,
-    beyond_gaussian,
-    checked_ids,
     diagonal_blocks,
-    log_det,
     log_odds_of,
     multiplied,
     plus_gram,
     spread_of,
-    through,
     turned,
-    whitened,
 )
 from rbpf.maps.point import Point
-from rbpf.maps.rows import checked_new_ids, expected, first_records, linearised, projected
-from rbpf.maps.submaps import Beside, SubMap, SubMaps, by_frame
+from rbpf.maps.rows import checked_new_ids, expected, first_records, projected
+from rbpf.maps.submaps import SubMap, SubMaps
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
-GAUSSIAN = Gaussian()
 
 
 @final
@@ -92,12 +83,11 @@ class JointMap(Map):
         unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
 
     Attributes:
-        old: the sub-maps that are finished; None where there are none to be. All else is of the present one, where the
-            world is the place where it began.
+        old: the sub-maps that are finished. All else is of the present one, where the world is the place where it began.
+        held: which landmarks and clones there are, and in which columns.
         mean: (N, n) of ξ, s, and the landmarks and clones as they came.
         cov: (n, n), common to all particles.
         origin: (E,) G.
-        clones: (C, E) K of the clones.
     """
 
     evidence = False
@@ -110,25 +100,22 @@ class JointMap(Map):
         submap: int | None = None,
         unnamed: bool = False,
     ) -> None:
-        self.space, self.unnamed = space, unnamed
-        self.compiled = compiled
+        self.space, self.compiled = space, compiled
         self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
-        self._held = JointColumns(space.dim, [self.point])
         mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
         gaussian.psd_factor(cov)
         if submap is not None and mean.size:
             raise InputError("sub-maps take no substate: what it knows would tie them")
-        self._substate, self.submap = (mean, cov), submap
-        self._first = space.dim + mean.size
+        self._substate, self._first = (mean, cov), space.dim + mean.size
+        self.held = JointColumns(space, self._first, [self.point])
+        self.submap, self.unnamed = submap, unnamed
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n, self._next_id = n, 0
-        self.old = None if self.submap is None else SubMaps(self.space, self.point.dim, 2 * self.submap)
-        self._beside: Beside | None = None
-        self._frame: Estimate | None = None  # where there are finished sub-maps, what they and this one say of F
+        self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed)
         self._begin_submap()
 
     def begin_at(
@@ -148,7 +135,7 @@ class JointMap(Map):
         self.mean[:, d : self._first], self.cov[d : self._first, d : self._first] = substate
         chart = np.tile(np.eye(cov.shape[1]), (self.n, 1, 1))
         chart[:, :d, :d] = self.space.right_jacobian_inverse(offset)
-        points = self._held.of_one_kind(ids).columns.ravel().tolist() if ids.size else []
+        points = self.held.of_one_kind(ids).columns.ravel().tolist() if ids.size else []
         columns = np.array([*range(d), *points])
         moved = (chart @ cov @ np.swapaxes(chart, 1, 2)).mean(axis=0)
         self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(moved)
@@ -160,7 +147,7 @@ class JointMap(Map):
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
-        self.clones, self._held = np.zeros((0, self.space.size)), JointColumns(d, self._held.kinds)
+        self.held = JointColumns(self.space, self._first, self.held.kinds)
         self._in_step = False  # from prediction to correction: what is observed is associated with what is held
         self._gain: np.ndarray | None = None
 
@@ -214,51 +201,17 @@ class JointMap(Map):
         return decided
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        rows = self._seen_through(state, groups, prior)
-        inside = rows.inliers()
-        chol = gaussian.cholesky(rows.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
-        white = whitened(chol, np.concatenate([rows.nu[..., None], rows.by_state], axis=2)[:, inside])
-        nu, by_state = white[..., 0], white[..., 1:]
-        turned = np.swapaxes(by_state, 1, 2)
-        total = Information.zeros(*by_state.shape[::2])
-        total.info += turned @ by_state
-        total.vector += (turned @ nu[..., None])[..., 0]
-        total.quad += np.square(nu).sum(axis=1)
-        total.log_factor += rows.log_factor
-        total.rows += inside.size
-        is_density = np.ones(rows.nu.shape[1], dtype=bool)
-        for likelihood, own, log_odds in rows.groups:
-            count = int((log_odds >= 0.0).sum())
-            total.log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
-            is_density[own] = likelihood.normalised
-        total.log_det += log_det(chol[np.ix_(kept := is_density[inside], kept)])
-        return total
+        return self._seen_through(state, groups, prior).information()
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
-        self.mean, self.cov = self._given(increment)
+        given = self._given(state, increment)
+        self.mean, self.cov = given.mean, given.cov
         self._gain, self._in_step = None, False
         if not groups:
             return LogDensities(np.zeros(self.n), np.zeros(self.n))
-        rows = self._rows(state, self.mean, self.cov, groups)
-        inside = rows.inliers()
-        chol = gaussian.cholesky(rows.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
-        nu = whitened(chol, rows.nu[:, inside, None])[..., 0]
-        total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(chol))
-        total += beyond_gaussian(rows, inside, chol, nu)
-        slope = through(rows.slopes, self.cov[rows.columns])[inside]
-        half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        moves, cov = multiplied(nu, half), plus_gram(self.cov, half, -1.0)
-        fixed = rows.considered
-        if fixed.size:
-            # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
-            # are wider apart than they are uncertain would take more out of it than there is: they are off, not informative.
-            moves[:, fixed] -= moves[:, fixed].mean(axis=0)
-            values, vectors = np.linalg.eigh(spread_of(nu, np.full(self.n, 1.0 / self.n)))
-            root = np.sqrt(np.clip(values, 0.0, 1.0))[:, None] * vectors.T @ half[:, fixed]
-            at = np.ix_(fixed, fixed)
-            cov[at] = self.cov[at] - gaussian.symmetrise(root.T @ root)
-        self.mean, self.cov = self.mean + moves, cov
+        total, moves, self.cov = given.rows(groups).update(self.cov)
+        self.mean = self.mean + moves
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
@@ -269,67 +222,52 @@ class JointMap(Map):
 
     def consolidate(self, particles: Particles) -> Particles:
         """Ends the window: the frame moves to the robot; what the particles differ by enters the common covariance."""
-        self.origin, self.clones, mean, self.cov = self._consolidated(particles)
+        self.origin, self.held.clones, mean, self.cov = self._consolidated(particles)
         self.mean = np.repeat(mean[None], self.n, axis=0)
-        if self.old is not None and self.submap is not None:
-            ids = self._held.table.ids
+        if self.submap is not None:
             present = self._finished(self.origin, mean, self.cov)
-            # As many as tell a pose in space; with fewer the sub-map waits for more.
-            enough = ids.size >= self.submap or self.old.returned(ids).sum() >= 3
-            recall = False
-            if self.unnamed and self.old.maps and ids.size and not self._in_step:
-                reach = float(np.linalg.norm(present.points, axis=1).max())
-                recall = self.old.comes_near(self.old.end(present), reach)
-            if not self._in_step and (enough or recall):
-                self.old.join(present, recall)
+            if not self._in_step and self.old.take(present, len(self.ids) >= self.submap):
                 self._begin_submap()
                 present = self._finished(self.origin, self.mean[0], self.cov)
-            if self.old.maps:
-                self._frame = self.old.end(present)
-                self._beside = self.old.beside(present) if self.unnamed else None
+            self.old.look_from(present)
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
 
     def widened(self) -> "JointMap":
         """With the landmarks of old sub-maps that are next to the frame: what may be expected, and nothing is done with it."""
-        found = self._beside
-        if found is None:
-            return self
-        held, new, dim = self.holds(found.own), ~self.holds(found.ids), self.point.dim
-        columns = self._held.of_one_kind(found.own[held]).columns
-        at, rows = np.repeat(held, dim), np.repeat(new, dim)
-        slope, rest = found.slope[np.ix_(rows, at)], found.rest[np.ix_(rows, rows)]
-        moved = self.mean[:, columns.ravel()] - found.theirs[held].ravel()
-        cross = slope @ self.cov[columns.ravel()]
-        wide, size, count = copy(self), self.mean.shape[1], int(new.sum())
-        wide.mean = np.concatenate([self.mean, found.points[new].ravel() + moved @ slope.T], axis=1)
-        wide.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns.ravel()] @ slope.T]])
-        none = np.zeros(count, dtype=np.int64)
-        table = Table(found.ids[new], none, size + dim * np.arange(count), none - 1)
-        wide._held = JointColumns(self.space.dim, self._held.kinds)
-        wide._held.hold(Table(*(np.concatenate(pair) for pair in zip(self._held.table, table, strict=True))))
+        wide = copy(self)
+        wide.held, wide.mean, wide.cov = self.old.widened(self.held, self.mean, self.cov)
         return wide
 
     @property
     def all_ids(self) -> np.ndarray:
         """Of all landmarks, those of old sub-maps, too."""
-        return self.ids if self.old is None else np.union1d(self.ids, self.old.ids)
+        return self.ids if self.submap is None else np.union1d(self.ids, self.old.ids)
 
     def estimate(self, particles: Particles) -> Estimate:
         """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
         d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
         origin, turn = self.space.mean(world, weights), self._turn(particles)
-        within = self.cov[:d, :d] if self._frame is None else self._frame.cov
+        within = self.cov[:d, :d] if self.old.frame is None else self.old.frame.cov
         cov = turn @ within @ turn.T + spread_of(self.space.local(origin, world), weights)
         return Estimate(origin, gaussian.symmetrise(cov))
 
     def landmarks(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Names (M,) of all landmarks, means (M, D) and covariances (M, D, D) in the world."""
-        if self.old is None or not self.old.maps:
-            return self.ids, *self.in_world(particles)
-        if not self.ids.size:
-            return self.old.landmarks()
-        origin, _, mean, cov = self._consolidated(particles)
-        return self.old.with_one_more(self._finished(origin, mean, cov)).landmarks()
+        origin, clones, mean, cov = self._consolidated(particles)
+        if self.old.maps:
+            return self.old.landmarks(self._finished(origin, mean, cov))
+        d, dim, turn, held = self.space.dim, self.point.dim, self.space.rotation(origin), copy(self.held)
+        held.clones = clones
+        means, covs = np.empty((len(self.ids), dim)), np.empty((len(self.ids), dim, dim))
+        for kind in held.by_kind():
+            points, slope = held.points(kind, mean)
+            # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
+            columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
+            blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
+            by_all = turn @ np.concatenate([by_frame(self.space, points), slope], axis=-1)
+            means[kind.rows] = self.space.transform(origin, points)
+            covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
+        return self.ids, means, covs
 
     def moments(self, particles: Particles, of: Part | np.ndarray = Part.LANDMARK) -> tuple[np.ndarray, np.ndarray]:
         """As `Belief.moments`; the substate stays in the robot's frame."""
@@ -349,32 +287,16 @@ class JointMap(Map):
         return self.landmarks(particles)[1:]
 
     def _finished(self, origin: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> SubMap:
-        columns = self._held.of_one_kind(self._held.table.ids).columns
+        columns = self.held.of_one_kind(self.ids).columns
         used = np.append(np.arange(self.space.dim), columns)
         return SubMap(origin, self.ids, mean[columns], cov[np.ix_(used, used)])
 
-    def in_world(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
-        """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`; see `landmarks`."""
-        origin, clones, mean, cov = self._consolidated(particles)
-        d, dim = self.space.dim, self.point.dim
-        means, covs = np.empty((self._held.table.ids.size, dim)), np.empty((self._held.table.ids.size, dim, dim))
-        turn = self.space.rotation(origin)
-        for kind in self._held.by_kind():
-            points, slope = self._points(kind, mean, clones)
-            # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
-            columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
-            blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
-            by_all = turn @ np.concatenate([by_frame(self.space, points), slope], axis=-1)
-            means[kind.rows] = self.space.transform(origin, points)
-            covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
-        return means, covs
-
     def world(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
         """World_from_robot (n, E) of some particles, without what is uncertain about each one's frame."""
-        if self._frame is None:
+        if self.old.frame is None:
             return self._from_start(state, particles)
         # Sub-maps tell the frame's place when it moves: it is the same until then.
-        return self.space.compose(self._frame.mean, state)
+        return self.space.compose(self.old.frame.mean, state)
 
     def _from_start(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
         """As `world`, from where the present sub-map begins."""
@@ -392,16 +314,17 @@ class JointMap(Map):
         moved = self.mean.copy()
         moved[:, :d] = space.local(origin, world)
         blocks = [(np.arange(d)[None], self._turn(particles)[None])]
-        for kind in self._held.by_kind():
+        for kind in self.held.by_kind():
             if not kind.landmark.anchored:
                 moved[:, kind.columns] = kind.landmark.seen_from(space, state[:, None], self.mean[:, kind.columns])[0]
                 blocks.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
-        clones = self.clones
+        clones = self.held.clones
         if len(clones):
             # Mathematics (clone), with K' what the mean of the particles sees.
-            at = self._held.clone_columns(np.arange(len(clones)))
+            at = self.held.clone_columns(np.arange(len(clones)))
+            poses = space.retract(clones, self.mean[:, at])
             clones = space.between(centre, space.retract(clones, before[at]))
-            moved[:, at] = space.local(clones, space.between(state[:, None], self._poses(self.mean, at, self.clones)))
+            moved[:, at] = space.local(clones, space.between(state[:, None], poses))
         mean = weighted_mean(moved, weights)
         if len(clones):
             blocks.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
@@ -414,20 +337,20 @@ class JointMap(Map):
         frame = weighted_mean(self.mean[:, : self.space.dim], particles.weights)
         return self.space.adjoint(self.space.inverse(centre)) @ self.space.right_jacobian(frame)
 
-    def _given(self, increment: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Means (N, n) given increments (N, d), and the covariance; a substate has been seen through the increment."""
-        if self._gain is None or increment is None:
-            return self.mean, self.cov
-        return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
+    def _given(self, state: np.ndarray, increment: np.ndarray | None) -> Given:
+        """What is held given states and increments (N, d), through which a substate has been seen."""
+        mean, cov = self.mean, self.cov
+        if self._gain is not None and increment is not None:
+            mean, cov = self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
+        return Given(self.held, self.origin if self.submap is None else None, self.compiled, state, mean, cov)
 
     def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Rows:
         """The rows at predicted states; what has been seen through the increment of a substate moves with the state."""
         increment = None if self._gain is None else self.space.local(prior.base, state)
-        rows = self._rows(state, *self._given(increment), groups)
+        rows = self._given(state, increment).rows(groups)
         if increment is None or self._gain is None:
             return rows
-        slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
-        return rows._replace(by_state=rows.by_state + through(rows.slopes, slope))
+        return rows.moving(self._gain, self.space.right_jacobian_inverse(increment))
 
     def _foreseen(self, groups: Sequence[Observations], belief: Belief) -> tuple[np.ndarray, np.ndarray, list[Group]]:
         """Mean (R,) and covariance (R, R) of the innovations under all particles, and whose rows they are."""
@@ -438,119 +361,34 @@ class JointMap(Map):
         apart = rows.nu - nu
         return nu, rows.cov + spread @ spread.T + multiplied((weights[:, None] * apart).T, apart), rows.groups
 
-    def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
-        """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
-        d = self.space.dim
-        nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
-        noises, log_factor, parts = list[np.ndarray](), 0.0, list[Group]()
-        considered, read = [np.zeros(0, dtype=np.int64)], list[tuple[np.ndarray, np.ndarray]]()
-        for group in groups:
-            model, z, noise, ids = group.model, group.z, group.cov, checked_ids(group)
-            log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
-            at, kind, landmarks, anchors, substate = state[:, None], None, None, None, None
-            if ids is not None:
-                log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
-                z, noise, log_odds, ids = z[ids >= 0], noise[ids >= 0], log_odds[ids >= 0], ids[ids >= 0]
-                kind = self._held.of_one_kind(ids)
-                landmarks = mean[:, kind.columns]
-                if kind.landmark.anchored:
-                    anchors = self._poses(mean, kind.clones, self.clones[kind.by_clone])
-            if Part.SUBSTATE in model.reads:
-                substate = mean[:, None, d : self._first]
-            in_world = model.reads == frozenset({Part.STATE})
-            if in_world:
-                if self.old is not None:
-                    raise InputError(
-                        f"{type(model).__name__} observes the pose in the world: sub-maps do not take that"
-                    )
-                frame = self.space.retract(self.origin, mean[:, :d])
-                at = self.space.compose(frame, state)[:, None]
-            if landmarks is None or substate is not None or not self.compiled:
-                nu, jac = linearise(model, self.space, z, at, landmarks, anchors, substate)
-            else:
-                nu, *found = linearised(model, self.space, z, state, landmarks, anchors, True)
-                jac = Jacobians(*found)
-            count, p = z.shape
-            # What each observation reads of the Gaussian, and by what slope.
-            used = list[tuple[np.ndarray, np.ndarray]]()
-            if kind is not None and jac.landmark is not None:
-                slope = jac.landmark.mean(axis=0)
-                used.append((kind.columns, slope))
-                considered.append(kind.columns[kind.landmark.considered(slope, diagonal_blocks(cov, kind.columns))])
-            if kind is not None and anchors is not None and jac.state is not None:
-                # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
-                turn = self.space.adjoint(self.space.between(state[:, None], anchors))
-                turn = turn @ self.space.right_jacobian(mean[:, kind.clones])
-                used.append((kind.clones, -(jac.state @ turn).mean(axis=0)))
-            if jac.substate is not None:
-                used.append((np.tile(np.arange(d, self._first), (count, 1)), jac.substate.mean(axis=0)))
-            if in_world and jac.state is not None:
-                # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
-                turn = self.space.adjoint(self.space.inverse(state)) @ self.space.right_jacobian(mean[:, :d])
-                used.append((np.tile(np.arange(d), (count, 1)), (jac.state @ turn[:, None]).mean(axis=0)))
-            none = np.zeros((count, 0), dtype=np.int64), np.zeros((count, p, 0))
-            at, slopes = zip(none, *used, strict=True)
-            read.append((np.concatenate(at, axis=1), np.concatenate(slopes, axis=2)))
-            by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
-            nus.append(np.broadcast_to(nu, (self.n, count, p)).reshape(self.n, -1))
-            by_states.append(np.broadcast_to(by_state, (self.n, count, p, d)).reshape(self.n, -1, d))
-            first = sum(len(each) for each in noises)
-            parts.append(Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
-            noises.extend(noise)
-        columns = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(at.ravel() for at, _ in read)]))
-        sparse = [(np.searchsorted(columns, at), slope) for at, slope in read]
-        innovation = gaussian.symmetrise(through(sparse, through(sparse, cov[np.ix_(columns, columns)]).T))
-        end = 0
-        for noise in noises:
-            rows = slice(end, end := end + noise.shape[0])
-            innovation[rows, rows] += noise
-        nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
-        return Rows(nu, by_state, sparse, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
-
-    def _poses(self, mean: np.ndarray, columns: np.ndarray, clones: np.ndarray) -> np.ndarray:
-        """Clones (…, K, E) in the frame, of means (…, n), by their columns (K, d) and origins (K, E)."""
-        return self.space.retract(clones, mean[..., columns])
-
-    def _points(self, kind: Kind, mean: np.ndarray, clones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks as points (…, M, dim) in the frame, of means (…, n), and how they move by their columns and clones."""
-        landmark, space = kind.landmark, self.space
-        if not landmark.anchored:
-            return landmark.point(mean[..., kind.columns])
-        anchor = self._poses(mean, kind.clones, clones[kind.by_clone])
-        points, slope = landmark.point(mean[..., kind.columns], anchor)
-        # p = K Exp(δ) l: ∂p/∂δ = R [l's turn | I] J_r.
-        near = space.inverse_transform(anchor, points)
-        by_clone = space.rotation(anchor) @ by_frame(space, near) @ space.right_jacobian(mean[..., kind.clones])
-        return points, np.concatenate([slope, by_clone], axis=-1)
-
     @property
     def ids(self) -> np.ndarray:
-        return self._held.table.ids.copy()
+        return self.held.table.ids.copy()
 
     @property
     def stored_fraction(self) -> float:
-        sizes = np.array([kind.dim * (kind.dim + 3) // 2 for kind in self._held.kinds])
-        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * int(sizes[self._held.table.kind].sum()), 1)
+        sizes = np.array([kind.dim * (kind.dim + 3) // 2 for kind in self.held.kinds])
+        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * int(sizes[self.held.table.kind].sum()), 1)
 
     def holds(self, ids: np.ndarray) -> np.ndarray:
-        return self._held.holds(ids)
+        return self.held.holds(ids)
 
     def landmark_of(self, landmark_id: int) -> Landmark:
-        return self._held.kinds[self._held.table.kind[self._held.rows_of(np.array([landmark_id]))[0]]]
+        return self.held.kinds[self.held.table.kind[self.held.rows_of(np.array([landmark_id]))[0]]]
 
     def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
-        held, number = self.holds(ids), self._held.number(landmark)
-        held[held] = self._held.table.kind[self._held.rows_of(np.asarray(ids)[held])] == number
+        held, number = self.holds(ids), self.held.number(landmark)
+        held[held] = self.held.table.kind[self.held.rows_of(np.asarray(ids)[held])] == number
         return held
 
     def read(self, ids: np.ndarray, particles: np.ndarray | slice = slice(None)) -> Records:
         """Means and covariances in the frame; of what is anchored those in the anchor's, whose clone is the constant."""
-        kind = self._held.of_one_kind(np.asarray(ids))
+        kind = self.held.of_one_kind(np.asarray(ids))
         own = self.mean[particles]
         mean, blocks = own[:, kind.columns], diagonal_blocks(self.cov, kind.columns)
         const = None
         if kind.landmark.anchored:
-            const = self._poses(own, kind.clones, self.clones[kind.by_clone])
+            const = self.held.poses(kind, own)
         return Records(mean, np.broadcast_to(blocks, (*mean.shape, mean.shape[-1])), const)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
@@ -568,7 +406,7 @@ class JointMap(Map):
         self.register(landmark)
         if not (np.isfinite(records.mean).all() and np.isfinite(records.cov).all()):
             raise InputError("a new landmark has a mean or covariance that is not finite")
-        count, size, dim, d = records.mean.shape[1], self.mean.shape[1], landmark.dim, self.space.dim
+        count, dim, d = records.mean.shape[1], landmark.dim, self.space.dim
         ids = checked_new_ids(ids, count, self._next_id, self.holds)
         # Given the path, what is new owes its error to its own measurement alone, and a clone of the path has none.
         mean = np.broadcast_to(records.mean, (self.n, count, dim)).reshape(self.n, -1)
@@ -580,7 +418,7 @@ class JointMap(Map):
             clone = clone.reshape(-1)
             origins = anchors[0, which]
             places = self.space.local(origins, anchors[:, which])
-        grown = size + places.shape[1] * d + mean.shape[1]
+        old, grown = self.mean.shape[1], self.mean.shape[1] + places.shape[1] * d + mean.shape[1]
         if grown > LARGEST:
             most = (LARGEST - self._first) // self.point.dim
             raise InputError(
@@ -588,16 +426,10 @@ class JointMap(Map):
             )
         self.mean = np.concatenate([self.mean, places.reshape(self.n, -1), mean], axis=1)
         cov = np.zeros((grown, grown))
-        cov[:size, :size] = self.cov
-        self._held.clone_first = np.append(self._held.clone_first, size + d * np.arange(len(origins)))
-        first = size + places.shape[1] * d + dim * np.arange(count)
-        columns = first[:, None] + np.arange(dim)
+        cov[:old, :old] = self.cov
+        columns = self.held.add(ids, landmark, clone, origins)
         cov[columns[:, :, None], columns[:, None, :]] = records.cov.mean(axis=0)
         self.cov = cov
-        clone = np.where(clone < 0, -1, clone + len(self.clones))
-        self.clones = np.concatenate([self.clones, origins])
-        new = Table(ids, np.full(count, self._held.number(landmark)), first, clone)
-        self._held.hold(Table(*(np.concatenate(pair) for pair in zip(self._held.table, new, strict=True))))
         self._next_id = max(self._next_id, int(ids.max(initial=-1)) + 1)
         return ids
 
@@ -607,7 +439,7 @@ class JointMap(Map):
         The filter that saves and the one that loads name the same ones in the same order. Raises InputError: it has
         components, constants that are no anchor, or does not say how it moves with the frame.
         """
-        if self._held.number(landmark) >= 0:
+        if self.held.number(landmark) >= 0:
             return
         space, anchor = self.space, self.space.identity() if landmark.anchored else None
         if landmark.anchored and self.submap is not None:
@@ -619,25 +451,13 @@ class JointMap(Map):
                 f"not {type(landmark).__name__}"
             )
         landmark.seen_from(space, space.identity(), np.zeros(landmark.dim))
-        self._held.kinds.append(landmark)
+        self.held.kinds.append(landmark)
 
     def remove(self, ids: np.ndarray) -> None:
-        rows = self._held.rows_of(ids)
-        gone = [kind.columns[np.isin(kind.rows, rows)].ravel() for kind in self._held.by_kind()]
-        self._held.hold(Table(*(np.delete(column, rows) for column in self._held.table)))
-        self._drop(gone)
+        self._keep(self.held.drop(self.held.rows_of(ids)))
 
-    def _drop(self, gone: list[np.ndarray]) -> None:
-        """Removes columns, and clones at which nothing is anchored any more."""
-        used = np.isin(np.arange(len(self.clones)), self._held.table.clone)
-        kept = np.ones(self.mean.shape[1], dtype=bool)
-        kept[np.concatenate([*gone, self._held.clone_columns(np.flatnonzero(~used)).ravel()])] = False
-        at = np.flatnonzero(kept)
-        self.mean, self.cov = self.mean[:, kept], self.cov.take(at, axis=0).take(at, axis=1)
-        place, number = np.cumsum(kept) - 1, np.append(np.cumsum(used) - 1, -1)
-        self.clones, self._held.clone_first = self.clones[used], place[self._held.clone_first[used]]
-        table = self._held.table
-        self._held.hold(table._replace(first=place[table.first], clone=number[table.clone]))
+    def _keep(self, columns: np.ndarray) -> None:
+        self.mean, self.cov = self.mean[:, columns], self.cov.take(columns, axis=0).take(columns, axis=1)
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
         """Turns anchored landmarks into points of the frame: with all that they are correlated with, to first order.
@@ -648,14 +468,10 @@ class JointMap(Map):
         ids = np.asarray(ids, dtype=np.int64)
         if not ids.size:
             return
-        kind = self._held.of_one_kind(ids)
-        if (
-            not kind.landmark.anchored
-            or self._held.number(to or self.point) != 0
-            or kind.landmark.dim != self.point.dim
-        ):
+        kind = self.held.of_one_kind(ids)
+        if not kind.landmark.anchored or self.held.number(to or self.point) != 0 or kind.landmark.dim != self.point.dim:
             raise InputError(f"a joint map turns what is anchored into Point({self.point.dim})")
-        points, slopes = kind.landmark.promote(self.read(ids)).mean, self._points(kind, self.mean, self.clones)[1]
+        points, slopes = kind.landmark.promote(self.read(ids)).mean, self.held.points(kind, self.mean)[1]
         slope, columns = slopes.mean(axis=0), np.concatenate([kind.columns, kind.clones], axis=1)
         # P' = T P Tᵀ, where T has the slope in the rows of each landmark.
         for _ in range(2):
@@ -663,14 +479,14 @@ class JointMap(Map):
             self.cov = self.cov.T
         self.cov = gaussian.symmetrise(self.cov)
         self.mean[:, kind.columns] = points
-        kinds, clones = self._held.table.kind.copy(), self._held.table.clone.copy()
+        kinds, clones = self.held.table.kind.copy(), self.held.table.clone.copy()
         kinds[kind.rows], clones[kind.rows] = 0, -1
-        self._held.hold(self._held.table._replace(kind=kinds, clone=clones))
-        self._drop([])
+        self.held.hold(self.held.table._replace(kind=kinds, clone=clones))
+        self._keep(self.held.drop(kind.rows[:0]))
 
     def loosen(self, ids: np.ndarray, cov: np.ndarray) -> None:
         """Landmarks (K,) may have moved by as much, covariance (K, D, D), in the frame: each by itself."""
-        columns = self._held.of_one_kind(ids).columns
+        columns = self.held.of_one_kind(ids).columns
         self.cov = self.cov.copy()
         self.cov[columns[:, :, None], columns[:, None, :]] += cov
 
@@ -709,55 +525,23 @@ class JointMap(Map):
 
     def arrays(self) -> dict[str, np.ndarray]:
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}
-        named |= {"clones": self.clones, "clone_first": self._held.clone_first, **self._held.table._asdict()}
-        named = {f"joint/{name}": array for name, array in named.items()}
-        if self._frame is not None:
-            named |= {"joint/frame": self._frame.mean, "joint/frame_cov": self._frame.cov}
-        if self._beside is not None:
-            named |= {f"joint/beside/{name}": array for name, array in self._beside._asdict().items()}
-        return named if self.old is None else named | self.old.arrays()
+        named = {f"joint/{name}": array for name, array in (named | self.held.arrays()).items()}
+        return named if self.submap is None else named | self.old.arrays()
 
     def options(self) -> dict[str, object]:
-        kinds = [type(kind).__name__ for kind in self._held.kinds]
+        kinds = [type(kind).__name__ for kind in self.held.kinds]
         return {"joint substate": self._first - self.space.dim, "joint kinds": kinds, "submap": self.submap}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        rows, kinds = checkpoint.integers("landmarks", least=0), len(self._held.kinds)
         schema = {
-            "ids": rows, "first": rows, "kind": checkpoint.integers("landmarks", least=0, below=kinds),
-            "clones": checkpoint.elements(self.space, "clones"), "clone_first": checkpoint.integers("clones", least=0),
-            "clone": checkpoint.integers("landmarks", least=-1, below="clones"), "next": checkpoint.integers(1, least=0),
             "mean": checkpoint.numbers("n", "size"), "cov": checkpoint.numbers("size", "size"),
-            "origin": checkpoint.elements(self.space),
+            "origin": checkpoint.elements(self.space), "next": checkpoint.integers(1, least=0),
         }  # fmt: skip
         found = checkpoint.read(arrays, schema, "joint/", n=self.n)
-        table, self._next_id = Table(*(found[name] for name in Table._fields)), int(found["next"][0])
-        if np.unique(table.ids).size < table.ids.size or table.ids.max(initial=-1) >= self._next_id:
-            raise InputError("the array joint/ids names a landmark twice, or one that was never started")
-        anchored = np.array([kind.anchored for kind in self._held.kinds])[table.kind]
-        if ((table.clone >= 0) != anchored).any():
-            raise InputError("the array joint/clone does not fit the landmarks' kinds")
-        self._held.hold(table)
         self.mean, self.cov, self.origin = found["mean"], found["cov"], found["origin"]
-        self.clones, self._held.clone_first = found["clones"], found["clone_first"]
-        own = [kind.columns.ravel() for kind in self._held.by_kind()]
-        own.append(self._held.clone_columns(np.arange(len(self.clones))).ravel())
-        if not np.array_equal(np.sort(np.concatenate(own)), np.arange(self._first, self.mean.shape[1])):
-            raise InputError("the arrays joint/first and joint/clone_first do not share the columns of joint/mean out")
-        if self.old is not None:
+        self.held.restore(arrays, "joint/", self.mean.shape[1])
+        self._next_id = int(found["next"][0])
+        if np.unique(self.ids).size < self.ids.size or self.ids.max(initial=-1) >= self._next_id:
+            raise InputError("the array joint/ids names a landmark twice, or one that was never started")
+        if self.submap is not None:
             self.old.restore(arrays)
-            if self.old.maps:
-                d = self.space.dim
-                schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}
-                found = checkpoint.read(arrays, schema, "joint/")
-                self._frame = Estimate(found["frame"], found["frame_cov"])
-                if self.unnamed:
-                    dim = self.point.dim
-                    schema = {
-                        "ids": checkpoint.integers("others", least=0), "points": checkpoint.numbers("others", dim),
-                        "own": checkpoint.integers("own", least=0), "theirs": checkpoint.numbers("own", dim),
-                        "slope": checkpoint.numbers("rows", "columns"), "rest": checkpoint.numbers("rows", "rows"),
-                    }  # fmt: skip
-                    self._beside = Beside(**checkpoint.read(arrays, schema, "joint/beside/"))
-                    if self._beside.slope.shape != (self._beside.points.size, self._beside.theirs.size):
-                        raise InputError("the array joint/beside/slope does not fit the landmarks beside it")

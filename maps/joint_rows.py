@@ -1,8 +1,9 @@
-"""The rows of a step of a joint map, stacked: what a Kalman update needs, and which of them are outliers.
+"""The rows of a step of a joint map: linearised and stacked, what a Kalman update takes of them, and which are outliers.
 
 Observations of one Gaussian are judged together, once for all particles, Mathematics (joint-outliers).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,10 +11,13 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dsyrk
 
 from rbpf import gaussian
-from rbpf.core.models import Likelihood, Observations, Part
-from rbpf.core.particles import weighted_mean
+from rbpf.core.linearisation import linearise
+from rbpf.core.models import NEW, NULL, Jacobians, Likelihood, Observations, Part
+from rbpf.core.particles import Information, weighted_mean
 from rbpf.errors import InputError
 from rbpf.kernels.dense import add_gram, congruent, mirror, product
+from rbpf.maps.joint_columns import JointColumns
+from rbpf.maps.rows import GAUSSIAN, linearised
 
 QUICK = 30_000_000
 """Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
@@ -50,6 +54,135 @@ class Rows(NamedTuple):
             return np.arange(self.nu.shape[1])
         found = [(-odds, *rows) for _, *part in self.groups for rows, odds in zip(*part, strict=True) if odds >= 0.0]
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
+
+    def factor(self) -> tuple[np.ndarray, np.ndarray]:
+        """The `inliers`, and Cholesky's factor of their covariance."""
+        inside = self.inliers()
+        return inside, gaussian.cholesky(self.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
+
+    def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
+        """The same where all that is held moves with the state, by gain (n, d) times turn (N, d, d)."""
+        return self._replace(by_state=self.by_state + through(self.slopes, gain[self.columns] @ turn))
+
+    def information(self) -> Information:
+        """What the rows say of the state."""
+        inside, chol = self.factor()
+        white = whitened(chol, np.concatenate([self.nu[..., None], self.by_state], axis=2)[:, inside])
+        nu, by_state = white[..., 0], white[..., 1:]
+        turned = np.swapaxes(by_state, 1, 2)
+        total = Information.zeros(*by_state.shape[::2])
+        total.info += turned @ by_state
+        total.vector += (turned @ nu[..., None])[..., 0]
+        total.quad += np.square(nu).sum(axis=1)
+        total.log_factor += self.log_factor
+        total.rows += inside.size
+        is_density = np.ones(self.nu.shape[1], dtype=bool)
+        for likelihood, own, log_odds in self.groups:
+            count = int((log_odds >= 0.0).sum())
+            total.log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
+            is_density[own] = likelihood.normalised
+        total.log_det += log_det(chol[np.ix_(kept := is_density[inside], kept)])
+        return total
+
+    def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One gain for all particles: log p(z | x) (N,), by what the means move (N, n), and the covariance (n, n) after."""
+        inside, chol = self.factor()
+        nu = whitened(chol, self.nu[:, inside, None])[..., 0]
+        total = self.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(chol))
+        total += beyond_gaussian(self, inside, chol, nu)
+        slope = through(self.slopes, cov[self.columns])[inside]
+        half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
+        moves, after = multiplied(nu, half), plus_gram(cov, half, -1.0)
+        fixed = self.considered
+        if fixed.size:
+            # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
+            # are wider apart than they are uncertain would take more out of it than there is: they are off, not informative.
+            moves[:, fixed] -= moves[:, fixed].mean(axis=0)
+            values, vectors = np.linalg.eigh(spread_of(nu, np.full(len(nu), 1.0 / len(nu))))
+            root = np.sqrt(np.clip(values, 0.0, 1.0))[:, None] * vectors.T @ half[:, fixed]
+            at = np.ix_(fixed, fixed)
+            after[at] = cov[at] - gaussian.symmetrise(root.T @ root)
+        return total, moves, after
+
+
+class Given(NamedTuple):
+    """What a joint map holds, given states (N, E) in its frame: means (N, n) and a covariance (n, n)."""
+
+    held: JointColumns
+    origin: np.ndarray | None  #: (E,) G; None where nothing may be observed in the world.
+    compiled: bool  #: use the models' fused kernels where they have one.
+    state: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+
+    def rows(self, groups: Sequence[Observations]) -> Rows:
+        """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
+        held, state, mean = self.held, self.state, self.mean
+        (n, d), space = (len(state), held.space.dim), held.space
+        nus, by_states = [np.zeros((n, 0))], [np.zeros((n, 0, d))]
+        noises, log_factor, parts = list[np.ndarray](), 0.0, list[Group]()
+        considered, read = [np.zeros(0, dtype=np.int64)], list[tuple[np.ndarray, np.ndarray]]()
+        for group in groups:
+            model, z, noise, ids = group.model, group.z, group.cov, checked_ids(group)
+            log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
+            at, kind, landmarks, anchors, substate = state[:, None], None, None, None, None
+            if ids is not None:
+                log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
+                z, noise, log_odds, ids = z[ids >= 0], noise[ids >= 0], log_odds[ids >= 0], ids[ids >= 0]
+                kind = held.of_one_kind(ids)
+                landmarks = mean[:, kind.columns]
+                anchors = held.poses(kind, mean) if kind.landmark.anchored else None
+            if Part.SUBSTATE in model.reads:
+                substate = mean[:, None, d : held.first]
+            in_world = model.reads == frozenset({Part.STATE})
+            if in_world:
+                if self.origin is None:
+                    name = type(model).__name__
+                    raise InputError(f"{name} observes the pose in the world: sub-maps do not take that")
+                at = space.compose(space.retract(self.origin, mean[:, :d]), state)[:, None]
+            if landmarks is None or substate is not None or not self.compiled:
+                nu, jac = linearise(model, space, z, at, landmarks, anchors, substate)
+            else:
+                nu, *found = linearised(model, space, z, state, landmarks, anchors, True)
+                jac = Jacobians(*found)
+            count, p = z.shape
+            # What each observation reads of the Gaussian, and by what slope.
+            used = [(np.zeros((count, 0), dtype=np.int64), np.zeros((count, p, 0)))]
+            if kind is not None and jac.landmark is not None:
+                slope = jac.landmark.mean(axis=0)
+                used.append((kind.columns, slope))
+                considered.append(
+                    kind.columns[kind.landmark.considered(slope, diagonal_blocks(self.cov, kind.columns))]
+                )
+            if kind is not None and anchors is not None and jac.state is not None:
+                # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
+                turn = space.adjoint(space.between(state[:, None], anchors)) @ space.right_jacobian(
+                    mean[:, kind.clones]
+                )
+                used.append((kind.clones, -(jac.state @ turn).mean(axis=0)))
+            if jac.substate is not None:
+                used.append((np.tile(np.arange(d, held.first), (count, 1)), jac.substate.mean(axis=0)))
+            if in_world and jac.state is not None:
+                # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
+                turn = space.adjoint(space.inverse(state)) @ space.right_jacobian(mean[:, :d])
+                used.append((np.tile(np.arange(d), (count, 1)), (jac.state @ turn[:, None]).mean(axis=0)))
+            columns, slopes = zip(*used, strict=True)
+            read.append((np.concatenate(columns, axis=1), np.concatenate(slopes, axis=2)))
+            by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
+            nus.append(np.broadcast_to(nu, (n, count, p)).reshape(n, -1))
+            by_states.append(np.broadcast_to(by_state, (n, count, p, d)).reshape(n, -1, d))
+            first = sum(len(each) for each in noises)
+            parts.append(Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
+            noises.extend(noise)
+        columns = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(at.ravel() for at, _ in read)]))
+        sparse = [(np.searchsorted(columns, at), slope) for at, slope in read]
+        innovation = gaussian.symmetrise(through(sparse, through(sparse, self.cov[np.ix_(columns, columns)]).T))
+        end = 0
+        for noise in noises:
+            rows = slice(end, end := end + noise.shape[0])
+            innovation[rows, rows] += noise
+        nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
+        return Rows(nu, by_state, sparse, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
 
 
 def through(slopes: list[tuple[np.ndarray, np.ndarray]], matrix: np.ndarray) -> np.ndarray:

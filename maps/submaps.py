@@ -9,6 +9,7 @@ Gaussian, to which a finished sub-map is joined at a cost that does not grow (J.
 Sub-maps of the same place become one, so that there are as many as the ground takes, and not the time.
 """
 
+from copy import copy
 from typing import NamedTuple, final
 
 import numpy as np
@@ -21,7 +22,8 @@ from rbpf.core import checkpoint
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.kernels.sparse import filled, selected_inverse
-from rbpf.lie import Euclidean, SE2Group, SE3Group, skew
+from rbpf.lie import Euclidean, SE2Group, SE3Group
+from rbpf.maps.joint_columns import JointColumns, by_frame
 
 CLOSE_ENOUGH = 1e-6
 """Largest step [m, rad] at which a solution is taken, and iterations until it is."""
@@ -70,20 +72,6 @@ class _Tied(NamedTuple):
     cov: np.ndarray
     half: np.ndarray
     mine: np.ndarray
-
-
-def by_turn(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
-    """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""
-    if isinstance(space, SE3Group):
-        return -skew(points)
-    columns = np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
-    return columns if isinstance(space, SE2Group) else np.zeros((*points.shape, 0))
-
-
-def by_frame(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
-    """∂(Exp(ε) l)/∂ε (M, D, d) at ε = 0."""
-    moved = np.broadcast_to(np.eye(points.shape[-1]), (*points.shape, points.shape[-1]))
-    return np.concatenate([by_turn(space, points), moved], axis=-1)
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
@@ -149,8 +137,11 @@ class SubMaps:
         space: SE2, SE3 or Euclidean(n).
         dim: D, of a point.
         most: landmarks that are kept about the start of the present sub-map, besides those of the last one.
+        unnamed: keep what is `beside` the present one.
 
     Attributes:
+        frame: where there are finished ones, what they and the present one, as last looked at, say of its end.
+        beside: the old landmarks there, where they are kept.
         maps: the finished ones.
         starts: the world's origin, and world_from_end (E,) of each; the last one is where the present one starts.
         near: (K,) landmarks about the last start.
@@ -158,8 +149,10 @@ class SubMaps:
         cov: (d + KD, d + KD) of the last start, in its right chart, and of `points`.
     """
 
-    def __init__(self, space: SE2Group | SE3Group | Euclidean, dim: int, most: int) -> None:
-        self.space, self.dim, self.most = space, dim, most
+    def __init__(self, space: SE2Group | SE3Group | Euclidean, dim: int, most: int, unnamed: bool = False) -> None:
+        self.space, self.dim, self.most, self.unnamed = space, dim, most, unnamed
+        self.frame: Estimate | None = None
+        self.beside: Beside | None = None
         self.maps: list[SubMap] = []
         self.starts = [space.identity()]
         self.near, self.points = np.zeros(0, dtype=np.int64), np.zeros((0, dim))
@@ -175,6 +168,39 @@ class SubMaps:
         """Which landmarks (K,) are of old sub-maps, and not among those about the start."""
         old = np.array([landmark in self._last for landmark in ids.tolist()], dtype=bool)
         return old & ~np.isin(ids, self.near)
+
+    def take(self, present: SubMap, is_large: bool) -> bool:
+        """Joins the present sub-map if it is time: it is large, or the robot is back among old landmarks."""
+        recall = False
+        if self.unnamed and self.maps and present.ids.size:
+            reach = float(np.linalg.norm(present.points, axis=1).max())
+            recall = self.comes_near(self.end(present), reach)
+        # As many as tell a pose in space; with fewer the sub-map waits for more.
+        if is_due := recall or is_large or bool(self.returned(present.ids).sum() >= 3):
+            self.join(present, recall)
+        return is_due
+
+    def look_from(self, present: SubMap) -> None:
+        """What is known of the end of the present sub-map is so until it is looked from anew."""
+        if self.maps:
+            self.frame = self.end(present)
+            self.beside = self._about(present) if self.unnamed else None
+
+    def widened(
+        self, held: JointColumns, mean: np.ndarray, cov: np.ndarray
+    ) -> tuple[JointColumns, np.ndarray, np.ndarray]:
+        """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
+        if (found := self.beside) is None:
+            return held, mean, cov
+        own, new = held.holds(found.own), ~held.holds(found.ids)
+        columns = held.of_one_kind(found.own[own]).columns.ravel()
+        at, rows = np.repeat(own, self.dim), np.repeat(new, self.dim)
+        slope, rest = found.slope[np.ix_(rows, at)], found.rest[np.ix_(rows, rows)]
+        moved, cross = mean[:, columns] - found.theirs[own].ravel(), slope @ cov[columns]
+        wide = copy(held)
+        wide.add(found.ids[new], held.kinds[0], np.full(int(new.sum()), -1), held.clones[:0])
+        mean = np.concatenate([mean, found.points[new].ravel() + moved @ slope.T], axis=1)
+        return wide, mean, np.block([[cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
 
     def join(self, finished: SubMap, recall: bool = False) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end.
@@ -202,7 +228,7 @@ class SubMaps:
         mean = space.compose(space.retract(self.start, x[:d]), end)
         return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
 
-    def beside(self, present: SubMap) -> Beside:
+    def _about(self, present: SubMap) -> Beside:
         """The old landmarks about the end of the present sub-map, by all that is known."""
         space, d, dim = self.space, self.space.dim, self.dim
         x, cov, half, mine = self._tied(present)
@@ -239,12 +265,6 @@ class SubMaps:
         far = np.linalg.norm(self.space.inverse_transform(end.mean, self._guess(ids)), axis=1)
         return bool((far < reach).any())
 
-    def with_one_more(self, finished: SubMap) -> "SubMaps":
-        """As if the present sub-map ended here."""
-        other = self.copied()
-        other._take(finished)
-        return other
-
     def __deepcopy__(self, memo: dict[int, object]) -> "SubMaps":
         return self.copied()
 
@@ -255,16 +275,19 @@ class SubMaps:
 
     def copied(self) -> "SubMaps":
         """What is told of all of them is solved for in a copy: to be asked changes nothing."""
-        other = SubMaps(self.space, self.dim, self.most)
+        other = copy(self)
         other.maps, other.starts, other._last = list(self.maps), list(self.starts), dict(self._last)
-        other.near, other.points, other.cov = self.near, self.points, self.cov
         return other
 
-    def landmarks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Names (M,), places in the world (M, D) and their covariances (M, D, D), by all sub-maps together.
+    def landmarks(self, present: SubMap | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Names (M,), places in the world (M, D) and their covariances (M, D, D), by all sub-maps and the present one.
 
         Starts and what several sub-maps hold are solved for; the others follow from their own sub-map, given these.
         """
+        if present is not None and present.ids.size:
+            every = self.copied()
+            every._take(present)
+            return every.landmarks()
         space, d, dim = self.space, self.space.dim, self.dim
         solution = self._solve(self._shared(alone=True))
         joint, end_of = solution.covariance(), solution.starts[1:]
@@ -521,7 +544,12 @@ class SubMaps:
             "tied": np.array([each.tied for each in self.maps], dtype=np.int64),
             "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
         }  # fmt: skip
-        return {f"submaps/{name}": array for name, array in named.items()}
+        named = {f"submaps/{name}": array for name, array in named.items()}
+        if self.frame is not None:
+            named |= {"joint/frame": self.frame.mean, "joint/frame_cov": self.frame.cov}
+        if self.beside is not None:
+            named |= {f"joint/beside/{name}": array for name, array in self.beside._asdict().items()}
+        return named
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Takes up what `arrays` gave. Raises InputError: it is damaged."""
@@ -555,3 +583,18 @@ class SubMaps:
             raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
         self.starts, self.near = list(found["starts"]), found["near"]
         self.points, self.cov = found["near_points"], found["near_cov"]
+        if not self.maps:
+            return
+        d, dim = self.space.dim, self.dim
+        schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}
+        found = checkpoint.read(arrays, schema, "joint/")
+        self.frame = Estimate(found["frame"], found["frame_cov"])
+        if self.unnamed:
+            schema = {
+                "ids": checkpoint.integers("others", least=0), "points": checkpoint.numbers("others", dim),
+                "own": checkpoint.integers("own", least=0), "theirs": checkpoint.numbers("own", dim),
+                "slope": checkpoint.numbers("rows", "columns"), "rest": checkpoint.numbers("rows", "rows"),
+            }  # fmt: skip
+            self.beside = Beside(**checkpoint.read(arrays, schema, "joint/beside/"))
+            if self.beside.slope.shape != (self.beside.points.size, self.beside.theirs.size):
+                raise InputError("the array joint/beside/slope does not fit the landmarks beside it")

@@ -71,7 +71,7 @@ def test_anchored_at_clones_it_is_the_kalman_filter():
     world = turned()
     filter_ = filtered(world, AnchoredPoint(SE2))
     assert_same(filter_, world.kalman)
-    assert len(filter_.belief().map.clones) == 2  # two landmarks are new in the first step, one in the third
+    assert len(filter_.belief().map.held.clones) == 2  # two landmarks are new in the first step, one in the third
 
 
 def test_what_is_considered_is_as_schmidt_has_it():
@@ -156,9 +156,9 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
     ]
 
     def measured(mean: np.ndarray, state: np.ndarray = particles.state) -> np.ndarray:
-        return -joint._rows(state, mean[None], joint.cov, groups).nu[0]
+        return -joint._given(state, None)._replace(mean=mean[None]).rows(groups).nu[0]
 
-    rows = joint._rows(particles.state, joint.mean, joint.cov, groups)
+    rows = joint._given(particles.state, None).rows(groups)
     by_mean = np.zeros((10, joint.mean.shape[1]))
     by_mean[:, rows.columns] = through(rows.slopes, np.eye(rows.columns.size))
     np.testing.assert_allclose(by_mean, numeric(measured, joint.mean[0]), atol=1e-4)
@@ -172,7 +172,7 @@ def test_what_is_told_of_rays_is_the_gaussian_carried_over():
     def carried(mean: np.ndarray) -> np.ndarray:
         frame = SE3.retract(joint.origin, mean[:6])
         points, start = [], 15  # ξ, three points, then a clone with its rays, and another
-        for clone, count in zip(joint.clones, (4, 2), strict=True):
+        for clone, count in zip(joint.held.clones, (4, 2), strict=True):
             anchor = SE3.compose(frame, SE3.retract(clone, mean[start : start + 6]))
             b = mean[start + 6 : start + 6 + 3 * count].reshape(-1, 3)
             points.append(SE3.transform(anchor, np.append(b[:, :2], np.ones((count, 1)), axis=1) / b[:, 2:]))
@@ -193,7 +193,7 @@ def test_consolidation_keeps_the_moments_of_draws():
     rng, count = np.random.default_rng(1), 40000
     which = rng.choice(60, count, p=particles.weights)
     drawn = joint.mean[which] + rng.multivariate_normal(np.zeros(len(joint.cov)), joint.cov, count)
-    origin, clones, state = joint.origin, joint.clones, particles.state[which]
+    origin, clones, state = joint.origin, joint.held.clones, particles.state[which]
     joint.consolidate(particles)
     expected = drawn.copy()
     world = SE3.compose(SE3.retract(origin, drawn[:, :6]), state)
@@ -201,7 +201,7 @@ def test_consolidation_keeps_the_moments_of_draws():
     expected[:, 6:15] = SE3.inverse_transform(state[:, None], drawn[:, 6:15].reshape(-1, 3, 3)).reshape(-1, 9)
     for k, first in enumerate((15, 33)):
         at = slice(first, first + 6)
-        expected[:, at] = SE3.local(joint.clones[k], SE3.between(state, SE3.retract(clones[k], drawn[:, at])))
+        expected[:, at] = SE3.local(joint.held.clones[k], SE3.between(state, SE3.retract(clones[k], drawn[:, at])))
     sigma = np.sqrt(np.diag(joint.cov))
     offset = (expected.mean(axis=0) - joint.mean[0]) / sigma
     assert np.abs(offset).max() < 0.03
@@ -226,7 +226,7 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
     assert np.linalg.norm(after[0][row] - before[0][row]) > 1e-6
     assert joint.are(joint.ids, Point(3)).tolist() == [True] * 3 + [False] * 4 + [False, True]
     # Rows of the point: those of the clone and the ray, by numeric slopes.
-    clone = joint.clones[1]
+    clone = joint.held.clones[1]
 
     def point(x: np.ndarray) -> np.ndarray:
         return SE3.transform(SE3.retract(clone, x[:6]), np.append(x[6:8], 1.0) / x[8])
@@ -236,7 +236,7 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
     np.testing.assert_allclose(joint.cov[42:45, :42], rows[:, :42], rtol=1e-5, atol=1e-8)
     joint.remove(np.array([10, 20]))  # the last ray of the second clone: the clone goes, too
     np.testing.assert_array_equal(joint.ids, [5, 2, 9, 21, 22, 23, 11])
-    assert len(joint.clones) == 1 and joint.mean.shape[1] == 6 + 3 * 7 + 6
+    assert len(joint.held.clones) == 1 and joint.mean.shape[1] == 6 + 3 * 7 + 6
     for whole, rest in zip(after, joint.moments(particles), strict=True):
         np.testing.assert_allclose(whole[[0, 1, 2, 4, 5, 6, 8]], rest, rtol=1e-9)
 
@@ -244,7 +244,7 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
 def test_particles_that_are_far_off_leave_a_covariance():
     """Innovations of many standard deviations: what is considered is not told to be better known than that allows."""
     joint, _ = rays(5)
-    joint._held.kinds[1] = InverseDepth(0.1, least_parallax=1e9)
+    joint.held.kinds[1] = InverseDepth(0.1, least_parallax=1e9)
     joint.mean[:, :6] = 0.0
     state, ids = SE3.exp(0.2 * np.random.default_rng(3).normal(size=(5, 6))), np.array([20, 21, 22, 23])
     z, cov = np.full((4, 2), 300.0), np.repeat(np.eye(2)[None], 4, axis=0)

@@ -54,7 +54,7 @@ SOME = seen(OUTLIERS, [0, 1, 2, 3, 4, 0], [[0.1, 0.3], [30.0, 4.0], [-0.2, 0.1],
 
 def summed(joint: JointMap, state: np.ndarray, group: Observations) -> np.ndarray:
     """Log p(z | x) (N,): the sum over all choices of outliers."""
-    columns = joint._held.of_one_kind(group.ids).columns.ravel()
+    columns = joint.held.of_one_kind(group.ids).columns.ravel()
     nu = (group.z - joint.mean[:, columns].reshape(len(state), -1, 2) + state[:, None]).reshape(len(state), -1)
     S = joint.cov[np.ix_(columns, columns)] + block_diag(*group.cov)
     terms = []

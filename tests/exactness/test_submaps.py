@@ -197,6 +197,7 @@ def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
     maps = SubMaps(SE2, 2, 10)
     for each in finished:
         maps.join(each)
+    maps.look_from(finished[0])
     again = SubMaps(SE2, 2, 10)
     again.restore(maps.arrays())
     for mine, theirs in zip(again.landmarks(), maps.landmarks(), strict=True):

@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.kernels.rigid_fit import rigid_fit
 from rbpf.lie import SE3
-from rbpf.maps.constellation import by_frame
+from rbpf.maps.joint_columns import by_frame
 
 ROUNDS, SETTLED = 20, 1e-10
 
@@ -15,8 +15,9 @@ def twin(world, cov, shape, weight, start):
     frame = np.repeat(start, len(world), axis=0)
     for _ in range(ROUNDS):
         local = SE3.inverse_transform(frame[:, None], world)
-        weighed = np.swapaxes(by_frame(local), -1, -2) @ weight
-        info = (weighed @ by_frame(local)).sum(axis=1)
+        moved = -by_frame(SE3, local)
+        weighed = np.swapaxes(moved, -1, -2) @ weight
+        info = (weighed @ moved).sum(axis=1)
         vector = (weighed @ (local - shape)[..., None]).sum(axis=1)
         step = -np.linalg.solve(info, vector)[..., 0]
         frame = SE3.retract(frame, step)
