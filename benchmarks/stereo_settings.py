@@ -70,7 +70,7 @@ def lines(folder: Path, names: list[str]) -> Iterator[str]:
         rows = np.abs(truth.stamps_ns[None] - sequence.stamps_ns[:, None]).argmin(axis=1)
         for title, (sift, stereo) in SETTINGS.items():
             features, ms = measured(sequence, StereoMatcher(sequence.rig, Sift(sift), stereo))
-            rigid, similar, scale, agreeing = errors(sequence.rig, features, truth.world_from_camera[rows])
+            rigid, similar, scale, agreeing = errors(sequence.rig, features, truth.poses[rows])
             count = np.mean([len(each) for each in features])
             cells = f"{ms[0]:7.1f} {ms[1]:7.1f}  {count:8.0f} {agreeing:6.0f}     {rigid:.4f} {similar:.4f} {scale:.4f}"
             yield f"{name:18}  {title:26} {cells}"

@@ -41,7 +41,7 @@ def filtered(log: RobotLog, proposal: Proposal) -> tuple[float, float]:
         OdometryMotion(log.space), sensor, LandmarkMap(log.space), proposal, n=100, rng=np.random.default_rng(0)
     )
     errors, sizes = [], []
-    for frame, true_pose in zip(log.frames, log.truth.world_from_robot, strict=True):
+    for frame, true_pose in zip(log.frames, log.truth.poses, strict=True):
         control = None if frame.delta is None else Odometry(frame.delta, frame.cov_delta)
         report = filter_.step(frame, control, frame.stamp_ns)
         errors.append(np.linalg.norm((report.estimate.mean - true_pose)[1:]))

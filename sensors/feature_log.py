@@ -47,35 +47,31 @@ class KnownPoints:
 
 
 @dataclass(frozen=True)
-class CameraTruth:
-    """Ground truth of a `FeatureLog`.
+class Truth:
+    """Ground truth of a recording: poses in SE(2) or SE(3), and landmarks.
 
     Raises InputError: a shape or a type is another one, a number is not finite, the stamps are out of order, or a
     quaternion is not of unit length.
     """
 
     stamps_ns: np.ndarray  #: (T,) int64 times of the poses, in order.
-    world_from_camera: np.ndarray  #: (T, 7) poses at these times, unit quaternions.
-    #: name of a landmark to its (3,) position in the world, m.
+    poses: np.ndarray  #: (T, E) world_from_body at these times, of the camera or the robot; unit quaternions.
+    #: name of a landmark to its (D,) position in the world, m.
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def poses(self) -> np.ndarray:
-        """(T, 7) of the body, which is the camera."""
-        return self.world_from_camera
 
     def __post_init__(self) -> None:
         where = "the ground truth"
         _check_whole(where, "stamps_ns", "T", self.stamps_ns)
-        _check_numbers(where, "world_from_camera", self.world_from_camera, (len(self.stamps_ns), 7))
+        planar = self.poses.shape[1:] == (3,)
+        _check_numbers(where, "poses", self.poses, (len(self.stamps_ns), 3 if planar else 7))
         if (late := np.flatnonzero(np.diff(self.stamps_ns) < 0)).size:
             raise InputError(f"{where}: stamp {late[0] + 1} is before the one it follows, sort the poses by time")
-        length = np.linalg.norm(self.world_from_camera[:, :4], axis=1)
+        length = np.ones(len(self.poses)) if planar else np.linalg.norm(self.poses[:, :4], axis=1)
         if (wrong := np.flatnonzero(np.abs(length - 1.0) > UNIT)).size:
             found = f"pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.9g}"
             raise InputError(f"{where}: {found}, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion")
         for name, position in self.landmarks.items():
-            _check_numbers(where, f"landmark {name}", position, (3,))
+            _check_numbers(where, f"landmark {name}", position, position.shape if planar else (3,))
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,7 @@ class FeatureLog:
     camera: Pinhole | RectifiedStereo  #: that took the images.
     frames: list[FeatureFrame]  #: the images in order of time; equal stamps, between which no time passes, are allowed.
     known: KnownPoints | None = None  #: landmarks known beforehand, None where there are none.
-    truth: CameraTruth | None = None  #: ground truth, None where the log has none.
+    truth: Truth | None = None  #: ground truth, None where the log has none.
 
     def __post_init__(self) -> None:
         if not self.frames:

@@ -12,7 +12,6 @@ from rbpf.errors import InputError
 from rbpf.runs.files import OnDone
 from rbpf.runs.folder import write_run, write_summary
 from rbpf.runs.plots import draw_run
-from rbpf.runs.provenance import left_out
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import write_tum
@@ -51,7 +50,8 @@ def finish_run(
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
     if run.system.name not in COMPARISONS["gtsam"]:  # it measures nothing that a batch optimiser takes
         wanted, batch = {}, False
-    entries = write_run(run, out, dict(sources) | left_out(**wanted))
+    # What is not made is an entry of config.yaml, so that a repetition does not make it either.
+    entries = write_run(run, out, dict(sources) | {name: False for name, asked in wanted.items() if not asked})
     (out / BATCH).unlink(missing_ok=True)
     for path in out.glob(f"{COMPARISON}*.json"):  # of an earlier run, with their pictures
         for old in (path, *out.glob(f"{path.stem.removeprefix(COMPARISON)}_*.png")):

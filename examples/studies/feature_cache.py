@@ -20,7 +20,7 @@ from rbpf.errors import InputError
 from rbpf.runs.recordings import Opened, filter_opened
 from rbpf.runs.run import Listener, Run
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.features import Sift
 from rbpf.sensors.readers import ImageSequence
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
@@ -65,7 +65,7 @@ class CachedSequence:
     name: str
     rig: RectifiedStereo
     stamps_ns: np.ndarray
-    truth: CameraTruth | None
+    truth: Truth | None
     folder: Path
 
     def __len__(self) -> int:

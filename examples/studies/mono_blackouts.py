@@ -305,7 +305,7 @@ def nearest_truth(sequence: ImageSequence) -> np.ndarray:
     """(T, 7) true world_from_camera, for each image that of the nearest stamp."""
     assert sequence.truth is not None
     nearest = np.abs(sequence.truth.stamps_ns[:, None] - sequence.stamps_ns).argmin(axis=0)
-    return np.asarray(sequence.truth.world_from_camera[nearest])
+    return np.asarray(sequence.truth.poses[nearest])
 
 
 def known_of(folder: Path) -> KnownPixels | None:

@@ -46,7 +46,7 @@ class Job(NamedTuple):
 def solve_and_filter(job: Job) -> tuple[float, list[tuple[float, np.ndarray]]]:
     """Error of the batch [m], and errors and NEES (T,) of the filters."""
     log = simulate_features(DeskWorld(frames=job.frames), Measuring(), MONO, job.seed)
-    truth = log.truth.world_from_camera
+    truth = log.truth.poses
     batch = solve_features(log, marginals=False).world_from_body
 
     def rmse(path: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.ranges import MOST, Count, CountOrNone, NotNegative, Positive, Range, Ranged, Rate, check_ranges
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints, Truth
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
 from rbpf.validation.simulation.paths import HandHeld, looking
@@ -405,7 +405,7 @@ def simulate_features(
         keep = camera.inside(noisy)
         cov = np.tile(measuring.noise_px**2 * np.eye(camera.dim), (int(keep.sum()), 1, 1))
         frames.append(FeatureFrame(stamp, rows[keep], noisy[keep], cov))
-    truth = CameraTruth(scene.stamps_ns, scene.world_from_camera, dict(enumerate(scene.points)))
+    truth = Truth(scene.stamps_ns, scene.world_from_camera, dict(enumerate(scene.points)))
     given = None
     if known.size:
         error = measuring.known_std_m * rng.standard_normal((known.size, 3))

@@ -25,7 +25,7 @@ from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.recordings import filter_features
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space
-from rbpf.sensors.feature_log import CameraTruth, FeatureLog
+from rbpf.sensors.feature_log import FeatureLog, Truth
 from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 from rbpf.systems.stereo.config import StereoConfig
@@ -66,7 +66,7 @@ def pairs_there_and_back(sequence: ImageSequence) -> ImageSequence:
     rows = there_and_back(count)
     stamps = np.arange(rows.size, dtype=np.int64) * int(np.median(np.diff(sequence.stamps_ns)))
     near = np.array([int(np.abs(truth.stamps_ns - stamp).argmin()) for stamp in sequence.stamps_ns.tolist()])
-    true = CameraTruth(stamps, truth.world_from_camera[near][rows])
+    true = Truth(stamps, truth.poses[near][rows])
     source = Reordered(sequence, rows, stamps)
     return replace(sequence, stamps_ns=stamps, truth=true, source=source)
 
@@ -78,7 +78,7 @@ def log_there_and_back(log: FeatureLog) -> FeatureLog:
     truth = log.truth
     if truth is not None:
         stamps = np.arange(rows.size, dtype=np.int64)
-        truth = CameraTruth(stamps, truth.world_from_camera[rows], truth.landmarks)
+        truth = Truth(stamps, truth.poses[rows], truth.landmarks)
     return replace(log, frames=frames, truth=truth)
 
 
@@ -119,7 +119,7 @@ def recorded(data: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
     if (data / TRACKS).is_dir():
         tracks = read_stereo_tracks(data / TRACKS)
         batch = solve_problem(tracks.log, tracks.world_from_camera, marginals=False).estimate
-        truth = CameraTruth(batch.trajectory.stamps_ns, batch.world_from_body)
+        truth = Truth(batch.trajectory.stamps_ns, batch.world_from_body)
         yield from of_tracks(replace(tracks.log, truth=truth), configs)
 
 

@@ -347,7 +347,7 @@ def main(run: Path | None = None, out: Path = Path("demo/two_optimisers"), quick
         world = DeskWorld(frames=30 if quick else 150)
         log = simulate_features(world, Measuring(known=6, known_std_m=0.0), MONO, seed=0)
         assert log.truth is not None
-        path = log.truth.world_from_camera
+        path = log.truth.poses
     else:
         log, path = read_feature_log(run), RunFolder.open(run).path.world_from_body
     found = adjust_by_both(log, path)

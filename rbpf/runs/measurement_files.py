@@ -152,7 +152,6 @@ def _read_robot(folder: Path, seen: "_Table") -> Measurements:
     space = _SPACES[seen.choice("space", tuple(_SPACES))]
     for key in ("recording", "space"):
         moved.require_same(key, seen)
-
     integers, numbers = moved.body(_moves(space), 2)
     moved.require(integers[:, 0] == np.arange(1, len(integers) + 1), "one row per step, from step 1 in order")
     stamps = np.concatenate([[seen.whole("start_stamp_ns")], integers[:, 1]])
@@ -160,7 +159,6 @@ def _read_robot(folder: Path, seen: "_Table") -> Measurements:
     deltas, covs = numbers[:, : space.size], gaussian.unpack(numbers[:, space.size :], space.dim)
     moved.require(are_poses(space, deltas), "an increment that begins with a quaternion of length 1")
     moved.require(are_covariances(covs), _COVARIANCE)
-
     integers, numbers = seen.body(_observed(_axes(space)), 3)
     steps, stamp, landmarks = integers.T
     inside = (steps >= 0) & (steps < len(stamps))
@@ -194,7 +192,6 @@ def _read_camera_log(folder: Path, seen: "_Table", kind: str) -> FeatureLog:
     listed.require(integers[:, 0] == np.arange(len(integers)), "one row per frame, from step 0 in order")
     stamps = np.ascontiguousarray(integers[:, 1])
     listed.require(np.diff(stamps, prepend=stamps[:1]) >= 0, "stamps in order of time")
-
     integers, numbers = seen.body(_observed(_PIXELS[kind]), 3)
     steps = integers[:, 0]
     seen.require((steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}")
@@ -205,7 +202,6 @@ def _read_camera_log(folder: Path, seen: "_Table", kind: str) -> FeatureLog:
     p = camera.dim
     columns = (integers[:, 2], numbers[:, :p], gaussian.unpack(numbers[:, p:], p))
     parts = zip(stamps.tolist(), *(np.split(column, cuts) for column in columns), strict=True)
-
     known = None
     if (folder / KNOWN).exists():
         table = _Table.read(folder / KNOWN)

@@ -57,11 +57,6 @@ def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: M
     write_text(out / CONFIG, text)
 
 
-def left_out(**wanted: bool) -> dict[str, bool]:
-    """What a run was asked not to make, as entries of config.yaml, so that a repetition does not make it either."""
-    return {name: False for name in _MADE if not wanted.get(name, True)}
-
-
 def library_versions() -> dict[str, str]:
     """Python, the libraries that compute, and the processor's instructions that they choose among."""
     found = {"python": platform.python_version(), "instructions": instruction_set()}

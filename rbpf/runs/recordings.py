@@ -13,11 +13,11 @@ from rbpf.motion.odometry import Odometry
 from rbpf.runs.files import CHECKPOINT, prepare_folder
 from rbpf.runs.provenance import decisive_inputs
 from rbpf.runs.run import Listener, Run, Source, drive
-from rbpf.runs.truth import GroundTruth, truth_at
+from rbpf.runs.truth import truth_at
 from rbpf.sensors import readers
 from rbpf.sensors.calibration import Board, MarkerBoard, find_board, find_markers
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog, Truth
 from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.sensors.readers.part import WHOLE
@@ -47,7 +47,7 @@ class Opened(NamedTuple):
     system: System
     source: Source
     stamps_ns: np.ndarray | None
-    truth: GroundTruth | None
+    truth: Truth | None
 
 
 @dataclass(frozen=True)

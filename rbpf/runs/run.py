@@ -136,7 +136,6 @@ def drive(
             raise InputError(f"{checkpoint} belongs to a run over another recording: start without --resume")
     if stamps_ns is not None and len(run.log) >= len(stamps_ns):
         return run  # a finished run that is resumed
-
     waited = time.perf_counter()
     for frame in run.source.frames(len(run.log)):
         try:

@@ -4,10 +4,8 @@ truth.npz    rows (R,) of the frames with a true pose, poses (R, E); ids (M,) an
              brings the estimate into the truth's world, "none" where both are expressed in the same one
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +13,7 @@ from rbpf.core.checkpoint import fitting, integers, load_arrays, numbers, read, 
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.runs.trajectory import Alignment
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.systems.system import Gauge
 
@@ -33,17 +32,6 @@ _TRUTH = {
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
 
 
-class GroundTruth(Protocol):
-    """True poses (T, E) world_from_body at stamps (T,), and landmarks by name, as recordings have them."""
-
-    @property
-    def stamps_ns(self) -> np.ndarray: ...
-    @property
-    def poses(self) -> np.ndarray: ...
-    @property
-    def landmarks(self) -> Mapping[int, np.ndarray]: ...
-
-
 @dataclass(frozen=True)
 class RunTruth:
     """Ground truth at a run's own frames."""
@@ -55,7 +43,7 @@ class RunTruth:
     alignment: Alignment = "none"
 
 
-def truth_at(space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge) -> RunTruth | None:
+def truth_at(space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray, gauge: Gauge) -> RunTruth | None:
     """The truth at a run's frames (T,); None where fewer than `LEAST` have a true pose.
 
     Where the run's world (`gauge`) begins at the first frame, so does the truth, if it is known there; else only an alignment

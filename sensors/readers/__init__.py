@@ -4,12 +4,13 @@ What is missing, or not as the module of a format describes it, is an InputError
 from whatever function here reads it.
 """
 
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.formats import open_images, open_log, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Topics
 from rbpf.sensors.readers.known_points import KnownPixels, read_known_points
 from rbpf.sensors.readers.laser import LaserOptions, read_laser_log
 from rbpf.sensors.readers.part import Part
-from rbpf.sensors.readers.robot_log import Frame, LogNoise, RobotLog, Truth
+from rbpf.sensors.readers.robot_log import Frame, LogNoise, RobotLog
 
 __all__ = [
     "Frame",

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Array
-from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat, Truth, assemble, diagonal, require_ranges
+from rbpf.sensors.feature_log import Truth
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat, assemble, diagonal, require_ranges
 from rbpf.sensors.readers.text import read_columns
 
 DEFAULT_NOISE = LogNoise(

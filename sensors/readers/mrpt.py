@@ -28,8 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import robot_log
-from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, RobotLogFormat, Truth, assemble
+from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, RobotLogFormat, assemble
 from rbpf.sensors.readers.text import Table, read_csv
 from rbpf.sensors.readers.yaml_files import read_yaml
 

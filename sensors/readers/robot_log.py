@@ -7,7 +7,7 @@ from arrays.
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.ranges import NotNegative, Positive, Ranged
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.text import Table
 
 UNNAMED = -1  #: In place of a landmark's name where it is not known which one was observed.
@@ -34,21 +35,6 @@ class Frame:
     landmarks: np.ndarray
     z: np.ndarray  #: (K, p) measurements.
     cov_z: np.ndarray  #: (K, p, p) their covariance.
-
-
-@dataclass(frozen=True)
-class Truth:
-    """Ground truth of a log."""
-
-    stamps_ns: np.ndarray  #: (T,) times of the poses.
-    world_from_robot: np.ndarray  #: (T, E) poses at these times.
-    #: name of a landmark to its (D,) position in the world.
-    landmarks: dict[int, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def poses(self) -> np.ndarray:
-        """(T, E) of the body."""
-        return self.world_from_robot
 
 
 @dataclass(frozen=True)

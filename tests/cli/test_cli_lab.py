@@ -26,7 +26,7 @@ def test_a_tour_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert sequence.camera.fx == 75.0
     assert len(read_wheel_odometry(tmp_path / "lab").stamps_ns) == 3001
     assert read_known_points(tmp_path / "lab" / "known_points.csv").names.size == 6
-    places = sequence.truth.world_from_camera[:, 4:]
+    places = sequence.truth.poses[:, 4:]
     assert np.ptp(places, axis=0)[0] > 4.0 and np.ptp(places, axis=0)[2] < 1e-9
     said = " ".join(capsys.readouterr().err.split())
     assert f"wrote {tmp_path / 'lab'}" in said.replace("lab,", "lab") and "MB" in said

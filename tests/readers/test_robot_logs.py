@@ -103,7 +103,7 @@ def test_mrpt_in_space(tmp_path):
     np.testing.assert_array_equal(log.frames[0].z, [[3, 0.1, 0.2]])
     np.testing.assert_allclose(log.frames[1].cov_z, [np.diag([0.0009, 0.0016, 0.0025])])
     np.testing.assert_allclose(log.robot_from_sensor, SE3.from_ypr(np.array([0.5, -0.25, 2]), QUARTER, 0, 0))
-    np.testing.assert_allclose(log.truth.world_from_robot[1], log.frames[1].delta)
+    np.testing.assert_allclose(log.truth.poses[1], log.frames[1].delta)
     np.testing.assert_array_equal(log.truth.landmarks[7], [1, 2, 3])
 
     def element(additive):
@@ -153,12 +153,12 @@ def test_a_folder_with_one_graph(tmp_path):
 def test_truth_may_be_whole_partial_or_missing(tmp_path, files, path, landmarks, stamps):
     truth = opened(tmp_path, files).truth
     assert truth.stamps_ns.tolist() == stamps
-    np.testing.assert_array_equal(truth.world_from_robot, [[0.5, 1, 2], [-0.5, 3, 4]])
+    np.testing.assert_array_equal(truth.poses, [[0.5, 1, 2], [-0.5, 3, 4]])
     np.testing.assert_array_equal(next(iter(truth.landmarks.values())), [1, 2])
     assert all(position.shape == (2,) for position in truth.landmarks.values())
     (tmp_path / path).unlink()
     partial = open_log(tmp_path).truth
-    assert partial.world_from_robot.shape == (0, 3) and len(partial.landmarks) == 2
+    assert partial.poses.shape == (0, 3) and len(partial.landmarks) == 2
     write(tmp_path, {path: files[path]})
     (tmp_path / landmarks).unlink()
     assert open_log(tmp_path).truth.landmarks == {}

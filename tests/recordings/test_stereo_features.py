@@ -22,7 +22,7 @@ def recording(request, data_dir):
     sequence = open_stereo(data_dir / request.param)
     frames = [frame for frame, _ in zip(sequence.frames(START[request.param]), range(PAIRS), strict=False)]
     rows = [int(np.abs(sequence.truth.stamps_ns - frame.stamp_ns).argmin()) for frame in frames]
-    poses = sequence.truth.world_from_camera[rows]
+    poses = sequence.truth.poses[rows]
     return sequence.name, sequence.rig, [(frame.image, frame.right) for frame in frames], poses
 
 

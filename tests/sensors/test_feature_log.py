@@ -8,7 +8,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints, Truth
 
 CAMERA = Pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
 STEREO = RectifiedStereo(CAMERA, 0.1)
@@ -76,18 +76,18 @@ class TestKnownPoints:
             replace(self.good, **wrong)
 
 
-class TestCameraTruth:
+class TestTruth:
     poses = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0], (3, 1))
-    good = CameraTruth(np.array([0, 5, 5]), poses, {3: np.zeros(3)})
+    good = Truth(np.array([0, 5, 5]), poses, {3: np.zeros(3)})
 
     @pytest.mark.parametrize(
         ("wrong", "message"),
         [
             ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "stamps_ns must be (T,) int64, got (3,) float64"),
-            ({"stamps_ns": np.array([0, 1])}, "world_from_camera must be (2, 7) float64, got (3, 7) float64"),
+            ({"stamps_ns": np.array([0, 1])}, "poses must be (2, 7) float64, got (3, 7) float64"),
             ({"stamps_ns": np.array([0, 5, 4])}, "stamp 2 is before the one it follows, sort the poses by time"),
             (
-                {"world_from_camera": poses * [1, 1, 1, 2, 1, 1, 1]},
+                {"poses": poses * [1, 1, 1, 2, 1, 1, 1]},
                 "pose 0 has a quaternion of length 2, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion",
             ),
             ({"landmarks": {8: np.zeros(2)}}, "landmark 8 must be (3,) float64, got (2,) float64"),

@@ -39,7 +39,7 @@ def rows(frame: FeatureFrame, keep: np.ndarray) -> FeatureFrame:
 def errors(run: Run) -> np.ndarray:
     """(T, 6) of the online estimates in the charts at them."""
     truth = run.source.log.truth  # type: ignore[attr-defined]
-    return SE3.local(run.log.poses, truth.world_from_camera)
+    return SE3.local(run.log.poses, truth.poses)
 
 
 def nees(run: Run) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.runs.run import Run
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import ImageFrame, ImageSequence
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.stereo.config import StereoConfig
@@ -41,7 +41,7 @@ def pairs(count: int, change: Change = lambda t, frame: frame, poses: np.ndarray
     """A pair of cameras before the plane."""
     poses = path(2 * count)[::2] if poses is None else poses
     stamps = np.arange(count, dtype=np.int64) * STEP_NS
-    truth = CameraTruth(stamps, poses)
+    truth = Truth(stamps, poses)
     return ImageSequence("plane", CAMERA, stamps, truth, BASELINE_M, Pairs(texture(), poses, change))
 
 
@@ -68,5 +68,5 @@ def filtered(sequence, config: StereoConfig, **options) -> Run:
 
 def errors_m(poses: np.ndarray, sequence: ImageSequence) -> np.ndarray:
     """Of the positions (T,); the first camera is the world."""
-    true = SE3.between(sequence.truth.world_from_camera[0], sequence.truth.world_from_camera[: len(poses)])
+    true = SE3.between(sequence.truth.poses[0], sequence.truth.poses[: len(poses)])
     return np.linalg.norm(SE3.translation(poses) - SE3.translation(true), axis=1)

@@ -49,7 +49,7 @@ def run(log) -> Run:
 
 def rmse(log: FeatureLog, poses: np.ndarray) -> float:
     """Of the positions; the first camera is the world."""
-    true = SE3.between(log.truth.world_from_camera[0], log.truth.world_from_camera)
+    true = SE3.between(log.truth.poses[0], log.truth.poses)
     off = SE3.translation(poses) - SE3.translation(true)
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 

@@ -81,7 +81,7 @@ def test_where_nothing_was_mapped_the_map_goes_on():
 
 def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> Pair[StereoFeatures]:
     """The last pair of `settled`, of this wall or another; half of the places are exchanged."""
-    source = Pairs(texture(seed), pairs(12).truth.world_from_camera, lambda t, frame: frame)
+    source = Pairs(texture(seed), pairs(12).truth.poses, lambda t, frame: frame)
     pair, _ = slam.front_end.measure(next(iter(source.frames(11))))
     features, rng = pair.features, np.random.default_rng(0)
     z, rows = features.z.copy(), rng.permutation(len(features))[: len(features) // 2]

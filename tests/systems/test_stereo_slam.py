@@ -55,7 +55,7 @@ class TestPath:
         """Every landmark seen often lies on the plane, within a few of its own standard deviations."""
         found = plain.system.map()
         often = found.columns["sightings"] >= 5
-        points = SE3.transform(pairs(COUNT).truth.world_from_camera[0], found.mean[often])
+        points = SE3.transform(pairs(COUNT).truth.poses[0], found.mean[often])
         side, down = points[:, 0] / 0.004, points[:, 1] / (0.004 * np.cos(0.35))
         off = points[:, 2] - (1.5 + down * 0.004 * np.sin(0.35) + 0.3 * side * 0.004)
         assert often.sum() > 10

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints, Truth
 from tests.validation.numeric import shrunk, slope_of
 
 PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)
@@ -45,7 +45,7 @@ def scene(
         )
         z = camera.project(local) + np.einsum("kij,kj->ki", factor, rng.normal(size=(len(seen), camera.dim)))
         images.append(FeatureFrame(100_000_000 * step, names[seen], z, factor @ factor.mT))
-    truth = CameraTruth(np.array([f.stamp_ns for f in images]), path, dict(zip(names.tolist(), places, strict=True)))
+    truth = Truth(np.array([f.stamp_ns for f in images]), path, dict(zip(names.tolist(), places, strict=True)))
     return FeatureLog("small scene", camera, images, _known(names[:known], places[:known], rng), truth)
 
 
@@ -88,7 +88,7 @@ def solve_by_scipy(log: FeatureLog, robust: float | None = None) -> Reference:
 
     def parts(x: Array) -> tuple[Array, Array]:
         lead = x.shape[:-1]
-        path = SE3.retract(log.truth.world_from_camera, x[..., :split].reshape(*lead, -1, 6))
+        path = SE3.retract(log.truth.poses, x[..., :split].reshape(*lead, -1, 6))
         return path, around + x[..., split:].reshape(*lead, -1, 3)
 
     def residuals(x: Array) -> Array:

@@ -95,7 +95,7 @@ def test_known_points_make_one_world_of_filter_and_batch():
 def camera_problem():
     """A log without known points, and its optimum as if a filter had found it, in another scale."""
     log = replace(scene(frames=7, points=18, known=0, seed=3), known=None)
-    optimum = solve_problem(log, log.truth.world_from_camera)
+    optimum = solve_problem(log, log.truth.poses)
     return log, optimum.estimate
 
 

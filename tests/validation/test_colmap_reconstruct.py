@@ -10,7 +10,7 @@ from rbpf.lie import SE3
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import open_images
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.compare import (
@@ -75,7 +75,7 @@ def test_the_same_seed_gives_the_same_reconstruction(desk, found):
 def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
     truth = made()
     moved = made(scale=3.0)
-    reference = Trajectory(truth.stamps_ns, truth.world_from_camera)
+    reference = Trajectory(truth.stamps_ns, truth.poses)
     similar = compare_with_path(moved, reference)
     assert similar.path.rmse < 1e-12
     assert similar.reference_from_colmap.scale == pytest.approx(1 / 3)
@@ -116,7 +116,7 @@ def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
 
 def test_what_cannot_be_compared_is_refused():
     ours = made()
-    late = CameraTruth(ours.stamps_ns + 10**12, ours.world_from_camera)
+    late = Truth(ours.stamps_ns + 10**12, ours.world_from_camera)
     with pytest.raises(InputError, match="covers 0 of 8 key frames"):
         compare_with_truth(ours, late)
     with pytest.raises(InputError, match="same clock"):
@@ -161,7 +161,7 @@ def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
     sequence = open_images(data_dir / "mono_redkitchen_a")
     truth = sequence.truth
     points = MapEstimate(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
-    estimate = PathAndMap(truth.stamps_ns, truth.world_from_camera, np.empty((0, 6, 6)), points)
+    estimate = PathAndMap(truth.stamps_ns, truth.poses, np.empty((0, 6, 6)), points)
     run, own = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=16, features=1500))
     assert run.reconstruction.fraction >= 0.9
     assert own.path.rmse < 0.05, "the reference reconstruction is 0.038 m from this truth"

@@ -38,7 +38,7 @@ def estimate_of(log, names=None):
     std = np.linspace(0.01, 0.2, len(names))
     points = np.array([log.truth.landmarks[name] for name in names])
     summary = MapEstimate(np.array(names), points, std[:, None, None] ** 2 * np.eye(3))
-    return PathAndMap(stamps, log.truth.world_from_camera, np.empty((0, 6, 6)), summary)
+    return PathAndMap(stamps, log.truth.poses, np.empty((0, 6, 6)), summary)
 
 
 def read_ply(path):
@@ -71,12 +71,12 @@ def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(t
     export_colmap(estimate, log, tmp_path / "model", kind)
     model = pycolmap.Reconstruction(tmp_path / "model")
     assert model.num_images() == 5 and model.num_points3D() == 12
-    for t, pose in enumerate(log.truth.world_from_camera):
+    for t, pose in enumerate(log.truth.poses):
         image = model.find_image_with_name(image_name(t))
         assert SE3.local(pose, from_colmap_pose(image.cam_from_world())) == pytest.approx(np.zeros(6), abs=1e-12)
     table = observation_table(log)
     points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
-    ours = np.linalg.norm(reprojection(table, log.truth.world_from_camera, points)[0], axis=1)
+    ours = np.linalg.norm(reprojection(table, log.truth.poses, points)[0], axis=1)
     theirs = reprojection_errors(model)
     assert len(theirs) == len(ours)
     ids = estimate.landmarks.ids.tolist()
@@ -89,7 +89,7 @@ def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
     log = scene(camera=STEREO, frames=3, points=8, noise_px=1e-7)
     table = observation_table(log)
     points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
-    model = build_model(table, log.truth.world_from_camera, points)
+    model = build_model(table, log.truth.poses, points)
     assert model.num_rigs() == 1 and model.num_frames() == 3 and model.num_images() == 6
     assert max(reprojection_errors(model).values()) < 1e-5
     left, right = (model.image(image_id(1, side, True)) for side in (LEFT, RIGHT))

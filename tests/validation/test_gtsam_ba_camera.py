@@ -23,7 +23,7 @@ CAMERAS = [PLAIN, BENT, WHOLE, FISHEYE, STEREO]
 def estimate(log, seed=5, scale=0.02):
     """The truth, disturbed."""
     rng = np.random.default_rng(seed)
-    path = log.truth.world_from_camera
+    path = log.truth.poses
     moved = SE3.retract(path, scale * rng.normal(size=(len(path), 6)))
     return InitialEstimate(moved, {n: p + scale * rng.normal(size=3) for n, p in log.truth.landmarks.items()})
 
@@ -74,7 +74,7 @@ def _distances(path):
 def test_points_known_exactly_stay_where_they_are():
     log = scene()
     exact = replace(log, known=KnownPoints(log.known.names, log.known.positions, np.zeros_like(log.known.cov)))
-    found = solve_features(exact, InitialEstimate(log.truth.world_from_camera, {}))
+    found = solve_features(exact, InitialEstimate(log.truth.poses, {}))
     tight = replace(log, known=KnownPoints(log.known.names, log.known.positions, 1e-6 * log.known.cov))
     near = solve_features(tight, estimate(log))
     for name, position in zip(log.known.names.tolist(), log.known.positions, strict=True):
@@ -112,7 +112,7 @@ def adjusted(camera, known: str):
     if log.known is not None:
         names = known_by_name(log.known, table.names)
     problem = CameraProblem(log.name, len(log.frames), table, names)
-    start = begin(problem, InitialEstimate(log.truth.world_from_camera, {}))
+    start = begin(problem, InitialEstimate(log.truth.poses, {}))
     return adjust(problem, start)
 
 

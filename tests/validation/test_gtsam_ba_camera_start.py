@@ -22,7 +22,7 @@ SQUARE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.3, 0.0], [0.0, 0.3,
 
 
 def true_start(log):
-    return InitialEstimate(log.truth.world_from_camera, {})
+    return InitialEstimate(log.truth.poses, {})
 
 
 def shown(log, step, names, z):
@@ -54,7 +54,7 @@ def test_a_camera_that_rests_at_first_is_followed(camera, known, outliers):
     measuring = Measuring(known=known, outlier_rate=outliers)
     log = simulate_features(DeskWorld(frames=90), measuring, camera, seed=1)
     found = solve_features(log, robust=1.345 if outliers else None, marginals=False)
-    path = log.truth.world_from_camera
+    path = log.truth.poses
     if not known:
         path = SE3.compose(SE3.inverse(path[0]), path)
     errors = np.sqrt(np.square(SE3.local(path, found.world_from_body)).mean(0))
@@ -83,7 +83,7 @@ def test_a_landmark_that_an_outlier_draws_into_its_camera_is_left_out():
     left_out = set(names[counts > 1].tolist()) - set(found.landmarks)
     assert left_out
     assert left_out <= set(found.undetermined)
-    assert np.abs(SE3.local(log.truth.world_from_camera, found.world_from_body)).max() < 0.03
+    assert np.abs(SE3.local(log.truth.poses, found.world_from_body)).max() < 0.03
 
 
 def test_a_stereo_pair_places_a_landmark_seen_once():
@@ -97,7 +97,7 @@ def test_a_stereo_pair_places_a_landmark_seen_once():
 
 def test_a_star_keeps_its_direction_and_helps_the_rotation():
     log = scene(noise_px=0.3)
-    path = log.truth.world_from_camera
+    path = log.truth.poses
     stars = np.array([[0.2, 0.3, 1.0], [-0.5, -0.2, 1.0]])
     starry = log
     for step in range(len(path)):
@@ -169,7 +169,7 @@ def test_frames_that_nothing_holds_are_refused(spoil, known, words):
 
 def test_an_unusable_estimate_is_refused():
     log = scene(known=0)
-    path, points = log.truth.world_from_camera, log.truth.landmarks
+    path, points = log.truth.poses, log.truth.landmarks
     with pytest.raises(InputError, match=re.escape("poses (6, 7), one for each frame of small scene, found (3, 7)")):
         solve_features(log, InitialEstimate(path[:3], points))
     with pytest.raises(InputError, match="All initial poses of small scene are at one place"):

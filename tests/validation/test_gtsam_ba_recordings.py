@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 def planar_errors(m, log, path, landmarks):
     """Root mean square of the path after rigid alignment, and mean of the landmarks after their own."""
     truth = log.truth
-    true_x, true_y = truth.world_from_robot[:, 1:].T
+    true_x, true_y = truth.poses[:, 1:].T
     true = np.stack([np.interp(m.stamps_ns, truth.stamps_ns, x) for x in (true_x, true_y)], axis=1)
     off = align(path[:, 1:], true).transform(path[:, 1:]) - true
     return np.sqrt(np.square(off).sum(1).mean()), landmark_errors(landmarks, truth.landmarks, "rigid").mean
@@ -35,7 +35,7 @@ def planar_errors(m, log, path, landmarks):
 
 def exact_errors(m, log, path, landmarks):
     """Root mean square of the path and mean of the landmarks, without alignment."""
-    off = m.space.translation(path) - m.space.translation(log.truth.world_from_robot)
+    off = m.space.translation(path) - m.space.translation(log.truth.poses)
     return np.sqrt(np.square(off).sum(1).mean()), landmark_errors(landmarks, log.truth.landmarks).mean
 
 
@@ -44,7 +44,7 @@ def exact_errors(m, log, path, landmarks):
 )
 def test_simulated_recordings_give_the_errors_of_the_reference(data_dir, folder, batch):
     log = open_log(data_dir / folder)
-    m = from_log(log, start=log.truth.world_from_robot[0])
+    m = from_log(log, start=log.truth.poses[0])
     found = solve(m)
     assert exact_errors(m, log, found.world_from_body, found.landmarks) == pytest.approx(batch, abs=6e-5)
     expected = 0.5 * m.z.shape[1] * (len(m.z) - len(found.landmarks))

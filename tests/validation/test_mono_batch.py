@@ -29,7 +29,7 @@ def log() -> FeatureLog:
 def rough(log: FeatureLog) -> np.ndarray:
     """Poses somewhere near the truth."""
     rng = np.random.default_rng(0)
-    return SE3.retract(known(log.truth).world_from_camera, 0.01 * rng.standard_normal((len(log.frames), 6)))
+    return SE3.retract(known(log.truth).poses, 0.01 * rng.standard_normal((len(log.frames), 6)))
 
 
 def adjusted(log: FeatureLog, path: np.ndarray, **options: Any) -> Optimum:
@@ -53,7 +53,7 @@ def test_a_whole_log_is_the_plain_solution(log):
     np.testing.assert_array_equal(batch.steps, np.arange(FRAMES))
     plain = solve_features(log, robust=HUBER, marginals=False)
     assert np.abs(SE3.local(plain.world_from_body, batch.estimate.world_from_body)).max() < 1e-4
-    error = batch.estimate.trajectory.positions - SE3.translation(known(log.truth).world_from_camera)
+    error = batch.estimate.trajectory.positions - SE3.translation(known(log.truth).poses)
     assert np.sqrt(np.square(error).sum(axis=1).mean()) < 0.02
 
 
@@ -92,7 +92,7 @@ def test_a_wrong_focal_length_and_distortion_are_mended():
     camera, rounds = log.camera, []
     wrong = replace(camera, fx=0.96 * camera.fx, fy=0.96 * camera.fy, distortion=(-0.02, 0.0, 0.0, 0.0, 0.0))
     spoilt = replace(log, camera=wrong)
-    start = solve_problem(spoilt, known(log.truth).world_from_camera, HUBER, marginals=False)
+    start = solve_problem(spoilt, known(log.truth).poses, HUBER, marginals=False)
     refined = refine_calibration(spoilt, start, lambda done, most: rounds.append(done))
     assert refined.batch.error < start.error
     off = np.array([refined.camera.fx / camera.fx - 1.0, refined.camera.distortion[0]])

@@ -61,6 +61,6 @@ def test_the_folder_holds_what_the_wheels_say(tmp_path: Path) -> None:
     assert len(odometry.stamps_ns) == 49
     np.testing.assert_array_equal(odometry.stamps_ns[::6], sequence.stamps_ns)
     np.testing.assert_allclose(odometry.robot_from_camera, ROBOT_FROM_CAMERA)
-    reckoned = odometry.world_from_camera(sequence.truth.world_from_camera[0])[::6]
-    apart = np.linalg.norm(reckoned[:, 4:] - sequence.truth.world_from_camera[:, 4:], axis=1)
+    reckoned = odometry.world_from_camera(sequence.truth.poses[0])[::6]
+    apart = np.linalg.norm(reckoned[:, 4:] - sequence.truth.poses[:, 4:], axis=1)
     assert 0.0 < apart[-1] < 0.08 * TOUR.way_m[48]

@@ -158,7 +158,7 @@ def test_the_truth_is_told_from_the_first_pose():
     moved = log.space.retract(log.space.identity(), np.array([0.5, 3.0, -2.0]))
     truth = Truth(
         log.truth.stamps_ns,
-        log.space.compose(moved, log.truth.world_from_robot),
+        log.space.compose(moved, log.truth.poses),
         {k: log.space.transform(moved, p[:2]) for k, p in log.truth.landmarks.items()},
     )
     stamps = np.array([frame.stamp_ns for frame in log.frames])
@@ -166,7 +166,7 @@ def test_the_truth_is_told_from_the_first_pose():
     np.testing.assert_allclose(there.poses, here.poses, atol=1e-12)
     for name, point in here.landmarks.items():
         np.testing.assert_allclose(there.landmarks[name], point, atol=1e-12)
-    late = Truth(truth.stamps_ns[5:], truth.world_from_robot[5:])
+    late = Truth(truth.stamps_ns[5:], truth.poses[5:])
     assert truth_at(log.space, late, stamps, "first frame").alignment == "rigid"
     assert truth_at(log.space, Truth(truth.stamps_ns[-2:], truth.poses[-2:]), stamps, "first frame") is None
 

@@ -21,7 +21,7 @@ from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Similarity, Trajectory, associate
 from rbpf.runs.truth import poses_at
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import ImageSequence
 from rbpf.validation.colmap.model import OVER_IMAGES, recorded_images
 from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction, ReconstructionOptions, reconstruct
@@ -138,9 +138,9 @@ def compare_with_path(
     return ColmapComparison(found, errors, move, cloud, extent)
 
 
-def compare_with_truth(found: Reconstruction, truth: CameraTruth) -> ColmapComparison:
+def compare_with_truth(found: Reconstruction, truth: Truth) -> ColmapComparison:
     """COLMAP beside the truth, interpolated at the key frames; an InputError where there is too little."""
-    rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, found.stamps_ns)
+    rows, poses = poses_at(SE3, truth.stamps_ns, truth.poses, found.stamps_ns)
     if len(rows) < LEAST_FRAMES:
         raise InputError(
             f"The ground truth of {found.name} covers {len(rows)} of {len(found.frames)} key frames, expected "

@@ -107,7 +107,6 @@ def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, dr
     xi = np.zeros((draws, len(path), dim))
     xi[:, 1:] = moves[places.size :].T.reshape(draws, -1, dim)
     poses, log_motion = _driven(problem, path, xi)
-
     # Landmarks: their scatter about where the poses' moves would have them, and where the true residuals do.
     information = (points.T @ points).tobsr((size, size)).data
 
@@ -121,7 +120,6 @@ def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, dr
     for some, residual in _residuals(problem, poses, landmarks):
         landmarks[some] -= pulled(points.T @ residual)
     landmarks += scatter
-
     log_seen = np.full(draws, -0.5 * np.linalg.slogdet(2.0 * np.pi * m.cov_z)[1].sum())
     for some, residual in _residuals(problem, poses, landmarks):
         log_seen[some] -= 0.5 * np.square(residual).sum(axis=0)

@@ -73,7 +73,6 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None 
     graph = problem.graph(found.state, found.loose, path, SCALE, factors)
     values = problem.values(found.state)
     values.insert(key, np.zeros(2))
-
     done = count(1)
     tell, std = on_round or (lambda _done, _most: None), np.full(2, np.nan)
     try:

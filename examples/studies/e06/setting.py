@@ -90,4 +90,4 @@ def true_poses(sequence: ImageSequence) -> np.ndarray:
     after = np.searchsorted(sequence.truth.stamps_ns, sequence.stamps_ns).clip(1, sequence.truth.stamps_ns.size - 1)
     stamps = sequence.truth.stamps_ns
     nearer = np.where(sequence.stamps_ns - stamps[after - 1] < stamps[after] - sequence.stamps_ns, after - 1, after)
-    return np.asarray(sequence.truth.world_from_camera[nearer])
+    return np.asarray(sequence.truth.poses[nearer])

@@ -38,7 +38,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import Grey, decode, decode_ahead, frame_of, require_shape, to_grey
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
@@ -298,7 +298,7 @@ def numbers_of(pose: Any) -> Array:
     return np.array([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z], dtype=float)
 
 
-def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -> CameraTruth:
+def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -> Truth:
     """The truth that a topic holds, for images at (T,) times, whose frame the poses should be those of."""
     kind = bag.topics.get(topic, "")
     if kind not in _POSES:

@@ -45,7 +45,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
@@ -102,7 +102,7 @@ class SevenScenes(ImageFormat):
         stamps_ns = np.rint(numbers * (1e9 / SCENES_RATE_HZ)).astype(np.int64)
         poses = [_scenes_pose(file.with_name(file.name.split(".")[0] + ".pose.txt")) for file in files]
         kept = [row for row, pose in enumerate(poses) if pose is not None]
-        truth = CameraTruth(stamps_ns[kept], np.array([poses[row] for row in kept])) if kept else None
+        truth = Truth(stamps_ns[kept], np.array([poses[row] for row in kept])) if kept else None
         return _sequence(path, camera, stamps_ns, files, truth)
 
 
@@ -132,7 +132,7 @@ class Photos(ImageFormat):
         photos = [row for row in rows if row[1] != "K"]
         table = parse_table(file, _PHOTO_POSE, [(line, pose) for line, _, pose in photos])
         stamps_ns = evenly(len(photos), PHOTO_RATE_HZ)
-        truth = CameraTruth(stamps_ns, normalised(np.roll(table.values, 4, axis=1), table.error))
+        truth = Truth(stamps_ns, normalised(np.roll(table.values, 4, axis=1), table.error))
         files = [path / "images" / name for _, name, _ in photos]
         return _sequence(path, camera, stamps_ns, files, truth, file)
 
@@ -185,7 +185,7 @@ def _sequence(
     camera: Calibration,
     stamps_ns: np.ndarray,
     files: list[Path],
-    truth: CameraTruth | None,
+    truth: Truth | None,
     listed: Path | None = None,
 ) -> ImageSequence:
     """Images in files of one size, which are listed in a file or lie in the folder."""

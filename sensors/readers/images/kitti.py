@@ -20,7 +20,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import pose_of_matrix, rigid_motion_error
@@ -140,7 +140,7 @@ def _files(folder: Path, count: int) -> list[Path]:
     return [found.get(i, folder / f"{i:06d}.png") for i in range(count)]
 
 
-def _read_truth(path: Path, first_from_camera: Array, stamps_ns: np.ndarray) -> CameraTruth | None:
+def _read_truth(path: Path, first_from_camera: Array, stamps_ns: np.ndarray) -> Truth | None:
     folder = path.resolve()
     for file in (path / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
         if not file.exists():
@@ -153,5 +153,5 @@ def _read_truth(path: Path, first_from_camera: Array, stamps_ns: np.ndarray) -> 
         for row, matrix in enumerate(matrices):
             if (wrong := rigid_motion_error(matrix)) is not None:
                 raise table.error(row, wrong)
-        return CameraTruth(stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
+        return Truth(stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
     return None

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.text import read_stamped
 
 #: How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more.
@@ -39,16 +39,16 @@ def normalised(world_from_body: Array, error: Callable[[int, str], InputError]) 
     return SE3.normalise(world_from_body)
 
 
-def truth_between(path: Path, stamps_ns: np.ndarray, world_from_camera: Array, images_ns: np.ndarray) -> CameraTruth:
+def truth_between(path: Path, stamps_ns: np.ndarray, world_from_camera: Array, images_ns: np.ndarray) -> Truth:
     """Ground truth in a file, poses (P, 7) at times (P,), that lies at least in part in the time of the images (T,)."""
     if stamps_ns[-1] < images_ns[0] or stamps_ns[0] > images_ns[-1]:
         poses, images = (f"{span[0] / 1e9:.3f} to {span[-1] / 1e9:.3f} s" for span in (stamps_ns, images_ns))
         problem = f"the poses are at {poses} and the images at {images}, which is another clock"
         raise InputError(f"{path}: {problem}; shift the poses to the images' clock, or take the file away.")
-    return CameraTruth(stamps_ns, world_from_camera)
+    return Truth(stamps_ns, world_from_camera)
 
 
-def read_tum_truth(path: Path, images_ns: np.ndarray) -> CameraTruth | None:
+def read_tum_truth(path: Path, images_ns: np.ndarray) -> Truth | None:
     """`timestamp tx ty tz qx qy qz qw` [s, m], world_from_camera; None where there is no such file."""
     if not path.exists():
         return None

@@ -119,8 +119,8 @@ def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, w
     done = Rectification.between(sequence.camera, right, left_from_right, where)
     truth = sequence.truth
     if truth is not None:
-        turned = SE3.compose(truth.world_from_camera, done.left_from_rectified)
-        truth = replace(truth, world_from_camera=turned)
+        turned = SE3.compose(truth.poses, done.left_from_rectified)
+        truth = replace(truth, poses=turned)
     return replace(
         sequence,
         camera=done.rig.camera,

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.feature_log import Truth
 
 TOLERANCE_S = 0.005  #: Two images whose times differ by no more were taken together.
 
@@ -48,7 +48,7 @@ class ImageSequence:
     #: (T,) int64 times of the images, not decreasing; equal ones, between which no time passes, occur.
     stamps_ns: np.ndarray
     #: world_from_camera of the (left) camera at its own stamps, without landmarks; None where unknown.
-    truth: CameraTruth | None
+    truth: Truth | None
     baseline_m: float | None  #: of a rectified stereo pair, None where there is one camera.
     source: Source  #: where the images come from.
     notes: tuple[str, ...] = ()  #: one sentence for each thing that was left out or changed.

@@ -164,7 +164,7 @@ def film_images(bag, sequence, spoil=lambda k, shot: shot):
     """One camera's images and truth, from another recording."""
     shots = [spoil(k, {"stamp": f.stamp_ns, "image": f.image}) for k, f in enumerate(sequence.frames())]
     film(bag, "/cam0", sequence.camera, shots)
-    for stamp, pose in zip(sequence.truth.stamps_ns.tolist(), sequence.truth.world_from_camera, strict=True):
+    for stamp, pose in zip(sequence.truth.stamps_ns.tolist(), sequence.truth.poses, strict=True):
         bag.pose("/truth", stamp, pose)
 
 

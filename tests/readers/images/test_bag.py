@@ -300,7 +300,7 @@ def test_a_pair_that_has_to_be_rectified_is_where_its_cameras_say(tmp_path):
     assert sequence.rig.baseline_m == pytest.approx(0.12)
     assert "are not rectified; their images are, by the two CameraInfo" in sequence.notes[0]
     # The baseline lies along the left camera's rows: only the right one is turned.
-    left = sequence.truth.world_from_camera[0]
+    left = sequence.truth.poses[0]
     np.testing.assert_allclose(SE3.log(left)[:3], 0.0, atol=1e-6)
 
 
@@ -342,7 +342,7 @@ def test_truth_from_every_message_that_holds_a_pose(tmp_path, kind, message):
             bag.pose("/truth", stamp, pose, message)
     truth = open_images(path, topics=TRUTH).truth
     assert truth.stamps_ns.tolist() == list(STAMPS_NS)
-    np.testing.assert_allclose(SE3.between(truth.world_from_camera, poses), np.tile(SE3.identity(), (3, 1)), atol=1e-12)
+    np.testing.assert_allclose(SE3.between(truth.poses, poses), np.tile(SE3.identity(), (3, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -219,10 +219,10 @@ def test_stamps_and_truth_of_a_folder(tmp_path, caplog):
 def test_the_truth_of_tum_keeps_its_own_times_and_its_gaps(tmp_path):
     truth = open_images(write_tum(tmp_path)).truth
     assert truth.stamps_ns.tolist() == [1_500_000_000, 1_700_000_000] and truth.landmarks == {}
-    np.testing.assert_array_equal(truth.world_from_camera, [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 1, 2, 4]])
+    np.testing.assert_array_equal(truth.poses, [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 1, 2, 4]])
     # A quaternion of few digits is scaled to length 1.
     truth = open_images(write_tum(tmp_path, truth=["1.5 1 2 3 0.4564 0.1000 0.3652 0.8049"])).truth
-    assert np.linalg.norm(truth.world_from_camera[0, :4]) == pytest.approx(1.0, abs=1e-15)
+    assert np.linalg.norm(truth.poses[0, :4]) == pytest.approx(1.0, abs=1e-15)
     (tmp_path / "groundtruth.txt").unlink()
     assert open_images(tmp_path).truth is None
 
@@ -248,18 +248,18 @@ def test_the_estimated_state_of_euroc_becomes_the_pose_of_the_camera(tmp_path, m
     write_asl_truth(mav / "vicon0", PATH[1:], EUROC_NS[1:], SE3.identity())
     write_asl_truth(mav / "state_groundtruth_estimate0", PATH, EUROC_NS, mounted, extra=",0.1,0.2,0,0,0,0")
     truth = open_images(tmp_path / "a").truth
-    np.testing.assert_allclose(SE3.matrix(truth.world_from_camera), SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12)
+    np.testing.assert_allclose(SE3.matrix(truth.poses), SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12)
     assert truth.stamps_ns.tolist() == list(EUROC_NS)
     # A calibration that is given leaves the truth of the camera.
     given = open_images(tmp_path / "a", write_camera(tmp_path, fx=25.0)).truth
-    np.testing.assert_array_equal(truth.world_from_camera, given.world_from_camera)
+    np.testing.assert_array_equal(truth.poses, given.poses)
 
 
 def test_a_marker_is_not_the_body(tmp_path):
     marker = SE3.from_ypr(np.array([0.07, -0.1, 0.2]), 1.0, 0.5, -2.0)
     world_from_marker = SE3.compose(PATH, marker)
     write_asl_truth(write_euroc(tmp_path) / "mav0" / "vicon0", world_from_marker, EUROC_NS, marker)
-    found = SE3.matrix(open_images(tmp_path).truth.world_from_camera)
+    found = SE3.matrix(open_images(tmp_path).truth.poses)
     np.testing.assert_allclose(found, SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12)
 
 
@@ -272,7 +272,7 @@ def test_the_truth_of_kitti_beside_the_images_or_as_distributed(tmp_path, place)
     (tmp_path / "poses").mkdir()
     (folder / place).write_text("".join(map(matrix_row, ROAD)))
     sequence = open_images(folder)
-    np.testing.assert_allclose(sequence.truth.world_from_camera, ROAD, atol=1e-12)
+    np.testing.assert_allclose(sequence.truth.poses, ROAD, atol=1e-12)
     np.testing.assert_array_equal(sequence.truth.stamps_ns, sequence.stamps_ns)
 
 
@@ -287,7 +287,7 @@ def test_the_colour_pair_has_its_own_place(tmp_path):
     shift = -np.linalg.solve([[20, 0, 11.5], [0, 21, 7.5], [0, 0, 1]], [1.2, 2.1, 0.3])
     assert sequence.baseline_m == pytest.approx(0.54)
     expected = SE3.transform(ROAD, np.tile(shift, (3, 1)))
-    np.testing.assert_allclose(sequence.truth.world_from_camera[:, 4:], expected, atol=1e-12)
+    np.testing.assert_allclose(sequence.truth.poses[:, 4:], expected, atol=1e-12)
 
 
 def test_a_missing_image_of_kitti_is_a_lost_frame(tmp_path):
@@ -304,7 +304,7 @@ def test_where_tracking_was_lost_the_truth_of_scenes_has_a_gap(tmp_path, text):
     write_small_scenes(tmp_path)
     truth = open_images(tmp_path).truth
     expected = SE3.from_ypr(np.array([[0.0, 2, 3], [1, 2, 3], [4, 2, 3]]), [0.0, 0.1, 0.4], 0.2, 0.3)
-    np.testing.assert_allclose(truth.world_from_camera, expected, atol=1e-12)
+    np.testing.assert_allclose(truth.poses, expected, atol=1e-12)
     (tmp_path / POSE).unlink() if text is None else (tmp_path / POSE).write_text(text)
     sequence = open_images(tmp_path)
     assert len(sequence) == 3 and sequence.truth.stamps_ns.tolist() == [0, 133_333_333]
@@ -324,7 +324,7 @@ def test_scenes_without_a_calibration_have_the_nominal_camera(tmp_path):
 def test_poses_of_photos_in_the_order_of_their_lines(tmp_path):
     truth = open_images(write_photos(tmp_path)).truth
     assert truth.stamps_ns.tolist() == [0, 1_000_000_000]
-    assert truth.world_from_camera.tolist() == [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 4, 5, 6]]
+    assert truth.poses.tolist() == [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 4, 5, 6]]
 
 
 # Videos.

@@ -42,6 +42,6 @@ def test_known_points_are_seen_where_the_table_says(data_dir, folder, tolerance_
     sequence = open_images(data_dir / folder)
     points = read_known_points(data_dir / folder / "known_points.csv")
     assert points.names.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
-    start = SE3.identity() if sequence.truth is None else sequence.truth.world_from_camera[0]
+    start = SE3.identity() if sequence.truth is None else sequence.truth.poses[0]
     px = sequence.camera.project(SE3.inverse_transform(np.tile(start, (8, 1)), points.positions))
     assert np.abs(px - points.px).max() < tolerance_px

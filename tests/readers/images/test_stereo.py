@@ -44,7 +44,7 @@ def test_a_euroc_pair(tmp_path):
     assert levels(sequence) == [(10, 100), (20, 110), (30, 120)]
     assert all(frame.problem is None for frame in sequence.frames())
     expected = SE3.compose(poses, CAM0)
-    np.testing.assert_allclose(SE3.local(sequence.truth.world_from_camera, expected), 0.0, atol=1e-9)
+    np.testing.assert_allclose(SE3.local(sequence.truth.poses, expected), 0.0, atol=1e-9)
     assert [frame.stamp_ns for frame in sequence.frames(1)] == list(EUROC_NS[1:])
 
 
@@ -163,7 +163,7 @@ def test_a_pair_that_is_not_rectified_is_rectified(tmp_path):
     frame = next(sequence.frames())
     assert frame.image.shape == frame.right.shape == (16, 24)
     # A rectified camera keeps its place and turns towards the baseline.
-    turned = SE3.between(SE3.compose(poses, CAM0), sequence.truth.world_from_camera)
+    turned = SE3.between(SE3.compose(poses, CAM0), sequence.truth.poses)
     np.testing.assert_allclose(SE3.translation(turned), 0.0, atol=1e-9)
     direction = SE3.rotation(turned[0])[:, 0]
     np.testing.assert_allclose(direction, np.array([0.11, 0.002, 0.0]) / np.hypot(0.11, 0.002), atol=1e-6)
