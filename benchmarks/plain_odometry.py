@@ -7,8 +7,8 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors import MatchLimits
-from rbpf.sensors.stereo import StereoFeatures, match_frames
+from rbpf.sensors.descriptors import MatchLimits, match_all
+from rbpf.sensors.stereo import StereoFeatures
 
 WITHIN_PX, TRIALS, STEPS, HUBER = 2.0, 200, 12, 1.5
 
@@ -18,7 +18,7 @@ def path(rig: RectifiedStereo, features: list[StereoFeatures], seed: int = 0) ->
     cv2.setRNGSeed(seed)
     poses, agreeing = [SE3.identity()], []
     for before, after in pairwise(features):
-        matches = match_frames(before, after, MatchLimits())
+        matches = match_all(before.descriptors, after.descriptors, MatchLimits())
         now_from_before, kept = motion(rig, before.take(matches.first), after.take(matches.second))
         poses.append(SE3.compose(poses[-1], SE3.inverse(now_from_before)))
         agreeing.append(kept)

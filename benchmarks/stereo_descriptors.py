@@ -19,12 +19,12 @@ from benchmarks.plain_odometry import path
 from rbpf.core.models import NULL
 from rbpf.lie import SE3
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors import DescriptorStore, MatchLimits, gate_pairs, match_pairs
+from rbpf.sensors.descriptors import DescriptorStore, MatchLimits, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.sift import SiftConfig, descriptors_from_histograms
 from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.readers import open_stereo
-from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
+from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 
 NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
 SLACK_PX, RIGHT = 2.0, 16.3
@@ -85,7 +85,7 @@ def frame_to_frame(recording: Recording, gap: int) -> tuple[int, int]:
     found = right = 0
     for frame in range(0, len(recording.features) - gap, 2):
         before, after = recording.features[frame], recording.features[frame + gap]
-        matches = match_frames(before, after, MatchLimits())
+        matches = match_all(before.descriptors, after.descriptors, MatchLimits())
         mean, cov = recording.predicted(*recording.in_world(frame, matches.first), frame + gap)
         found += len(matches)
         right += int(agree(mean, cov, after.z[matches.second], after.cov[matches.second]).sum())

@@ -16,9 +16,9 @@ import numpy as np
 from benchmarks.plain_odometry import WITHIN_PX, motion
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.descriptors import MatchLimits
+from rbpf.sensors.descriptors import MatchLimits, match_all
 from rbpf.sensors.readers import ImageSequence, open_stereo
-from rbpf.sensors.stereo import StereoMatcher, match_frames
+from rbpf.sensors.stereo import StereoMatcher
 from rbpf.validation.simulation.desk_and_room import TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
@@ -33,7 +33,7 @@ def residuals(sequence: ImageSequence) -> tuple[np.ndarray, np.ndarray]:
     frames = [frame for frame, _ in zip(sequence.frames(), range(FRAMES), strict=False)]
     features = [sensor.measure(frame.image, frame.right) for frame in frames]
     for before, after in pairwise(features):
-        matches = match_frames(before, after, MatchLimits())
+        matches = match_all(before.descriptors, after.descriptors, MatchLimits())
         first, second = before.take(matches.first), after.take(matches.second)
         pose, _ = motion(sequence.rig, first, second)
         miss = second.z - sequence.rig.project(SE3.transform(pose, first.points))

@@ -180,51 +180,26 @@ class DescriptorStore:
 
     def __init__(self, length: int) -> None:
         self.length = length
-        self._descriptors = np.zeros((64, length), dtype=np.float32)
-        self._ids = np.zeros(64, dtype=np.int64)
-        self._count = 0
+        self.ids = np.zeros(0, dtype=np.int64)  #: (M,) ascending.
+        self.descriptors = np.zeros((0, length), dtype=np.float32)  #: (M, d), in the order of the ids.
 
     def __len__(self) -> int:
-        return self._count
-
-    @property
-    def ids(self) -> np.ndarray:
-        """(M,) ascending."""
-        return self._ids[: self._count]
-
-    @property
-    def descriptors(self) -> np.ndarray:
-        """(M, d) float32, in the order of the ids."""
-        return self._descriptors[: self._count]
+        return self.ids.size
 
     def add(self, ids: np.ndarray, descriptors: np.ndarray) -> None:
         """Adds descriptors (k, d) of new landmarks (k,), whose ids ascend beyond those held; else an InputError."""
         ids = np.asarray(ids, dtype=np.int64)
         if descriptors.shape != (ids.size, self.length):
             raise InputError(f"descriptors must be ({ids.size}, {self.length}), a row an id, got {descriptors.shape}")
-        last = self._ids[self._count - 1 : self._count]
-        if (np.diff(np.concatenate([last, ids])) <= 0).any():
+        if (np.diff(np.concatenate([self.ids[-1:], ids])) <= 0).any():
             raise InputError("ids of new descriptors must ascend, and be above those held: take the map's own")
-        total = self._count + ids.size
-        if total > self._ids.size:
-            # Room for as many again.
-            more = max(total, 2 * self._ids.size) - self._ids.size
-            self._ids = np.pad(self._ids, (0, more))
-            self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))
-        self._ids[self._count : total], self._descriptors[self._count : total] = ids, descriptors
-        self._count = total
+        self.ids = np.concatenate([self.ids, ids])
+        self.descriptors = np.concatenate([self.descriptors, descriptors], dtype=np.float32)
 
     def remove(self, ids: np.ndarray) -> None:
         """Drops landmarks (k,); an InputError if one is not held."""
         rows = self.rows(ids)
-        if not rows.size:
-            return
-        # What is removed is mostly young: only what follows the first of them moves.
-        start = int(rows.min())
-        kept = np.delete(np.arange(start, self._count), rows - start)
-        total = start + kept.size
-        self._ids[start:total], self._descriptors[start:total] = self._ids[kept], self._descriptors[kept]
-        self._count = total
+        self.ids, self.descriptors = np.delete(self.ids, rows), np.delete(self.descriptors, rows, axis=0)
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
         """Rows (k,) of landmarks (k,); an InputError if one is not held."""
@@ -236,8 +211,8 @@ class DescriptorStore:
 
     def find(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (k,) of landmarks (k,), and whether each is held (k,); the row of one that is not means nothing."""
-        rows = np.minimum(np.searchsorted(self.ids, ids), max(self._count - 1, 0))
-        return rows, (self.ids[rows] == ids) if self._count else np.zeros(rows.shape, dtype=bool)
+        rows = np.minimum(np.searchsorted(self.ids, ids), max(self.ids.size - 1, 0))
+        return rows, (self.ids[rows] == ids) if self.ids.size else np.zeros(rows.shape, dtype=bool)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -245,8 +220,7 @@ class DescriptorStore:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        self._ids, self._descriptors = read(arrays, _KEPT, "descriptors/", length=self.length).values()
-        self._count = self._ids.size
+        self.ids, self.descriptors = read(arrays, _KEPT, "descriptors/", length=self.length).values()
 
     def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
         """The landmark (K,) of each descriptor (K, d), each once; NULL where there is none, an InputError for another d."""

@@ -27,7 +27,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.ranges import Formerly, NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
+from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
 
@@ -102,30 +102,6 @@ def triangulate_jacobian(rig: RectifiedStereo, z: np.ndarray) -> np.ndarray:
     slope[..., 0, 0] += rig.baseline_m / disparity[..., 0]
     slope[..., 1, 1] = rig.camera.fx / rig.camera.fy * rig.baseline_m / disparity[..., 0]
     return slope
-
-
-def match_frames(
-    before: StereoFeatures,
-    after: StereoFeatures,
-    limits: MatchLimits,
-    predicted: tuple[np.ndarray, np.ndarray] | None = None,
-    gate: float = 11.3,
-) -> DescriptorMatches:
-    """Which features of an earlier pair (rows `first`) are seen again in a later one (rows `second`).
-
-    Args:
-        before: K features of the earlier pair.
-        after: features of the later one.
-        limits: when a candidate is taken.
-        predicted: where the earlier ones should be in the later pair: (u_left, v, u_right) (K, 3), NaN for none, and
-            covariance (K, 3, 3) without the noise of the measurement; None lets all compete.
-        gate: largest squared Mahalanobis distance from there; 11.3 holds 99 % of a Gaussian.
-    """
-    if predicted is None:
-        return match_all(before.descriptors, after.descriptors, limits)
-    mean, cov = predicted
-    k, m = gate_pairs(after.z, after.cov, mean, cov, gate)
-    return match_pairs(before.descriptors, after.descriptors, (m, k), limits)
 
 
 SWAPPED, FEWER = 20, 4  #: So many matches the wrong way round, and so many times fewer the right way, are no accident.

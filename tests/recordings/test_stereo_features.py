@@ -7,7 +7,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.descriptors import MatchLimits, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.readers import open_stereo
-from rbpf.sensors.stereo import PairConfig, StereoMatcher, match_frames
+from rbpf.sensors.stereo import PairConfig, StereoMatcher
 
 pytestmark = pytest.mark.real_data
 
@@ -54,7 +54,7 @@ def test_they_move_as_the_truth_says(recording, features, apart, fraction):
     errors = []
     for first in range(PAIRS - apart):
         before, after = features[first], features[first + apart]
-        matches = match_frames(before, after, MatchLimits())
+        matches = match_all(before.descriptors, after.descriptors, MatchLimits())
         there = expected(recording, first, first + apart, before.points[matches.first])
         errors.append(np.abs(after.z[matches.second] - there).max(axis=1))
     error = np.concatenate(errors)
@@ -69,7 +69,7 @@ def test_the_refinement_brings_disparities_closer_to_each_other(recording, featu
     def spread(measured):
         out = []
         for first in range(PAIRS - 1):
-            matches = match_frames(measured[first], measured[first + 1], MatchLimits())
+            matches = match_all(measured[first].descriptors, measured[first + 1].descriptors, MatchLimits())
             there = expected(recording, first, first + 1, measured[first].points[matches.first])
             gap = (measured[first + 1].z[matches.second] - there) @ np.array([1.0, 0.0, -1.0])
             out.append(gap[np.abs(gap) < 3.0])

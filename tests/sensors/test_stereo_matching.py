@@ -7,9 +7,9 @@ from examples.studies.image_faults import salt_and_pepper
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.descriptors import MatchLimits
+from rbpf.sensors.descriptors import MatchLimits, match_all
 from rbpf.sensors.features import Sift, SiftConfig
-from rbpf.sensors.stereo import PairConfig, StereoMatcher, calibration_doubt, match_frames, refine, triangulate_jacobian
+from rbpf.sensors.stereo import PairConfig, StereoMatcher, calibration_doubt, refine, triangulate_jacobian
 from tests.sensors.stereo_scenes import RIG, room, true_disparity
 from tests.systems.stereo_sequences import pairs
 
@@ -69,27 +69,10 @@ def test_a_feature_is_seen_again_where_the_motion_takes_it():
     first, second = measured(0), measured(1)
     second_from_first = SE3.between(poses[1], poses[0])
     expected = RIG.project(SE3.transform(second_from_first, first.points))
-    matches = match_frames(first, second, MatchLimits())
+    matches = match_all(first.descriptors, second.descriptors, MatchLimits())
     error = second.z[matches.second] - expected[matches.first]
     assert len(matches) > 80
     assert np.mean(np.abs(error).max(axis=1) < 1.0) > 0.9
-
-
-def test_a_prediction_lets_only_near_ones_compete():
-    _, _, poses = room()
-    first, second = measured(0), measured(1)
-    mean = RIG.project(SE3.transform(SE3.between(poses[1], poses[0]), first.points))
-    cov = np.tile(4.0 * np.eye(3), (len(first), 1, 1))
-    loose = MatchLimits(ratio=0.9)
-    gated = match_frames(first, second, loose, (mean, cov))
-    free = match_frames(first, second, loose)
-    nu = second.z[gated.second] - mean[gated.first]
-    spread = cov[gated.first] + second.cov[gated.second]
-    assert (np.einsum("ki,kij,kj->k", nu, np.linalg.inv(spread), nu) <= 11.3 + 1e-9).all()
-    wrong = np.abs(second.z[free.second] - mean[free.first]).max(axis=1) > 10.0
-    assert len(gated) > (~wrong).sum()
-    mean[:] = np.nan
-    assert len(match_frames(first, second, loose, (mean, cov))) == 0
 
 
 def test_limits_of_the_disparity():
@@ -124,8 +107,8 @@ def test_a_pair_without_texture():
     features = StereoMatcher(RIG, Sift(FULL)).measure(flat, flat)
     assert len(features) == 0
     assert features.z.shape == (0, 3) and features.cov_points.shape == (0, 3, 3)
-    assert len(match_frames(features, measured(), MatchLimits())) == 0
-    assert len(match_frames(measured(), features, MatchLimits())) == 0
+    assert len(match_all(features.descriptors, measured().descriptors, MatchLimits())) == 0
+    assert len(match_all(measured().descriptors, features.descriptors, MatchLimits())) == 0
 
 
 def test_sizes_that_differ():

@@ -16,10 +16,11 @@ from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.descriptors import match_all
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
-from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
+from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.landmarks import (
     DescriptorLandmarks,
@@ -167,7 +168,8 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         return self.matcher.impossible
 
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
-        found = match_frames(before.features, now.features, self.config.odometry.limits)
+        one, other = before.features.descriptors, now.features.descriptors
+        found = match_all(one, other, self.config.odometry.limits)
         used = before.for_odometry[found.first] & now.for_odometry[found.second]
         return found.first[used], found.second[used]
 
