@@ -52,7 +52,7 @@ def open_images(
     is malformed; a topic is named that is not there.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics)
-    return _opened(existing(path, "an image sequence"), options, part, stereo=False)
+    return _opened(existing(path, "an image sequence"), options, part)
 
 
 def open_stereo(
@@ -79,12 +79,12 @@ def open_stereo(
     Raises InputError: as of `open_images`, no two images belong together, the two cameras' images differ in size, the
     baseline is zero, or the right camera is not to the right of the left one.
     """
-    options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
-    return _opened(existing(path, "a stereo sequence"), options, part, stereo=True)
+    options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s, stereo=True)
+    return _opened(existing(path, "a stereo sequence"), options, part)
 
 
-def _opened(path: Path, options: ReadOptions, part: Part, stereo: bool) -> ImageSequence:
-    formats = [one for one in IMAGES if one.stereo_kind or not stereo]
+def _opened(path: Path, options: ReadOptions, part: Part) -> ImageSequence:
+    formats = [one for one in IMAGES if one.stereo_kind or not options.stereo]
     for one in formats:
         if not one.recognises(path):
             continue
@@ -92,11 +92,11 @@ def _opened(path: Path, options: ReadOptions, part: Part, stereo: bool) -> Image
             name, value = next(iter(given.items()))
             problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"
             raise InputError(f"{path}: {problem}; leave it out.")
-        sequence = one.read_stereo(path, options) if stereo else one.read(path, options)
+        sequence = one.read(path, options)
         for note in sequence.notes:
             _log.warning("%s", note)
         return sequence if part == WHOLE else part.apply(sequence)
-    kinds = "; or ".join(one.stereo_kind if stereo else one.kind for one in formats)
+    kinds = "; or ".join(one.stereo_kind if options.stereo else one.kind for one in formats)
     raise InputError(f"{path}: found {_content(path)}, expected {kinds}.")
 
 

@@ -340,13 +340,7 @@ class RosBag(ImageFormat):
         return (path / "metadata.yaml").is_file() and any(SUFFIXES & set(file.suffixes) for file in path.iterdir())
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        return self._read(path, options, 1)
-
-    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
-        return self._read(path, options, 2)
-
-    def _read(self, path: Path, options: ReadOptions, cameras: int) -> ImageSequence:
-        topics = options.topics
+        topics, cameras = options.topics, 2 if options.stereo else 1
         with opened(path) as bag:
             names = _image_topics(bag, topics.images[:cameras], cameras)
             # The cameras, by a file or as the bag says.

@@ -53,14 +53,6 @@ class Calibration:
             raise InputError(f"{self.where}: width and height are {camera.width}x{camera.height}, {found}; {action}.")
 
 
-def find_calibration(folder: Path, given: Path | None) -> Calibration:
-    """The given calibration, or the one in the folder.
-
-    Raises InputError: there is none, or it is not as described above.
-    """
-    return read_calibration(folder / NAME if given is None else given)
-
-
 def read_calibration(path: Path) -> Calibration:
     """Read a `camera.yaml`. Raises InputError: the file is missing or not as described above."""
     entries = read_yaml(path, KIND).entries(_REQUIRED, _OPTIONAL)

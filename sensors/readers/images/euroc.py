@@ -49,7 +49,9 @@ class Euroc(ImageFormat):
         return (path / "mav0").is_dir() or (path / "cam0").is_dir()
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        mav = _mav(path)
+        mav = path / "mav0" if (path / "mav0").is_dir() else path
+        if options.stereo:
+            return self._read_pair(mav, options)
         own, body_from_camera = _read_camera(mav / "cam0" / "sensor.yaml", self.kind)
         rows = read_stamped(mav / "cam0" / "data.csv", self.kind, nanoseconds=True)
         files = rows.files(mav / "cam0" / "data")
@@ -59,8 +61,7 @@ class Euroc(ImageFormat):
         source = FileImages(rows.stamps_ns, shape, files)
         return _sequence(mav, used.camera, body_from_camera, rows.stamps_ns, source)
 
-    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
-        mav = _mav(path)
+    def _read_pair(self, mav: Path, options: ReadOptions) -> ImageSequence:
         folders = mav / "cam0", mav / "cam1"
         cameras = [_read_camera(folder / "sensor.yaml", self.stereo_kind) for folder in folders]
         (left, body_from_left), (right, body_from_right) = cameras
@@ -103,10 +104,6 @@ def _read_camera(path: Path, hint: str) -> tuple[Calibration, Array]:
     lens = coefficients(entries["distortion_coefficients"], model)
     camera = Pinhole(width, height, fx.positive(), fy.positive(), cx.number(), cy.number(), lens, model)
     return Calibration(str(path), camera), _mount(entries["T_BS"])
-
-
-def _mav(path: Path) -> Path:
-    return path / "mav0" if (path / "mav0").is_dir() else path
 
 
 def _sequence(

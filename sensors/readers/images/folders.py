@@ -46,7 +46,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
-from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_calibration, read_calibration
+from rbpf.sensors.readers.images.calibration import NAME, Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
@@ -75,7 +75,7 @@ class Tum(ImageFormat):
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         rows = read_stamped(path / "rgb.txt", self.kind)
         files = rows.files(path)
-        camera = find_calibration(path, options.calibration)
+        camera = read_calibration(options.calibration or path / NAME)
         truth = read_tum_truth(path / "groundtruth.txt", rows.stamps_ns)
         return _sequence(path, camera, rows.stamps_ns, files, truth, rows.path)
 
@@ -97,7 +97,7 @@ class SevenScenes(ImageFormat):
             if number == later:
                 raise InputError(f"{path}: found {file.name} and {other.name}, expected one image of each number.")
         known = options.calibration is not None or (path / NAME).is_file()
-        camera = find_calibration(path, options.calibration) if known else SCENES_CAMERA
+        camera = read_calibration(options.calibration or path / NAME) if known else SCENES_CAMERA
         numbers, files = np.array([number for number, _ in images], dtype=np.int64), [file for _, file in images]
         stamps_ns = np.rint(numbers * (1e9 / SCENES_RATE_HZ)).astype(np.int64)
         poses = [_scenes_pose(file.with_name(file.name.split(".")[0] + ".pose.txt")) for file in files]
@@ -150,7 +150,7 @@ class Folder(ImageFormat):
         files = list_images(path)
         if not files:
             raise InputError(f"{path}: expected images in it or in its images/, found none.")
-        camera, times = find_calibration(path, options.calibration), path / "times.txt"
+        camera, times = read_calibration(options.calibration or path / NAME), path / "times.txt"
         if times.exists():
             stamps_ns = read_stamped(times, self.kind).stamps_ns
             if len(stamps_ns) != len(files):

@@ -43,12 +43,7 @@ class Kitti(ImageFormat):
         return any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        return self._read(path, options, stereo=False)
-
-    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
-        return self._read(path, options, stereo=True)
-
-    def _read(self, path: Path, options: ReadOptions, stereo: bool) -> ImageSequence:
+        stereo = options.stereo
         left, right = next(pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir())
         folders = path / f"image_{left}", path / f"image_{right}"
         if stereo and not folders[1].is_dir():

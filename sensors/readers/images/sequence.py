@@ -120,6 +120,7 @@ class ReadOptions:
     calibration: Path | None = None  #: a `camera.yaml` in place of the recording's own calibration; None for that.
     topics: Topics = UNNAMED  #: of a ROS bag, where they have to be named.
     tolerance_s: float = TOLERANCE_S  #: images of two cameras whose times differ by no more belong together.
+    stereo: bool = False  #: both cameras are asked for, of a format that has a `stereo_kind`.
 
 
 class ImageFormat(ABC):
@@ -135,14 +136,7 @@ class ImageFormat(ABC):
 
     @abstractmethod
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        """Open the images of one camera, the left one of two.
+        """Open the images of one camera, the left one of two, or those of two cameras, rectified.
 
-        Raises InputError: a file is missing or not as the format's module describes.
+        Raises InputError: a file is missing or not as the format's module describes, or two cameras are not one pair.
         """
-
-    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
-        """Open the images of two cameras, rectified; overridden where there is a `stereo_kind`.
-
-        Raises InputError: as `read`, or the two cameras are not one pair.
-        """
-        raise NotImplementedError

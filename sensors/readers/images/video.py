@@ -23,7 +23,7 @@ from typing import Any, final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images.calibration import find_calibration, read_calibration
+from rbpf.sensors.readers.images.calibration import NAME, read_calibration
 from rbpf.sensors.readers.images.decoding import Grey, decode_ahead, frame_of, read_grey, require_shape, to_grey
 from rbpf.sensors.readers.images.folders import DEFAULT_RATE_HZ, evenly, list_images
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
@@ -44,7 +44,7 @@ class Video(ImageFormat):
         return path.is_file() and path.suffix.lower() in SUFFIXES
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        calibration = find_calibration(path.parent, options.calibration)
+        calibration = read_calibration(options.calibration or path.parent / NAME)
         camera, (stamps_ns, shape, quarters) = calibration.camera, read_header(path)
         if calibration.rate_hz is not None:
             stamps_ns = evenly(len(stamps_ns), calibration.rate_hz)
