@@ -140,15 +140,6 @@ def test_bad_settings_are_one_sentence(log, tmp_path, capsys, arguments, message
     assert not list((tmp_path / "run").glob("*"))
 
 
-def test_a_damaged_log_names_file_and_line(log, tmp_path, capsys):
-    broken = shutil.copytree(log, tmp_path / "log")
-    lines = (broken / "observations.csv").read_text().splitlines()
-    lines[5] = lines[5].replace(lines[5].split(",")[2], "-3")
-    (broken / "observations.csv").write_text("\n".join(lines) + "\n")
-    assert run(broken, tmp_path / "run") == 2
-    assert "observations.csv, line 6" in " ".join(capsys.readouterr().err.split())
-
-
 def test_a_cut_checkpoint_is_said(began, log, tmp_path, capsys):
     shutil.copytree(began, tmp_path / "run")
     checkpoint = tmp_path / "run" / "checkpoint.npz"

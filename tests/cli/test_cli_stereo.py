@@ -170,11 +170,3 @@ def test_a_recording_that_is_gone_cannot_be_compared_and_the_report_is_written(f
     assert main(["validate", str(folder), "--against", "colmap"]) == 2
     assert "nowhere" in sentence(capsys)
     assert "Not compared with colmap" in (folder / "report.html").read_text()
-
-
-def test_no_stereo_sequence(tmp_path, capsys):
-    (tmp_path / "empty").mkdir()
-    assert run(tmp_path / "empty", tmp_path / "run") == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "found an empty folder, expected a ROS bag" in said and "or an EuRoC sequence" in said
-    assert "or a KITTI odometry sequence of two cameras" in said

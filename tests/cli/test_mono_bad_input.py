@@ -49,32 +49,6 @@ def test_a_video_that_ends_in_mid_frame_keeps_what_it_showed(desk, tmp_path):
     assert any("the video ends after" in note for note in entries["problems"])
 
 
-def test_backward_stamps_name_the_line(folder, tmp_path, capsys):
-    times = (folder / "times.txt").read_text().splitlines()
-    times[5] = "0.0"
-    (folder / "times.txt").write_text("\n".join(times) + "\n")
-    said = refused(capsys, folder, tmp_path / "run")
-    assert "times.txt" in said and "6" in said and "backwards" in said
-
-
-def test_a_calibration_of_another_size_is_refused(folder, tmp_path, capsys):
-    camera = tmp_path / "camera.yaml"
-    camera.write_text("fx: 100\nfy: 100\ncx: 50\ncy: 40\nwidth: 100\nheight: 80\n")
-    said = refused(capsys, folder, tmp_path / "run", "--calibration", camera)
-    assert "100x80" in said and "240x180" in said
-
-
-def test_what_is_no_sequence_is_refused(tmp_path, capsys):
-    (tmp_path / "empty").mkdir()
-    assert "empty folder" in refused(capsys, tmp_path / "empty", tmp_path / "run")
-    assert "nowhere" in refused(capsys, tmp_path / "nowhere", tmp_path / "run")
-
-
-def test_a_first_image_that_is_damaged_is_refused(folder, tmp_path, capsys):
-    image_path(folder, 0).write_bytes(b"no image")
-    assert "first image" in refused(capsys, folder, tmp_path / "run")
-
-
 def mixed_up(rows):
     return [[*row[:3], *rows[k - 1][3:]] for k, row in enumerate(rows)]
 
