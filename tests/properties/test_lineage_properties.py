@@ -1,11 +1,11 @@
-"""The forest of ancestors against plain composition of ancestor indices."""
+"""The forest of ancestors and stored trajectories, against plain composition and a history that copies everything."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.core.genealogy import Lineage
+from rbpf.core.genealogy import History, Lineage
 
 
 def drawn(rng: np.random.Generator, n: int, concentration: float) -> np.ndarray:
@@ -98,3 +98,92 @@ def test_what_is_settled_is_forgotten_by_a_restoration():
     lineage.restore(other.arrays())
     lineage.take_up(0)
     np.testing.assert_array_equal(lineage.rows(0), [1, 1])
+
+
+class Copied:
+    """All paths (T, N, E), gathered anew at every resampling."""
+
+    def __init__(self, n: int, lag: int | None) -> None:
+        self.paths = np.zeros((0, n, 2))
+        self.stamps: list[int] = []
+        self.lag = lag
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        self.paths = self.paths[:, ancestors]
+
+    def record(self, stamp: int, state: np.ndarray) -> None:
+        keep = len(self.stamps) + 1 if self.lag is None else self.lag
+        self.paths = np.concatenate([self.paths, state[None]])[-keep:]
+        self.stamps = [*self.stamps, stamp][-keep:]
+
+
+def recorded(seed: int, lag: int | None, clouds: bool) -> tuple[History, Copied]:
+    """A history of random length, size and rate of resampling, saved and restored on its way."""
+    rng = np.random.default_rng(seed)
+    n, steps, rate = rng.integers(1, 9), rng.integers(1, 80), rng.choice([0.1, 0.6, 1.0])
+    lineage = Lineage(n)
+    history, oracle = History(lineage, lag, clouds), Copied(n, lag)
+    for t in range(steps):
+        if rng.random() < rate:
+            ancestors = np.sort(rng.integers(0, n, n))
+            lineage.advance(ancestors)
+            oracle.resample(ancestors)
+        state = rng.normal(size=(n, 2))
+        history.record(10 * t, state, np.full(n, -np.log(n)))
+        oracle.record(10 * t, state.copy())
+        state[:] = np.nan  # what was recorded is a copy
+        if rng.random() < 0.05:
+            lineage, history = restored(lineage, history)
+    return history, oracle
+
+
+@given(seed=st.integers(0, 2**32 - 1), lag=st.sampled_from([None, 1, 2, 7, 30]), clouds=st.booleans())
+def test_paths_are_those_of_a_full_history(seed, lag, clouds):
+    history, oracle = recorded(seed, lag, clouds)
+    np.testing.assert_array_equal(history.paths(), oracle.paths)
+    np.testing.assert_array_equal(history.stamps_ns, oracle.stamps)
+
+
+def restored(lineage: Lineage, history: History) -> tuple[Lineage, History]:
+    arrays = lineage.arrays() | history.arrays()
+    again = Lineage(lineage.n)
+    again.restore(arrays)
+    copy = History(again, history.lag, history.clouds)
+    copy.restore(arrays)
+    return again, copy
+
+
+@given(n=st.integers(1, 6), seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 40))
+def test_clouds_hold_every_particle_and_weight(n, seed, steps):
+    rng = np.random.default_rng(seed)
+    lineage = Lineage(n)
+    history = History(lineage, clouds=True)
+    states, weights = rng.normal(size=(steps, n, 3)), rng.normal(size=(steps, n))
+    for t in range(steps):
+        if rng.random() < 0.5:
+            lineage.advance(np.sort(rng.integers(0, n, n)))
+        history.record(t, states[t], weights[t])
+    np.testing.assert_array_equal([s for block in history.blocks for s in block.states], states)
+    np.testing.assert_array_equal([w for block in history.blocks for w in block.log_weights], weights)
+
+
+@pytest.mark.parametrize("rate", [0.2, 1.0])
+def test_a_fixed_lag_takes_constant_memory(rate):
+    rng = np.random.default_rng(8)
+    n, lag = 20, 25
+    lineage = Lineage(n)
+    history = History(lineage, lag)
+    sizes = []
+    for t in range(1500):
+        if rng.random() < rate:
+            lineage.advance(np.sort(rng.integers(0, n, n)))
+        history.record(t, np.zeros((n, 3)), np.zeros(n))
+        if t % 20 == 0:
+            arrays = lineage.arrays() | history.arrays()
+            sizes.append((history.stored_states, len(history.blocks), len(arrays["history/due"]), lineage.nodes))
+    states, blocks, due, nodes = np.max(sizes, axis=0)
+    assert states <= lag * n
+    assert blocks <= lag + 1
+    assert due <= 2 * lag + 4
+    assert nodes <= 16 * n
+    assert lineage.arrays()["lineage/parent"].size <= 16 * n
