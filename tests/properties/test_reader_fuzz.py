@@ -27,7 +27,6 @@ from tests.validation.worlds import world
 pytestmark = pytest.mark.slow
 
 POSES = SE3.exp(np.linspace(0.0, 1.0, 18).reshape(3, 6))
-KNOWN = "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n1,5.5,6.5,0.1,0.2,1.6,0.03\n2,15.5,6.5,0.3,0.2,1.6,0.03\n"
 
 Read = Callable[[Path], object]
 
@@ -98,11 +97,6 @@ def bag(name: str) -> tuple[Callable[[Path], object], Read, str]:
     return write, read, "**/*.*"
 
 
-def results(folder: Path) -> None:
-    write_tum(folder / "path.tum", Trajectory(np.arange(3) * 10**8, POSES))
-    (folder / "known_points.csv").write_text(KNOWN)
-
-
 def features(folder: Path) -> None:
     log = simulate_features(DeskWorld(frames=2), Measuring(measurements=8), MONO, seed=0)
     write_measurements(folder, replace(log, frames=[log.frames[0]] * 2))
@@ -129,8 +123,16 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "laser, ROS 1": (lambda f: bags.write_scans(f / "walk.bag"), lambda f: read_laser_log(f / "walk.bag"), "*"),
     "laser, ROS 2": (lambda f: bags.write_scans(f / "walk_db3"), lambda f: read_laser_log(f / "walk_db3"), "**/*.*"),
     "wheel odometry": (lambda f: small.write(f, small.WHEELS), read_wheel_odometry, "odometry.*"),
-    "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),
-    "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
+    "known points": (
+        lambda f: small.write(f, small.KNOWN),
+        lambda f: read_known_points(f / "known_points.csv"),
+        "known_points.csv",
+    ),
+    "path": (
+        lambda f: write_tum(f / "path.tum", Trajectory(np.arange(3) * 10**8, POSES)),
+        lambda f: read_tum(f / "path.tum"),
+        "path.tum",
+    ),
     "features": (features, read_feature_log, "observations*.csv"),
     "measurements": (lambda f: write_measurements(f, world(2, "position")), read_measurements, "*.csv"),
 }
@@ -186,7 +188,7 @@ def test_a_video_that_claims_more_images_than_it_has_bytes_is_counted(video):
 
 
 def test_a_table_that_is_too_large_is_not_read(tmp_path, monkeypatch):
-    (tmp_path / "known_points.csv").write_text(KNOWN)
+    small.write(tmp_path, small.KNOWN)
     monkeypatch.setattr(text, "MOST_BYTES", 20)
     with pytest.raises(InputError, match="larger than"):
         read_known_points(tmp_path / "known_points.csv")

@@ -90,17 +90,21 @@ def test_what_is_no_such_board_is_refused(image):
 
 
 @pytest.mark.parametrize(
-    ("size", "square_m", "words"),
+    ("kind", "numbers", "words"),
     [
-        ("9", 0.02, "inner corners as 9x6"),
-        ("9x-6", 0.02, "inner corners as 9x6"),
-        ("9x2", 0.02, "at least 3x3"),
-        ("9x6", 0.0, "must be positive"),
+        (Board, ("9", 0.02), "inner corners as 9x6"),
+        (Board, ("9x-6", 0.02), "inner corners as 9x6"),
+        (Board, ("9x2", 0.02), "at least 3x3"),
+        (Board, ("9x6", 0.0), "must be positive"),
+        (MarkerBoard, ("5", 0.04, 0.01, "4x4_50"), "their number as 5x7"),
+        (MarkerBoard, ("4x3", 0.0, 0.01, "4x4_50"), "is positive"),
+        (MarkerBoard, ("4x3", 0.04, -0.01, "4x4_50"), "not negative"),
+        (MarkerBoard, ("4x3", 0.04, 0.01, "9x9_50"), "no dictionary"),
     ],
 )
-def test_a_board_that_makes_no_sense(size, square_m, words):
+def test_a_board_that_makes_no_sense(kind, numbers, words):
     with pytest.raises(InputError, match=words):
-        Board.parse(size, square_m)
+        kind.parse(*numbers)
 
 
 def test_sizes_as_people_write_them():
@@ -160,30 +164,16 @@ def test_what_is_no_such_board_of_markers_is_refused():
         find_markers(seen_markers(small)[0], MARKERS)
 
 
-@pytest.mark.parametrize(
-    ("size", "side_m", "gap_m", "dictionary", "words"),
-    [
-        ("5", 0.04, 0.01, "4x4_50", "their number as 5x7"),
-        ("4x3", 0.0, 0.01, "4x4_50", "is positive"),
-        ("4x3", 0.04, -0.01, "4x4_50", "not negative"),
-        ("4x3", 0.04, 0.01, "9x9_50", "no dictionary"),
-    ],
-)
-def test_a_board_of_markers_that_makes_no_sense(size, side_m, gap_m, dictionary, words):
-    with pytest.raises(InputError, match=words):
-        MarkerBoard.parse(size, side_m, gap_m, dictionary)
-
-
 SIZE = CAMERA.width, CAMERA.height
+CORNERS = BOARD.corners * [1.0, -1.0, -1.0] + [-4 * BOARD.square_m, 2.5 * BOARD.square_m, 0.0]
 
 
 def exact_views(camera: Pinhole, poses: np.ndarray, noise_px: float, seed: int = 0) -> list[BoardView]:
     """Where the corners are, without images, with noise."""
     rng = np.random.default_rng(seed)
-    corners = BOARD.corners * [1.0, -1.0, -1.0] + [-4 * BOARD.square_m, 2.5 * BOARD.square_m, 0.0]
     views = []
     for k, pose in enumerate(poses):
-        px = camera.project(SE3.inverse_transform(pose, corners))
+        px = camera.project(SE3.inverse_transform(pose, CORNERS))
         views.append(BoardView(f"{k}.png", px + rng.normal(0.0, noise_px, px.shape)))
     return views
 
@@ -191,8 +181,7 @@ def exact_views(camera: Pinhole, poses: np.ndarray, noise_px: float, seed: int =
 def seen_whole(camera: Pinhole, noise_px: float, seed: int = 0) -> list[BoardView]:
     """Those views from near by that show the whole board to a fisheye camera."""
     poses = nearby(20)
-    corners = BOARD.corners * [1.0, -1.0, -1.0] + [-4 * BOARD.square_m, 2.5 * BOARD.square_m, 0.0]
-    seen = camera.visible(SE3.inverse_transform(poses[:, None], corners)).all(axis=1)
+    seen = camera.visible(SE3.inverse_transform(poses[:, None], CORNERS)).all(axis=1)
     return exact_views(camera, poses[seen], noise_px, seed)
 
 

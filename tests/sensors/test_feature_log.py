@@ -27,72 +27,53 @@ def refused(message: str):
     return pytest.raises(InputError, match=f"^{re.escape(message)}")
 
 
-class TestFeatureLog:
-    def test_stereo_measures_three_numbers(self):
-        assert log(frame(0, 4, dim=3), camera=STEREO).camera.dim == 3
-        with refused("frame 0 of walk: z must be (4, 3) float64, got (4, 2) float64"):
-            log(frame(0, 4), camera=STEREO)
-
-    def test_a_covariance_may_be_singular(self):
-        good = frame(0, 2)
-        exact = replace(good, cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
-        assert log(exact).frames == [exact]
-
-    def test_no_frame_and_frames_out_of_order(self):
-        with refused("walk holds no frame, expected at least one image"):
-            log()
-        with refused("frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"):
-            log(frame(0, 1), frame(5, 1), frame(4, 1))
-
-    @pytest.mark.parametrize(
-        ("wrong", "message"),
-        [
-            ({"stamp_ns": 1.5}, "stamp_ns must be a whole number of nanoseconds, got 1.5"),
-            ({"landmarks": np.array([1.0, 2.0])}, "landmarks must be (K,) int64, got (2,) float64"),
-            ({"landmarks": np.array([7, 7])}, "landmark 7 comes twice, keep one of the two"),
-            ({"landmarks": np.array([1, 2, 3])}, "z must be (3, 2) float64, got (2, 2) float64"),
-            ({"z": np.array([[1.0, 2.0], [np.nan, 4.0]])}, "z must be finite, entry (1, 0) is nan"),
-            ({"cov_z": np.stack([np.eye(2), np.diag([1.0, -1.0])])}, "cov_z is no covariance: "),
-        ],
-    )
-    def test_a_wrong_frame_is_named(self, wrong, message):
-        with refused(f"frame 1 of walk: {message}"):
-            log(frame(0, 2), replace(frame(3, 2), **wrong), frame(4, 2))
+def test_stereo_measures_three_numbers():
+    assert log(frame(0, 4, dim=3), camera=STEREO).camera.dim == 3
+    with refused("frame 0 of walk: z must be (4, 3) float64, got (4, 2) float64"):
+        log(frame(0, 4), camera=STEREO)
 
 
-class TestKnownPoints:
-    good = KnownPoints(np.array([4, 2]), np.zeros((2, 3)), np.zeros((2, 3, 3)))
-
-    @pytest.mark.parametrize(
-        ("wrong", "message"),
-        [
-            ({"names": np.array([4, 4])}, "landmark 4 comes twice, keep one of the two"),
-            ({"positions": np.zeros((2, 2))}, "positions must be (2, 3) float64, got (2, 2) float64"),
-            ({"cov": np.tile(-np.eye(3), (2, 1, 1))}, "cov is no covariance: "),
-        ],
-    )
-    def test_a_wrong_point_is_refused(self, wrong, message):
-        with refused(f"the known points: {message}"):
-            replace(self.good, **wrong)
+def test_a_covariance_may_be_singular():
+    good = frame(0, 2)
+    exact = replace(good, cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
+    assert log(exact).frames == [exact]
 
 
-class TestTruth:
-    poses = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0], (3, 1))
-    good = Truth(np.array([0, 5, 5]), poses, {3: np.zeros(3)})
+def test_no_frame_and_frames_out_of_order():
+    with refused("walk holds no frame, expected at least one image"):
+        log()
+    with refused("frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"):
+        log(frame(0, 1), frame(5, 1), frame(4, 1))
 
-    @pytest.mark.parametrize(
-        ("wrong", "message"),
-        [
-            ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "stamps_ns must be (T,) int64, got (3,) float64"),
-            ({"stamps_ns": np.array([0, 1])}, "poses must be (2, 7) float64, got (3, 7) float64"),
-            ({"stamps_ns": np.array([0, 5, 4])}, "stamp 2 is before the one it follows, sort the poses by time"),
-            (
-                {"poses": poses * [1, 1, 1, 2, 1, 1, 1]},
-                "pose 0 has a quaternion of length 2, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion",
-            ),
-            ({"landmarks": {8: np.zeros(2)}}, "landmark 8 must be (3,) float64, got (2,) float64"),
-        ],
-    )
-    def test_a_wrong_truth_is_refused(self, wrong, message):
-        with refused(f"the ground truth: {message}"):
-            replace(self.good, **wrong)
+
+POINTS = KnownPoints(np.array([4, 2]), np.zeros((2, 3)), np.zeros((2, 3, 3)))
+POSES = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0], (3, 1))
+TRUTH = Truth(np.array([0, 5, 5]), POSES, {3: np.zeros(3)})
+MADE = {
+    "frame 1 of walk": lambda **wrong: log(frame(0, 2), replace(frame(3, 2), **wrong), frame(4, 2)),
+    "the known points": lambda **wrong: replace(POINTS, **wrong),
+    "the ground truth": lambda **wrong: replace(TRUTH, **wrong),
+}
+WRONG = [
+    ("frame 1 of walk", "stamp_ns", 1.5, "stamp_ns must be a whole number of nanoseconds, got 1.5"),
+    ("frame 1 of walk", "landmarks", np.array([1.0, 2.0]), "landmarks must be (K,) int64, got (2,) float64"),
+    ("frame 1 of walk", "landmarks", np.array([7, 7]), "landmark 7 comes twice, keep one of the two"),
+    ("frame 1 of walk", "landmarks", np.array([1, 2, 3]), "z must be (3, 2) float64, got (2, 2) float64"),
+    ("frame 1 of walk", "z", np.array([[1.0, 2.0], [np.nan, 4.0]]), "z must be finite, entry (1, 0) is nan"),
+    ("frame 1 of walk", "cov_z", np.stack([np.eye(2), np.diag([1.0, -1.0])]), "cov_z is no covariance: "),
+    ("the known points", "names", np.array([4, 4]), "landmark 4 comes twice, keep one of the two"),
+    ("the known points", "positions", np.zeros((2, 2)), "positions must be (2, 3) float64, got (2, 2) float64"),
+    ("the known points", "cov", np.tile(-np.eye(3), (2, 1, 1)), "cov is no covariance: "),
+    ("the ground truth", "stamps_ns", np.array([0.0, 1.0, 2.0]), "stamps_ns must be (T,) int64, got (3,) float64"),
+    ("the ground truth", "stamps_ns", np.array([0, 1]), "poses must be (2, 7) float64, got (3, 7) float64"),
+    ("the ground truth", "stamps_ns", np.array([0, 5, 4]), "stamp 2 is before the one it follows, sort the poses by"),
+    ("the ground truth", "poses", POSES * [1, 1, 1, 2, 1, 1, 1],
+     "pose 0 has a quaternion of length 2, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion"),
+    ("the ground truth", "landmarks", {8: np.zeros(2)}, "landmark 8 must be (3,) float64, got (2,) float64"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("of", "field", "wrong", "message"), WRONG)
+def test_what_is_wrong_is_named(of, field, wrong, message):
+    with refused(f"{of}: {message}"):
+        MADE[of](**{field: wrong})

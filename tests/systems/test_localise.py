@@ -1,6 +1,6 @@
 """A camera is found in the map of an earlier run, and followed in it; the map stays as it is."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images.sequence import ImageSequence, Source
+from rbpf.sensors.readers.images.sequence import ImageSequence
+from rbpf.sensors.readers.part import Chosen
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, known_map_arrays, read_known_map
 from tests.systems.plane_sequences import CAMERA, known_points, made_up_map, path, sequence
@@ -18,19 +19,9 @@ from tests.systems.plane_sequences import CAMERA, known_points, made_up_map, pat
 MAPPED, FRAMES = 60, 90
 
 
-@dataclass(frozen=True)
-class Part(Source):
-    """Images of another source from a number on."""
-
-    inner: Source
-    first: int
-
-    def frames(self, start):
-        return self.inner.frames(self.first + start)
-
-
 def from_frame(whole: ImageSequence, first: int) -> ImageSequence:
-    return replace(whole, stamps_ns=whole.stamps_ns[first:], source=Part(whole.source, first))
+    rows, stamps = np.arange(first, len(whole)), whole.stamps_ns[first:]
+    return replace(whole, stamps_ns=stamps, source=Chosen(whole.source, rows, stamps))
 
 
 @pytest.fixture(scope="module")

@@ -158,11 +158,6 @@ def test_times_that_run_backwards(tmp_path):
         open_images(tmp_path / "walk_mcap", write_camera(tmp_path))
 
 
-def test_times_that_were_never_set(tmp_path):
-    with pytest.raises(InputError, match="all 3 images have the time 0, their headers are not filled in"):
-        open_images(write_bag(tmp_path / "walk.bag", stamps=(0, 0, 0)))
-
-
 # Which topics.
 
 
@@ -173,19 +168,6 @@ def test_several_topics_of_images_have_to_be_named(tmp_path):
     ):
         open_images(path)
     assert levels(open_images(path, topics=Topics(("/right/image_rect",)))) == [110, 120, 130]
-
-
-@pytest.mark.parametrize(
-    ("topics", "problem"),
-    [
-        (Topics(("/nothing",)), "/nothing is no topic of images; the bag's image topics are /cam0/image_raw"),
-        (Topics(("/truth",)), "/truth is no topic of images"),
-        (Topics(truth="/nothing"), "expected poses in the topic /nothing, found /truth with poses"),
-    ],
-)
-def test_a_topic_that_is_not_there(tmp_path, topics, problem):
-    with pytest.raises(InputError, match=problem):
-        open_images(write_bag(tmp_path / "walk.bag"), topics=topics)
 
 
 def test_a_bag_without_images(tmp_path):
@@ -245,14 +227,19 @@ WRONG = {
     "binned": ({"binning": 2}, "the images are binned"),
     "size": ({"size": (48, 64)}, "width and height are 64x48, the images of .*image_raw have 24x16 px"),
     "no size": ({"size": (0, 0)}, "/cam0/camera_info: .*width"),
+    "times never set": ({"stamps": (0, 0, 0)}, "all 3 images have the time 0, their headers are not filled in"),
+    "topic": (Topics(("/nothing",)), "/nothing is no topic of images; the bag's image topics are /cam0/image_raw"),
+    "poses for images": (Topics(("/truth",)), "/truth is no topic of images"),
+    "truth": (Topics(truth="/nothing"), "expected poses in the topic /nothing, found /truth with poses"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_cameras_that_are_refused(tmp_path, name):
-    changes, problem = WRONG[name]
+def test_cameras_times_and_topics_that_are_refused(tmp_path, name):
+    wrong, problem = WRONG[name]
+    changes, topics = ({}, wrong) if isinstance(wrong, Topics) else (wrong, Topics())
     with pytest.raises(InputError, match=problem):
-        open_images(write_bag(tmp_path / "walk.bag", **changes))
+        open_images(write_bag(tmp_path / "walk.bag", **changes), topics=topics)
 
 
 def test_a_rectified_image_has_the_camera_of_the_projection(tmp_path):
