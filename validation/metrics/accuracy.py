@@ -6,7 +6,7 @@ The definitions are those of J. Sturm et al., "A benchmark for the evaluation of
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +49,10 @@ class AbsoluteError:
 @final
 @dataclass(frozen=True)
 class RelativeError:
-    """Differences between estimated and true motions over pairs of poses."""
+    """Differences between estimated and true motions from each of T poses to the next."""
 
-    pairs: NDArray[np.intp]  #: (P, 2) rows of the first and second pose of each pair.
-    translations: Array  #: (P,) [m].
-    rotations_deg: Array  #: (P,) angles in [0, 180].
-
-    def __len__(self) -> int:
-        return len(self.pairs)
+    translations: Array  #: (T - 1,) [m].
+    rotations_deg: Array  #: (T - 1,) angles in [0, 180].
 
     @property
     def translation_rmse(self) -> float:
@@ -83,41 +79,22 @@ def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Simi
 
 
 def rpe(
-    estimate: Trajectory,
-    reference: Trajectory,
-    delta: float = 1,
-    unit: Literal["frames", "metres"] = "frames",
-    alignment: Alignment | Similarity = "none",
+    estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none"
 ) -> RelativeError:
-    """Relative pose error, the difference of the motions between consecutive poses `delta` apart, of T poses each.
+    """Relative pose error, the difference of the motions from each of T poses to the next, of two poses or more.
 
-    The first pair starts at the first pose and each further pair where the one before ends. `delta` is a whole number
-    of frames, or metres along the estimated path once aligned; of an alignment, as for `ate`, only the scale changes
-    anything.
+    Of an alignment, as for `ate`, only the scale changes anything.
 
-    Raises InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the path is shorter than a
-    pair.
+    Raises InputError: the lengths differ or are below 2, or the alignment is unknown.
     """
     _require_pairs(estimate, reference)
+    if len(estimate) < 2:
+        raise InputError("Expected a trajectory of two poses or more, found one: it has no motion.")
     moved = estimate.transformed(fit(alignment, estimate.positions, reference.positions))
-    if unit == "frames":
-        if delta < 1 or delta != int(delta):
-            raise InputError(f"Expected delta to be a whole number of frames, at least 1, found {delta:g}.")
-        ends = list(range(0, len(moved), int(delta)))
-    else:
-        if unit != "metres" or not delta > 0.0:
-            raise InputError(f"Expected delta to be a positive number of frames or metres, found {delta:g} {unit}.")
-        path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(moved.positions, axis=0), axis=-1))])
-        ends = [0]
-        while (end := int(np.searchsorted(path, path[ends[-1]] + delta))) < len(path):
-            ends.append(end)
-    if len(ends) < 2:
-        raise InputError(f"Expected a trajectory longer than {delta:g} {unit}; choose a shorter delta.")
-    pairs = np.stack([ends[:-1], ends[1:]], axis=1)
-    motions = (SE3.between(*np.swapaxes(path.world_from_body[pairs], 0, 1)) for path in (reference, moved))
+    motions = (SE3.between(p.world_from_body[:-1], p.world_from_body[1:]) for p in (reference, moved))
     error = SE3.between(*motions)
     turned = np.linalg.norm(SE3.log(error)[:, :3], axis=-1)
-    return RelativeError(pairs, np.linalg.norm(SE3.translation(error), axis=-1), np.degrees(turned))
+    return RelativeError(np.linalg.norm(SE3.translation(error), axis=-1), np.degrees(turned))
 
 
 def landmark_errors(
