@@ -85,14 +85,21 @@ def map_figure(found: RunFolder) -> Any:
     path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
     if (found.folder / GRID).is_file():
         return _grid_figure(found, world, path, motion)
-    figure, shown = Views.of(found.system, path).axes(f"{found.name}: {SIGMAS:g}σ map in {world.name}")
-    landmarks, at = moved_map(found.map, motion), path.positions
+    title, measured = f"{found.name}: {SIGMAS:g}σ map in {world.name}", found.measurements
+    known = measured.known if isinstance(measured, FeatureLog) else None
+    others = {} if known is None else {"known points": ("known", motion.transform(known.positions))}
+    return draw_map(title, Views.of(found.system, path), path.positions, moved_map(found.map, motion), others)
+
+
+def draw_map(
+    title: str, views: "Views", at: np.ndarray, landmarks: MapEstimate, others: Mapping[str, tuple[str, np.ndarray]]
+) -> Any:
+    """A path (T, 3) and a map of its world: points with 3σ ellipses, rays; others' points (K, 3), with a name in `COLOURS`."""
+    figure, shown = views.axes(title)
     mean, cov = landmarks.points().in_space()
     middle = np.median(np.concatenate([mean, at]), axis=0)
     far = np.linalg.norm(mean - middle, axis=1)
     near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
-    measured = found.measurements
-    known = measured.known if isinstance(measured, FeatureLog) else None
     for axes, plane in shown:
         right, up = plane
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="path")
@@ -103,9 +110,8 @@ def map_figure(found: RunFolder) -> Any:
             ends = landmarks.ray_ends[landmarks.is_ray()]
             lines = axes.plot(ends[..., right].T, ends[..., up].T, color=COLOURS["map"], lw=0.7, alpha=0.7)
             lines[0].set_label("rays (depth not known yet)")
-        if known is not None:
-            places = motion.transform(known.positions)
-            axes.plot(places[:, right], places[:, up], "+", color=COLOURS["known"], ms=9, label="known points")
+        for name, (colour, places) in others.items():
+            axes.plot(places[:, right], places[:, up], "+", color=COLOURS[colour], ms=9, label=name)
         close_up(axes, plane, np.concatenate([mean[near], at]))
     shown[0][0].legend(loc="best", fontsize="small")
     return figure

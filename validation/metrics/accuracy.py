@@ -78,9 +78,7 @@ def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Simi
     return AbsoluteError(reference.stamps_ns, distances, applied)
 
 
-def rpe(
-    estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none"
-) -> RelativeError:
+def rpe(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none") -> RelativeError:
     """Relative pose error, the difference of the motions from each of T poses to the next, of two poses or more.
 
     Of an alignment, as for `ate`, only the scale changes anything.

@@ -1,6 +1,5 @@
 """Pictures of a run beside the truth, its batch optimum and COLMAP's reconstruction, and the figures that they share."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +7,14 @@ import numpy as np
 
 from rbpf.core.diagnostics import chi_square_band, chi_square_quantile
 from rbpf.runs import plots
-from rbpf.runs.plots import COLOURS, SIGMAS, Views, World, close_up, moved_map, new_axes, outline, save_figures
+from rbpf.runs.plots import COLOURS, Views, World, draw_map, moved_map, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap, RunFolder
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
 from rbpf.validation.consistency.against_groundtruth import TruthErrors
 from rbpf.validation.consistency.statistic import inverse_roots
 
-CLOSE = 0.95  #: A map's picture holds this fraction of its landmarks; single ones far off do not make it small.
 _LOWEST = 0.01  #: NEES below this fraction of the band are drawn there.
 
 
@@ -33,10 +32,10 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
         found = errors.landmarks
         title = f"{name}: landmarks against the truth"
         figures["groundtruth_landmarks.png"] = landmark_figure(title, found.squares, found.white.shape[1])
-        ours, (mean, cov) = world.brought(record.trajectory).positions, found.map.in_space()
-        true = np.pad(found.truth, ((0, 0), (0, 3 - found.truth.shape[1])))
-        title = f"{name}: map over the truth, in {world.name}"
-        figures["groundtruth_map.png"] = map_figure(title, ours, mean, cov, {"truth": true}, wide_axes(ours[rows]))
+        path, true = world.brought(record.trajectory), np.pad(found.truth, ((0, 0), (0, 3 - found.truth.shape[1])))
+        title, others = f"{name}: map over the truth, in {world.name}", {"true landmarks": ("truth", true)}
+        views = Views.of(record.system, path)
+        figures["groundtruth_map.png"] = draw_map(title, views, path.positions, found.map, others)
     return save_figures(figures, record.folder)
 
 
@@ -48,13 +47,14 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
     name, theirs, ours, world = found.name, found.optimum.estimate, found.ours, world or World()
     both = {"batch": theirs.trajectory, "filter": found.filter.trajectory}
     motions = {which: world.motion(path) for which, path in both.items()}
-    paths = {which: motions[which].transform(path.positions) for which, path in both.items()}
-    plane = wide_axes(paths["batch"])
-    figure, axes = in_plane(f"{name}: paths in {world.name}", plane)
-    for which, at in paths.items():
-        axes.plot(*at[:, plane].T, "-", color=COLOURS[which], lw=1.2, label=which)
-        axes.plot(*at[0, plane], "o", color=COLOURS[which], ms=4)
-    axes.legend(fontsize="small")
+    paths = {which: path.transformed(motions[which]) for which, path in both.items()}
+    views = Views.of("mono" if isinstance(found.optimum.problem, FeatureLog) else "range-bearing", paths["batch"])
+    figure, shown = views.axes(f"{name}: paths in {world.name}")
+    for axes, plane in shown:
+        for which, path in paths.items():
+            axes.plot(*path.positions[:, plane].T, "-", color=COLOURS[which], lw=1.2, label=which)
+            axes.plot(*path.positions[0, plane], "o", color=COLOURS[which], ms=4)
+    shown[0][0].legend(fontsize="small")
     figures = {"gtsam_path.png": figure}
     cov, cov_batch, delta = found.pose_errors()
     if len(cov):
@@ -65,12 +65,13 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
     if len(found.landmarks):
         title = f"{name}: landmarks against the batch optimum"
         figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), found.landmarks.dims)
-        rows = np.isin(ours.landmarks.ids, found.landmarks.keys)
-        mean, cov = moved_map(ours.landmarks, motions["filter"]).in_space(rows)
-        there = np.isin(theirs.landmarks.ids, found.landmarks.keys)
-        batch = moved_map(theirs.landmarks, motions["batch"]).in_space(there)[0]
-        title = f"{name}: map over the batch optimum, in {world.name}"
-        figures["gtsam_map.png"] = map_figure(title, paths["filter"], mean, cov, {"batch": batch}, plane)
+        places = moved_map(theirs.landmarks, motions["batch"]).in_space()[0]
+        title, others = (
+            f"{name}: map over the batch optimum, in {world.name}",
+            {"landmarks of the batch": ("batch", places)},
+        )
+        ours_there = moved_map(ours.landmarks, motions["filter"])
+        figures["gtsam_map.png"] = draw_map(title, views, paths["filter"].positions, ours_there, others)
     return save_figures(figures, out)
 
 
@@ -103,16 +104,6 @@ def plot_against_colmap(found: ColmapComparison, reference: PathAndMap, out: Pat
     return save_figures(figures, out)
 
 
-def wide_axes(positions: np.ndarray) -> list[int]:
-    """The two axes, in their order, along which positions (T, 3) extend most."""
-    return sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
-
-
-def in_plane(title: str, plane: list[int]) -> tuple[Any, Any]:
-    """A figure of one pair of axes for two of the world's."""
-    return new_axes(title, f"{'xyz'[plane[1]]} [m]", f"{'xyz'[plane[0]]} [m]")
-
-
 def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any:
     """Normalised squared errors (R,) of one run over the steps, with the band of an honest filter."""
     (figure, axes), band = new_axes(title, "NEES", "step", equal=False, height=4.0), chi_square_band(dim)
@@ -134,22 +125,5 @@ def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
     axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
     axes.plot(places, right, color="tab:green", lw=1.0, label="independent landmarks of an honest filter")
     axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize="small")
-    return figure
-
-
-def map_figure(
-    title: str, path: np.ndarray, mean: np.ndarray, cov: np.ndarray, other: Mapping[str, np.ndarray], plane: list[int]
-) -> Any:
-    """A map's points (M, 3) with ellipses from (M, 3, 3), over others' by name, in a plane of the world."""
-    figure, axes = in_plane(title, plane)
-    axes.plot(*path[:, plane].T, color=COLOURS["filter"], lw=0.8, alpha=0.6, label="path of the filter")
-    for name, points in other.items():
-        axes.plot(*points[:, plane].T, "+", color=COLOURS[name], ms=7, label=f"landmarks: {name}")
-    axes.plot(*mean[:, plane].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
-    ellipses = outline(mean[:, plane], cov[:, plane][:, :, plane])
-    axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color=COLOURS["map"], lw=0.7)
-    shown = np.concatenate([path, *other.values(), mean])
-    close_up(axes, plane, np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0))
     axes.legend(fontsize="small")
     return figure
