@@ -15,8 +15,7 @@ from rbpf.errors import InputError
 from rbpf.runs.files import OnDone, prepare_folder, write_text
 from rbpf.runs.plots import COLOURS, label, save_figures
 from rbpf.sensors.calibration import Board, BoardCalibration, BoardView, board_corners, calibrate
-from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
+from rbpf.sensors.readers.images.calibration import MODELS, NAME, camera_text, model_of
 from rbpf.sensors.readers.images.video import read_uncalibrated
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
@@ -93,19 +92,6 @@ def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out
     about = f"from {len(found.views)} views of a chessboard; reprojection error {found.rms_px:.3f} px"
     write_text(out / NAME, camera_text(found.camera, about))
     return entries
-
-
-def camera_text(camera: Pinhole, about: str) -> str:
-    """What camera.yaml holds, under a line that says where it comes from."""
-    lines = [
-        f"# {about}",
-        f"model: {model_of(camera)}",
-        *(f"{name}: {getattr(camera, name):.6f}" for name in _INTRINSICS),
-        f"width: {camera.width}",
-        f"height: {camera.height}",
-        f"distortion: [{', '.join(f'{value:.8f}' for value in camera.distortion)}]",
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def _draw(found: BoardCalibration) -> Any:

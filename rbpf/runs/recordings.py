@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -267,14 +267,8 @@ def first_image(sequence: readers.ImageSequence | LiveCamera) -> np.ndarray:
     return first.image
 
 
-class Recording(Protocol):
-    """What the command line filters: it can be opened as often as one likes, and says what it is made of."""
-
-    def open(self, config: Any) -> Opened:
-        """A new system with these settings, and the source of its frames."""
-
-    def sources(self) -> Sources:
-        """For config.yaml: `recording`, and what else was read."""
+#: What the command line filters: it can be opened as often as one likes, and says what it is made of, for config.yaml.
+Recording = RobotRecording | MonoRecording | StereoRecording | LaserRecording
 
 
 def filter_recording(

@@ -104,7 +104,9 @@ def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
     shaken = poses + np.pad(rng.normal(scale=1e-3, size=(8, 3)), ((0, 0), (4, 0)))
     turn = SE3.exp(np.array([0.5, -1.0, 0.3, 1.0, 2.0, 3.0]))
     world = replace(ours, world_from_camera=SE3.compose(turn, shaken), points=SE3.transform(turn, ours.points))
-    moved = compare_with_path(world, reference, ours.points)
+    count = len(ours.points)
+    points = MapEstimate(np.arange(count), ours.points, np.repeat(np.eye(3)[None], count, axis=0))
+    moved = compare_with_path(world, reference, points)
     by_cameras, by_centres = (
         np.linalg.norm(move.transform(world.points) - ours.points, axis=1).max()
         for move in (moved.reference_from_colmap, moved.path.alignment)
@@ -124,7 +126,7 @@ def test_what_cannot_be_compared_is_refused():
     with pytest.raises(InputError, match="share 2 instants"):
         compare_with_path(ours, Trajectory(ours.stamps_ns[:2], ours.world_from_camera[:2]))
     with pytest.raises(InputError, match="3 or more points"):
-        cloud_distance(ours.points[:2], ours.points)
+        cloud_distance(ours.points[:2], ours.points, np.repeat(np.eye(3)[None], len(ours.points), axis=0))
 
 
 def test_too_few_key_frames_are_refused():

@@ -23,6 +23,7 @@ from rbpf.runs.trajectory import Similarity, Trajectory, associate
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import ImageSequence
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import OVER_IMAGES, recorded_images
 from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction, ReconstructionOptions, reconstruct
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
@@ -38,7 +39,7 @@ class CloudDistance:
 
     nearest_m: Array  #: (M,) to the nearest point.
     surface_m: Array  #: (M,) to the plane that fits the nearest points best.
-    sigmas: Array  #: (M,) the latter in the landmark's standard deviation across the plane; NaN without covariances.
+    sigmas: Array  #: (M,) the latter in the landmark's standard deviation across the plane.
     spacing_m: float  #: median distance from the nearest points to their own nearest neighbour.
 
     def as_dict(self) -> dict[str, Any]:
@@ -47,11 +48,8 @@ class CloudDistance:
         for name in ("nearest", "surface"):
             median, p90 = np.quantile(getattr(self, f"{name}_m"), [0.5, 0.9]).tolist()
             figures |= {f"{name}_median_m": median, f"{name}_p90_m": p90}
-        known = self.sigmas[np.isfinite(self.sigmas)]
-        if known.size:
-            figures["surface_median_sigmas"] = float(np.median(known))
-            figures["share_within_3_sigmas"] = float((known < 3.0).mean())
-        return figures
+        figures["surface_median_sigmas"] = float(np.median(self.sigmas))
+        return figures | {"share_within_3_sigmas": float((self.sigmas < 3.0).mean())}
 
 
 @final
@@ -102,19 +100,15 @@ def compare_with_colmap(
     estimate: PathAndMap, sequence: ImageSequence, options: ReconstructionOptions | None = None
 ) -> tuple[ColmapComparison, ColmapComparison | None]:
     """A run beside the reconstruction of its images, and this beside the truth: how good COLMAP itself is, None without."""
-    found, points = reconstruct(sequence, options), estimate.landmarks
-    run = compare_with_path(found, estimate.trajectory, points.mean, points.cov)
+    found = reconstruct(sequence, options)
+    run = compare_with_path(found, estimate.trajectory, estimate.landmarks)
     return run, None if sequence.truth is None else compare_with_truth(found, sequence.truth)
 
 
 def compare_with_path(
-    found: Reconstruction, reference: Trajectory, landmarks: Array | None = None, cov_landmarks: Array | None = None
+    found: Reconstruction, reference: Trajectory, points: MapEstimate | None = None
 ) -> ColmapComparison:
-    """COLMAP beside a filter's path and, if given, its map.
-
-    The poses of the camera at the key frames' times are compared, of which there must be enough, and landmarks (M, 3) of
-    covariances (M, 3, 3) in the reference's world.
-    """
+    """COLMAP beside a filter's path and, if given, its map: poses at the key frames' times, of which there must be enough."""
     ours, theirs = associate(found.path, reference)
     if len(ours) < LEAST_FRAMES:
         raise InputError(
@@ -133,8 +127,8 @@ def compare_with_path(
     scale = float((dx * dy).sum() / square) if not found.metric and square > 0.0 else 1.0
     move = Similarity(scale, rotation, y.mean(axis=0) - scale * x.mean(axis=0))
     cloud, extent = None, float(np.linalg.norm(np.ptp(theirs.positions, axis=0)))
-    if landmarks is not None and len(landmarks):
-        cloud = cloud_distance(move.transform(found.points), landmarks, cov_landmarks)
+    if points is not None and points.ids.size:
+        cloud = cloud_distance(move.transform(found.points), points.mean, points.cov)
     return ColmapComparison(found, errors, move, cloud, extent)
 
 
@@ -149,7 +143,7 @@ def compare_with_truth(found: Reconstruction, truth: Truth) -> ColmapComparison:
     return compare_with_path(found, Trajectory(found.stamps_ns[rows], poses))
 
 
-def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None = None) -> CloudDistance:
+def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array) -> CloudDistance:
     """Distances of M >= 1 landmarks (M, 3), of covariances (M, 3, 3), to a cloud (P, 3) of P >= 3 points."""
     if len(cloud) < LEAST_POINTS or not len(landmarks):
         found = f"{len(cloud)} and {len(landmarks)}"
@@ -161,7 +155,5 @@ def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None =
     middle = around.mean(axis=1)
     normal = np.linalg.svd(around - middle[:, None])[2][:, 2]
     surface = np.abs(np.einsum("ki,ki->k", landmarks - middle, normal))
-    sigmas = np.full(len(landmarks), np.nan)
-    if cov_landmarks is not None:
-        sigmas = surface / np.sqrt(np.einsum("ki,kij,kj->k", normal, cov_landmarks, normal))
+    sigmas = surface / np.sqrt(np.einsum("ki,kij,kj->k", normal, cov_landmarks, normal))
     return CloudDistance(distances[:, 0], surface, sigmas, float(np.median(spacing)))

@@ -80,13 +80,13 @@ def solve(
         )
 
 
-def solve_online(m: Measurements, robust: float | None = None) -> Array:
+def solve_online(m: Measurements) -> Array:
     """The last pose of the optimum of what had been measured until then, step after step: what no filter can do better.
 
     By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
     of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
     """
-    problem = Problem(m, robust)
+    problem = Problem(m)
     with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):
         return np.array([pose for pose, _ in _grown(problem, 1, MOVED)])
 

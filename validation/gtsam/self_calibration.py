@@ -14,9 +14,8 @@ from rbpf.runs.files import OnDone, prepare_folder, write_text
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers.images.calibration import NAME
+from rbpf.sensors.readers.images.calibration import NAME, camera_text
 from rbpf.sensors.readers.measurements import InitialEstimate
-from rbpf.validation.calibration import camera_text
 from rbpf.validation.gtsam.batch_problem import Optimum, softened, solve_problem
 from rbpf.validation.gtsam.camera import begin
 from rbpf.validation.gtsam.camera_graph import FINE, SCALE, CameraProblem, adjust, together

@@ -77,11 +77,9 @@ def score_estimate(
     `others` are further paths of the run, by what the names of their errors begin with.
     """
     reference = in_space(estimate.stamps_ns[truth.rows], truth.poses)
-    ours = estimate.at(truth.rows).trajectory
-    entries: dict[str, float] = {}
-    for merit in MERITS:
-        entries |= merit(ours, reference, truth)
-    entries |= score_landmarks(estimate, truth, anonymous)
+    entries = _merits(estimate.at(truth.rows).trajectory, reference, truth) | score_landmarks(
+        estimate, truth, anonymous
+    )
     for prefix, path in (others or {}).items():
         entries |= score_path(path, reference, truth, prefix)
     return entries
@@ -93,10 +91,12 @@ def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth, prefix:
         estimate, reference = associate(path, reference, 0)
     except InputError:
         return {}
-    entries: dict[str, float] = {}
-    for merit in MERITS if len(estimate) >= LEAST else ():
-        entries |= merit(estimate, reference, truth)
+    entries = _merits(estimate, reference, truth) if len(estimate) >= LEAST else {}
     return {prefix + name: value for name, value in entries.items()}
+
+
+def _merits(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
+    return {name: value for merit in MERITS for name, value in merit(estimate, reference, truth).items()}
 
 
 def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:

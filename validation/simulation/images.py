@@ -25,7 +25,7 @@ from rbpf.lie import SE3, Array
 from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_ranges
 from rbpf.runs.files import OnDone, write_csv, write_text
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images.calibration import model_of
+from rbpf.sensors.readers.images.calibration import camera_text
 from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
@@ -321,19 +321,7 @@ def simulate_images(
             write_sensor(partial, "cam1", scene, left, baseline_m, suffix)
         if imaging.depth:
             write_sensor(partial, "depth0", scene, left, 0.0, ".png")
-        # camera.yaml: the (left) camera, and the baseline of a stereo pair.
-        lens = ", ".join(left.lens.coefficient_names)
-        intrinsics = zip(("fx", "fy", "cx", "cy"), left.params[:4].tolist(), strict=True)
-        coefficients = [float(x) for x in left.distortion]
-        lines = [
-            f"model: {model_of(left)}",
-            *[f"{name}: {value}" for name, value in intrinsics],
-            f"width: {left.width}",
-            f"height: {left.height}",
-            f"distortion: {coefficients}  # {lens} (OpenCV)",
-            *([] if baseline_m is None else [f"baseline_m: {float(baseline_m)}"]),
-        ]
-        write_text(partial / "camera.yaml", "\n".join(lines) + "\n")
+        write_text(partial / "camera.yaml", camera_text(left, baseline_m=baseline_m))
         # Ground truth: poses and velocities in the world [m/s]; there is no gyroscope: its biases are 0.
         place, poses = partial / "mav0" / "state_groundtruth_estimate0", scene.world_from_camera
         place.mkdir(parents=True)

@@ -67,6 +67,21 @@ def read_calibration(path: Path) -> Calibration:
     return Calibration(str(path), camera, rate_hz, baseline_m)
 
 
+def camera_text(camera: Pinhole, about: str = "", baseline_m: float | None = None) -> str:
+    """What `camera.yaml` holds of a camera and the baseline of a rectified pair, under a line that says where it comes from."""
+    lens = [float(value) for value in camera.distortion]
+    entries: dict[str, object] = {
+        "model": model_of(camera),
+        **dict(zip(_REQUIRED[:4], camera.params[:4].tolist(), strict=True)),
+        "width": camera.width,
+        "height": camera.height,
+        "distortion": f"{lens}  # {', '.join(camera.lens.coefficient_names)} (OpenCV)",
+    }
+    if baseline_m is not None:
+        entries["baseline_m"] = float(baseline_m)
+    return (f"# {about}\n" if about else "") + "".join(f"{name}: {value}\n" for name, value in entries.items())
+
+
 def coefficients(value: YamlValue, model: str = "radial-tangential") -> tuple[float, ...]:
     """Distortion of a list: k1, k2, p1, p2, k3, of which the last may be left out, or k1, k2, k3, k4 if equidistant."""
     count = len(LENSES[model].coefficient_names)
