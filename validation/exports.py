@@ -39,7 +39,6 @@ _log = logging.getLogger(__name__)
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 #: Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing.
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
-_STOPS = np.array([[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float)
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
 _BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
 _VERTEX = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue")), ("sigma_m", "<f4")]
@@ -159,14 +158,14 @@ def colours_by_sigma(std: Array) -> NDArray[np.uint8]:
 
     It reaches from their 5 % to their 95 % quantile.
     """
+    from matplotlib import colormaps
+
     if not len(std):
         return np.zeros((0, 3), dtype=np.uint8)
     logs = np.log(np.maximum(std, np.finfo(float).tiny))
     low, high = np.quantile(logs, (0.05, 0.95))
     fraction = np.clip((logs - low) / max(float(high - low), np.finfo(float).tiny), 0.0, 1.0)
-    at = fraction * (len(_STOPS) - 1)
-    stops = np.arange(len(_STOPS))
-    return np.stack([np.interp(at, stops, channel) for channel in _STOPS.T], axis=-1).round().astype(np.uint8)
+    return np.asarray(colormaps["plasma"](fraction, bytes=True)[:, :3], dtype=np.uint8)
 
 
 def write_ply(

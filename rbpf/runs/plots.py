@@ -97,9 +97,11 @@ def draw_map(
     """A path (T, 3) and a map of its world: points with 3σ ellipses, rays; others' points (K, 3), with a name in `COLOURS`."""
     figure, shown = views.axes(title)
     mean, cov = landmarks.points().in_space()
-    middle = np.median(np.concatenate([mean, at]), axis=0)
-    far = np.linalg.norm(mean - middle, axis=1)
+    far = np.linalg.norm(mean - np.median(np.concatenate([mean, at]), axis=0), axis=1)
     near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
+    # Limits that hold these with a margin; what is far away (rays) runs out of the picture.
+    low, high = (extreme(np.concatenate([mean[near], at]), axis=0) for extreme in (np.min, np.max))
+    middle, half = 0.5 * (low + high), 0.55 * max(float((high - low).max()), 1e-3)
     for axes, plane in shown:
         right, up = plane
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="path")
@@ -112,7 +114,9 @@ def draw_map(
             lines[0].set_label("rays (depth not known yet)")
         for name, (colour, places) in others.items():
             axes.plot(places[:, right], places[:, up], "+", color=COLOURS[colour], ms=9, label=name)
-        close_up(axes, plane, np.concatenate([mean[near], at]))
+        across, along = ((middle[axis] - half, middle[axis] + half) for axis in plane)
+        axes.set(xlim=across, ylim=along[::-1] if axes.yaxis_inverted() else along)
+        axes.set_aspect("equal", adjustable="box")
     shown[0][0].legend(loc="best", fontsize="small")
     return figure
 
@@ -365,16 +369,6 @@ class Views:
         if self.down:
             shown[1][0].invert_yaxis()
         return figure, shown
-
-
-def close_up(axes: Any, shown: list[int], points: np.ndarray) -> None:
-    """Limits that hold points (K, 3) with a margin; what is far away (rays) runs out of the picture."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.55 * max(float((high - low).max()), 1e-3)
-    axes.set_xlim(middle[shown[0]] - half, middle[shown[0]] + half)
-    ends = middle[shown[1]] - half, middle[shown[1]] + half
-    axes.set_ylim(*(reversed(ends) if axes.yaxis_inverted() else ends))
-    axes.set_aspect("equal", adjustable="box")
 
 
 def shade(axes: Any, lost: np.ndarray) -> None:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.runs.plots import moved_map
 from rbpf.runs.reading import PathAndMap
-from rbpf.systems.map_estimate import MapEstimate
+from rbpf.runs.trajectory import Similarity
 
 #: What is told of each pair of Gaussians.
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
@@ -115,13 +116,10 @@ def scaled_onto(estimate: PathAndMap, rows: NDArray[np.intp], other: PathAndMap,
     if square <= _TINY**2:
         raise InputError(f"The gauge of {name} is not observable: the camera of the run stays where it began.")
     scale = float((mine * theirs).sum() / square)
-    origin, landmarks = estimate.world_from_body[0, 4:], estimate.landmarks
-    poses = estimate.world_from_body.copy()
-    poses[:, 4:] = origin + scale * (poses[:, 4:] - origin)
+    motion = Similarity(scale, np.eye(3), (1.0 - scale) * estimate.world_from_body[0, 4:])
+    poses, points = motion.transform_poses(estimate.world_from_body), moved_map(estimate.landmarks, motion)
     by = np.repeat([1.0, scale], 3)
-    mean = origin + scale * (landmarks.mean - origin)
-    moved = MapEstimate(landmarks.ids, mean, scale**2 * landmarks.cov)
-    return PathAndMap(estimate.stamps_ns, poses, estimate.cov_poses * np.outer(by, by), moved), scale
+    return PathAndMap(estimate.stamps_ns, poses, estimate.cov_poses * np.outer(by, by), points), scale
 
 
 def _differences(

@@ -68,7 +68,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def camera_text(camera: Pinhole, about: str = "", baseline_m: float | None = None) -> str:
-    """What `camera.yaml` holds of a camera and the baseline of a rectified pair, under a line that says where it comes from."""
+    """What `camera.yaml` holds of a camera, and the baseline of a rectified pair; its first line says what it is `about`."""
     lens = [float(value) for value in camera.distortion]
     entries: dict[str, object] = {
         "model": model_of(camera),
