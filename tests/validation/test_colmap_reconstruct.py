@@ -75,7 +75,7 @@ def test_the_same_seed_gives_the_same_reconstruction(desk, found):
 def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
     truth = made()
     moved = made(scale=3.0)
-    reference = Trajectory(truth.stamps_ns, truth.poses)
+    reference = Trajectory(truth.stamps_ns, truth.world_from_camera)
     similar = compare_with_path(moved, reference)
     assert similar.path.rmse < 1e-12
     assert similar.reference_from_colmap.scale == pytest.approx(1 / 3)
