@@ -13,7 +13,7 @@ from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.runs.files import numbered, own_folder, write_text
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import RobotRecording, open_robot_log
+from rbpf.runs.recordings import RobotRecording
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -66,35 +66,6 @@ def test_a_run_leaves_everything(began):
         assert (np.linalg.eigvalsh(archive["cov"]) > 0).all()
 
 
-def test_a_joint_map_leaves_the_same_files(log, tmp_path):
-    assert run(log, tmp_path / "run", "--set", "map=joint", "--set", "window=4") == 0
-    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary.keys() >= REQUIRED
-    assert summary["path_rmse_m"] < summary["odometry_path_rmse_m"]
-
-
-def test_a_joint_map_that_was_interrupted_within_a_window_goes_on_with_the_same_bytes(log, tmp_path):
-    config = RangeBearingConfig(map="joint", window=4, particles=30)
-    opened = open_robot_log(open_log(log), config)
-    for t, frame in enumerate(opened.source.frames()):
-        tracked = opened.system.take(frame)
-        if t == 9:
-            opened.system.save(tmp_path / "half.npz")
-    again = open_robot_log(open_log(log), config)
-    again.system.load(tmp_path / "half.npz")
-    for frame in again.source.frames(10):
-        resumed = again.system.take(frame)
-    assert tracked.pose.tobytes() == resumed.pose.tobytes()
-    assert tracked.cov.tobytes() == resumed.cov.tobytes()
-
-
-def test_what_a_joint_map_does_not_take_is_said(log, tmp_path, capsys):
-    assert run(log, tmp_path / "run", "--set", "map=joint", "--set", "window=0") == 2
-    assert "window must be" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 def test_config_repeats_the_run(log, tmp_path):
     assert run(log, tmp_path / "a", "--set", "proposal.iterations=1", "--set", "resampling.scheme=residual") == 0
     config = tmp_path / "a" / "config.yaml"
@@ -130,6 +101,7 @@ def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
     [
         (["--set", "nothing=1"], "no setting nothing"),
         (["--set", "particles"], "key=value"),
+        (["--set", "window=0"], "window must be"),
         (["--threads", "0"], "--threads"),
         (["--config", "missing.yaml"], "missing.yaml"),
     ],

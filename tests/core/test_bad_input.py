@@ -68,12 +68,10 @@ def in_the_plane(conditional=None, **options) -> Filter:
     return Filter(OdometryMotion(SE2), Scripted(), held, n=N, rng=np.random.default_rng(0), **options)
 
 
-MAP = LandmarkMap(SE2)
 # fmt: off
 CONSTRUCTION: dict[str, Callable[[], object]] = {
     "at least one particle, got 0": lambda: Filter(Walk(), Scripted(), n=0),
     "keeps at least one step, got 0": lambda: Filter(Walk(), Scripted(), lag=0),
-    "two parts of the filter are named": lambda: in_the_plane([MAP, LandmarkMap(SE2)]),
     rf"start must be \(3,\) or \({N}, 3\) finite numbers, got \(2,\)": lambda: in_the_plane(start=np.zeros(2)),
     r"start must be .*, got \(3,\): \[nan": lambda: in_the_plane(start=np.full(3, np.nan)),
     r"mean \(2,\) needs a cov of that size, got \(3, 3\)":

@@ -7,11 +7,15 @@ from pathlib import Path
 import pytest
 
 from rbpf.errors import InputError
+from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.readers import open_images, open_log, read_known_points
 from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from rbpf.validation.metrics.relations import read_relations
 from tests.readers.small import CARMEN, GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, WHEELS, write
 
+TUM = {"path.tum": "# x\n0.5 1 2 3 0 0 0 1\n0.6 1 2 3 0 0 0 1\n"}
+RELATIONS = {"some.relations": "0 1 1 0 0 0 0 0.5\n1 2 1 0 0 0 0 0.5\n"}
 FORMATS = {
     "MRCLAM": (MRCLAM, open_log),
     "MRPT": (MRPT, open_log),
@@ -19,6 +23,8 @@ FORMATS = {
     "graph": (GRAPH, lambda folder: open_log(folder / "graph.txt")),
     "CARMEN": (CARMEN, lambda folder: read_laser_log(folder / "robot.clf")),
     "wheels": (WHEELS, read_wheel_odometry),
+    "path": (TUM, lambda folder: read_tum(folder / "path.tum")),
+    "relations": (RELATIONS, lambda folder: read_relations(folder / "some.relations")),
     "known": (KNOWN, lambda folder: read_known_points(folder / "known_points.csv")),
 }
 every_format = pytest.mark.parametrize("name", FORMATS)
@@ -74,6 +80,13 @@ wheels | odometry.csv | 2 | 100,1,0,0,0,0,0 | expected no motion on the first li
 wheels | odometry.csv | 2 | 1.5,0,0,0,0,0,0 | expected a time in whole nanoseconds
 wheels | odometry.yaml | 1 | other: 1 | expected the keys robot_from_camera, found no robot_from_camera
 wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 2, 0, 0, 0] | expected robot_from_camera to begin with a unit
+path | path.tum | 3 | 0.6 1 2 3 0 0 1 | expected 8 columns (timestamp, tx, ty, tz, qx, qy, qz, qw), found 7
+path | path.tum | 3 | 0.6 1 2 x 0 0 0 1 | expected tz to be a finite number, found 'x'
+path | path.tum | 2 | 0.5 1 2 3 0 0 0 0.9 | expected a quaternion qx qy qz qw of length 1, found length 0.9
+path | path.tum | 3 | 0.25 1 2 3 0 0 0 1 | time runs backwards from 0.5 to 0.25
+relations | some.relations | 2 | 0 1 1 0 0 0 0 | expected 8 columns (t1, t2, x, y, z, roll, pitch, yaw), found 7
+relations | some.relations | 2 | 0 5e9 1 0 0 0 0 0 | expected the time in seconds
+relations | some.relations | 2 | 0 1 nan 0 0 0 0 0 | expected x to be a finite number, found 'nan'
 known | known_points.csv | 1 | id,u_px,v_px,x_m,y_m,z_m | expected a header with the columns id,u_px,v_px,x_m,y_m
 known | known_points.csv | 3 | 7,2,3,4,5,6,0.1 | id 7 comes a second time
 known | known_points.csv | 2 | 1,2,3,4,5,6,-0.1 | expected sigma_m to be zero or positive, found -0.1
@@ -107,6 +120,7 @@ MISSING = [
     ("CARMEN", "robot.clf", "no such file or folder; expected a ROS bag"),
     ("wheels", "odometry.csv", "no such file; expected the readings of a robot's wheels"),
     ("wheels", "odometry.yaml", "no such file"),
+    ("path", "path.tum", "no such file"),
 ]
 """Format, the file that is not there, and the words about it."""
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import count, cycle
+from itertools import count, cycle, islice
 
 import numpy as np
 import pytest
@@ -102,6 +102,9 @@ RESUMED = {
         lambda: stereo(map=MapConfig(kind="joint", active=30)), lambda: list(pairs(12).frames()), (0, 5, 7)
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
+    "robot, joint map": Case(
+        lambda: robot(RangeBearingConfig(particles=10, window=4))[0], lambda: list(islice(robot()[1], 16)), (0, 5, 9)
+    ),
     "robot, unnamed": Case(unnamed, lambda: corridor(0).frames, (0, 44, 58, 62)),
     "scans": Case(lambda: laser(), lambda: scans(12), (0, 5, 6, 9), {TrackingState.TRACKED, TrackingState.PREDICTED}),
 }

@@ -190,9 +190,3 @@ def test_all_formats_hold_the_run(run, tmp_path, capsys):
     assert model.num_points3D() == estimate.landmarks.ids.size and model.num_images() == len(poses)
     assert (tmp_path / "map.ply").read_bytes().startswith(b"ply")
     assert (tmp_path / "run.rrd").read_bytes()[:4] == b"RRF2"
-
-
-def test_what_is_no_run_is_refused(tmp_path, capsys):
-    assert main(["export", str(tmp_path), "--format", "tum"]) == 2
-    assert "no config.yaml: expected the folder" in capsys.readouterr().err
-    assert not (tmp_path / "export").exists()

@@ -71,19 +71,6 @@ def test_relations_outside_of_the_path_are_told(tmp_path):
         relation_errors(PATH.at(np.array([3, 4])), relations)
 
 
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        ([0, 1, 1, 0, 0, 0, 0], r"line 2: expected 8 columns \(t1, t2, x, y, z, roll, pitch, yaw\), found 7"),
-        ([0, 5e9, 1, 0, 0, 0, 0, 0], "line 2: expected the time in seconds"),
-        ([0, 1, "nan", 0, 0, 0, 0, 0], "line 2: expected x to be a finite number, found 'nan'"),
-    ],
-)
-def test_a_bad_line_is_named(tmp_path, row, words):
-    with pytest.raises(InputError, match=words):
-        read_relations(written(tmp_path, row))
-
-
 def test_a_run_is_scored_by_relations_and_by_another_path(tmp_path, capsys, plain_pictures):
     simulate_robot(RobotWorld(steps=12, landmarks=20), tmp_path / "log", seed=0)
     run = tmp_path / "run"

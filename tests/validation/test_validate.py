@@ -117,15 +117,20 @@ def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(run_f
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("command", "spoil", "message"),
     [
-        (lambda folder: shutil.rmtree(folder), "no such folder"),
-        (lambda folder: (folder / "summary.json").write_text("{"), "damaged"),
+        (["report"], lambda folder: shutil.rmtree(folder), "no such folder"),
+        (["report"], lambda folder: (folder / "summary.json").write_text("{"), "damaged"),
+        (
+            ["export", "--format", "tum"],
+            lambda folder: (folder / "config.yaml").unlink(),
+            "no config.yaml: expected the folder",
+        ),
     ],
 )
-def test_a_folder_that_is_no_run_is_refused(run_folder, spoil, message, capsys):
+def test_a_folder_that_is_no_run_is_refused(run_folder, command, spoil, message, capsys):
     spoil(run_folder)
-    assert main(["report", str(run_folder)]) == 2
+    assert main([*command, str(run_folder)]) == 2 and not (run_folder / "export").exists()
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
