@@ -150,8 +150,8 @@ class JointColumns:
         rows, kinds = checkpoint.integers("landmarks", least=0), len(self.kinds)
         schema = {
             "ids": rows, "first": rows, "kind": checkpoint.integers("landmarks", least=0, below=kinds),
-            "clone": checkpoint.integers("landmarks", least=-1, below="clones"),
             "clones": checkpoint.elements(self.space, "clones"), "clone_first": checkpoint.integers("clones", least=0),
+            "clone": checkpoint.integers("landmarks", least=-1, below="clones"),
         }  # fmt: skip
         found = checkpoint.read(arrays, schema, prefix)
         table, self.size = Table(*(found[name] for name in Table._fields)), size

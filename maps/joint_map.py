@@ -118,25 +118,23 @@ class JointMap(Map):
         self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed)
         self._begin_submap()
 
-    def begin_at(
-        self, world: np.ndarray, substate: tuple[np.ndarray, np.ndarray], ids: np.ndarray, cov: np.ndarray
-    ) -> None:
+    def begin_at(self, world: np.ndarray, substate: np.ndarray, ids: np.ndarray, cov: np.ndarray) -> None:
         """Places a map that was filled by `add_records` with what particles had sampled so far.
 
         Args:
             world: (N, E) world_from_frame of each particle's own frame, where its state and landmarks are.
-            substate: means (N, m) and covariance (m, m).
-            ids: (K,) points that are correlated with each other and with the frame's place.
-            cov: (N, d + K D, …) of that place, in its right chart, and of these points.
+            substate: (N, m) means.
+            ids: (K,) landmarks that are correlated with each other, with the substate and with the frame's place.
+            cov: (N, d + m + ΣD, …) of that place, in its right chart, of the substate and of these landmarks.
         """
-        d = self.space.dim
+        d, table = self.space.dim, self.held.table
         self.origin = self.space.mean(world, np.full(self.n, 1.0 / self.n))
         self.mean[:, :d] = offset = self.space.local(self.origin, world)
-        self.mean[:, d : self._first], self.cov[d : self._first, d : self._first] = substate
+        self.mean[:, d : self._first] = substate
         chart = np.tile(np.eye(cov.shape[1]), (self.n, 1, 1))
         chart[:, :d, :d] = self.space.right_jacobian_inverse(offset)
-        points = self.held.of_one_kind(ids).columns.ravel().tolist() if ids.size else []
-        columns = np.array([*range(d), *points])
+        each = [(table.first[row], self.held.kinds[table.kind[row]].dim) for row in self.held.rows_of(ids)]
+        columns = np.concatenate([np.arange(self._first), *(first + np.arange(dim) for first, dim in each)])
         moved = (chart @ cov @ np.swapaxes(chart, 1, 2)).mean(axis=0)
         self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(moved)
 
@@ -394,8 +392,16 @@ class JointMap(Map):
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         if new_landmarks.mask is not None and not new_landmarks.mask.all():
             raise InputError("a joint map's landmarks are in all particles")
-        records = first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
-        return self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
+        model, z, own = new_landmarks.model, new_landmarks.z, slice(self.space.dim, self._first)
+        records = first_records(model, z, new_landmarks.cov, state)
+        ids = self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
+        slope = model.new_by_substate(z)
+        if slope is not None and model.about is not None:
+            columns, by_own = self.held.of_one_kind(ids).columns.ravel(), slope.reshape(-1, slope.shape[-1])
+            self.mean[:, columns] += (self.mean[:, own] - model.about) @ by_own.T
+            self.cov[columns] += by_own @ self.cov[own]
+            self.cov[:, columns] += self.cov[:, own] @ by_own.T
+        return ids
 
     def add_records(
         self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None, ids: np.ndarray | None = None

@@ -140,11 +140,18 @@ class Given(NamedTuple):
                     name = type(model).__name__
                     raise InputError(f"{name} observes the pose in the world: sub-maps do not take that")
                 at = space.compose(space.retract(self.origin, mean[:, :d]), state)[:, None]
-            if landmarks is None or substate is not None or not self.compiled:
+            if landmarks is None or (substate is not None and model.about is None) or not self.compiled:
                 nu, jac = linearise(model, space, z, at, landmarks, anchors, substate)
             else:
                 nu, *found = linearised(model, space, z, state, landmarks, anchors, True)
                 jac = Jacobians(*found)
+                if substate is not None:
+                    # By what all particles have in common: in the slope they differ in the second order.
+                    centre = space.mean(state, np.full(n, 1.0 / n))
+                    const = None if kind is None or anchors is None else held.poses(kind, mean.mean(axis=0))
+                    by_substate = model.by_substate(centre, landmarks.mean(axis=0), const)
+                    nu = nu - np.moveaxis(by_substate @ (substate[:, 0] - model.about).T, -1, 0)
+                    jac = jac._replace(substate=by_substate[None])
             count, p = z.shape
             # What each observation reads of the Gaussian, and by what slope.
             used = [(np.zeros((count, 0), dtype=np.int64), np.zeros((count, p, 0)))]
@@ -166,8 +173,8 @@ class Given(NamedTuple):
                 # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
                 turn = space.adjoint(space.inverse(state)) @ space.right_jacobian(mean[:, :d])
                 used.append((np.tile(np.arange(d), (count, 1)), (jac.state @ turn[:, None]).mean(axis=0)))
-            columns, slopes = zip(*used, strict=True)
-            read.append((np.concatenate(columns, axis=1), np.concatenate(slopes, axis=2)))
+            where, slopes = zip(*used, strict=True)
+            read.append((np.concatenate(where, axis=1), np.concatenate(slopes, axis=2)))
             by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
             nus.append(np.broadcast_to(nu, (n, count, p)).reshape(n, -1))
             by_states.append(np.broadcast_to(by_state, (n, count, p, d)).reshape(n, -1, d))

@@ -53,12 +53,14 @@ class MarginalVelocity(MotionModel):
 
     Args:
         std_walk: (6,) or a number, see `velocity_walk`.
+        constants: numbers of the substate after the velocity's six that stay what they are and do not move the body.
     """
 
     space = SE3
 
-    def __init__(self, std_walk: np.ndarray) -> None:
+    def __init__(self, std_walk: np.ndarray, constants: int = 0) -> None:
         self.std_walk = deviations(std_walk, 6, "std_walk")
+        self.constants = constants
 
     def transition(self, state: np.ndarray, control: PosePrior | None, dt: float) -> Transition:
         """Chart at the previous pose: ε = δ v + w₁."""
@@ -68,7 +70,11 @@ class MarginalVelocity(MotionModel):
             state, factor = _placed(state, control), _with_prior(factor, control)
             coupling = np.zeros((1, 6, 6))
             keeps = keeps if control.std_velocity is None else np.zeros((1, 6, 6))
-        return Transition(state, factor[None], coupling, keeps, np.zeros((1, 6)))
+        if k := self.constants:
+            factor, coupling = np.pad(factor, ((0, k), (0, 0))), np.pad(coupling, ((0, 0), (0, 0), (0, k)))
+            keeps = np.pad(keeps, ((0, 0), (0, k), (0, k)))
+            keeps[0, 6:, 6:] = np.eye(k)
+        return Transition(state, factor[None], coupling, keeps, np.zeros((1, 6 + k)))
 
 
 @final

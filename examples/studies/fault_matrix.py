@@ -117,7 +117,11 @@ def usual_faults(rate_hz: float, frames: int) -> dict[str, Fault]:
 
 
 def try_mono(
-    sequence: ImageSequence, known: KnownPixels | None, config: MonoConfig, faults: Mapping[str, Fault]
+    sequence: ImageSequence,
+    known: KnownPixels | None,
+    config: MonoConfig,
+    faults: Mapping[str, Fault],
+    name: str = "mono",
 ) -> list[Outcome]:
     """The monocular system on a sequence with ground truth, undamaged first; no alignment with known points.
 
@@ -129,7 +133,7 @@ def try_mono(
         done = filter_opened(open_mono(damaged, config, known))
         return Told(done.log.stamps_ns, done.log.poses, done.log.lost(), done.messages, done.failure)
 
-    return _try_all("mono", sequence, run, faults)
+    return _try_all(name, sequence, run, faults)
 
 
 def try_stereo(sequence: ImageSequence, config: StereoConfig, faults: Mapping[str, Fault]) -> list[Outcome]:
@@ -265,7 +269,11 @@ def of_images(desk: Path, quick: bool) -> list[Outcome]:
     if quick:
         faults = {name: faults[0][name] for name in list(faults[0])[:1]}, {}
     config = replace(StereoConfig(), particles=100)
-    return [*try_mono(mono, known, MonoConfig(), faults[0]), *try_stereo(stereo, config, faults[1])]
+    focal = {name: fault for name, fault in faults[0].items() if name.startswith("focal")}
+    calibrating = (
+        try_mono(mono, known, MonoConfig(calibrate="online"), focal, "mono, calibrate=online") if focal else []
+    )
+    return [*try_mono(mono, known, MonoConfig(), faults[0]), *calibrating, *try_stereo(stereo, config, faults[1])]
 
 
 def of_machine(desk: Path, out: Path, kills: int, quick: bool) -> dict[str, Ended]:

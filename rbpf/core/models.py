@@ -200,6 +200,8 @@ class ObservationModel(ABC):
 
     dim: int
     reads: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
+    #: (m,) where a model is linear in the substate that it reads, with the slope `by_substate`: its kernel is of this one.
+    about: np.ndarray | None = None
 
     @abstractmethod
     def predict(
@@ -249,6 +251,16 @@ class ObservationModel(ABC):
         ]
         jac = np.stack(columns, axis=-1)
         return Records(mean, gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2)))
+
+    def by_substate(
+        self, state: States, landmark: Float[np.ndarray, "*#batch D"], const: Constants = None
+    ) -> Float[np.ndarray, "*batch p m"]:
+        """∂z/∂substate (…, p, m) of a model with `about`, Mathematics (sensor-constants); to be overridden with it."""
+        raise InputError(f"{type(self).__name__} has an `about`: override by_substate")
+
+    def new_by_substate(self, z: Z) -> np.ndarray | None:
+        """How the landmarks of `initialise` move with the substate (K, D, m), from measurements (K, p); None: not at all."""
+        return None
 
     def kernel(self) -> FusedKernel | None:
         """A compiled twin of residual(z, predict) and jacobians; None runs them in NumPy."""

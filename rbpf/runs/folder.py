@@ -22,6 +22,7 @@ posterior.tum            their weighted mean, which later frames have sharpened
 of the monocular one
 
 known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
+camera.yaml              of one that calibrated itself: the camera, for --calibration of the next run
 
 and of the laser's
 
@@ -77,6 +78,9 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
         header, columns = log.table(table)
         files.write_csv(out / table, header, zip(*columns, strict=True))
     for name, arrays in system.files(log).items():
+        if isinstance(arrays, str):
+            files.write_text(out / name, arrays)
+            continue
         save_arrays(out / name, arrays)
         if name == files.POSTERIOR:
             # The mean over the last frame's particles of their whole paths.

@@ -200,8 +200,8 @@ class System(ABC):
         """Further entries of a run's summary.json; they go before the common ones of the same name."""
         return {}
 
-    def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
-        """Further files of a run's folder, arrays by the file's name and their own."""
+    def files(self, log: Recorded) -> Mapping[str, dict[str, np.ndarray] | str]:
+        """Further files of a run's folder by name, arrays by their own names or text."""
         return {}
 
     @abstractmethod

@@ -73,6 +73,11 @@ class RadialTangential:
         down = radial + bend * v * v + 6.0 * p1 * v + 2.0 * p2 * u
         return np.stack([along, across, across, down], axis=-1).reshape(*uv.shape, 2)
 
+    def by_coefficients(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """What (u, v) is scaled by (…, 2) more with one more of k1, and of k2."""
+        s = np.square(uv).sum(axis=-1)
+        return np.stack([s, s * s], axis=-1)
+
     def is_invertible(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether the distortion is one-to-one up to (u, v) (…).
 
@@ -188,6 +193,13 @@ class Equidistant:
         across = bend * u * v
         parts = [scale + bend * u * u, across, across, scale + bend * v * v]
         return np.stack(parts, axis=-1).reshape(*uv.shape, 2)
+
+    def by_coefficients(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """As of `RadialTangential`."""
+        r = np.linalg.norm(uv, axis=-1)
+        angle = np.arctan(r)
+        per = angle**3 / np.maximum(r, np.sqrt(NEAR))
+        return np.stack([per, per * angle**2], axis=-1)
 
     def is_invertible(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether a direction (u, v) (…) is seen: nearer to the axis than `max_angle`, where the lens is one-to-one."""

@@ -73,6 +73,12 @@ class Pinhole:
         fx, fy, cx, cy, *distortion = (float(number) for number in params)
         return cls(width, height, fx, fy, cx, cy, tuple(distortion[:count]), model)
 
+    def tuned(self, by: Float[np.ndarray, "4"]) -> Self:
+        """The camera with focal lengths fx exp(by₀), fy exp(by₁), and by₂, by₃ added to k1 and k2."""
+        (x, y), (k1, k2, *rest) = np.exp(by[:2]).tolist(), self.distortion
+        lens = (k1 + float(by[2]), k2 + float(by[3]), *rest)
+        return replace(self, fx=self.fx * x, fy=self.fy * y, distortion=lens)
+
     def resized(self, width: int, height: int) -> Self:
         """The camera of its images in another size: the centre of the first pixel stays at (0, 0)."""
         x, y = width / self.width, height / self.height
@@ -126,6 +132,14 @@ class Pinhole:
             uv = _normalise(point)
             by_uv = self.params[:2, None] * self.lens.jacobian(uv) / point[..., 2, None, None]
             return np.concatenate([by_uv, -by_uv @ uv[..., None]], axis=-1)
+
+    def by_tuning(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 4"]:
+        """∂px/∂by (…, 2, 4) of `tuned`, at by = 0, of points (…, 3) in the camera's frame."""
+        with np.errstate(all="ignore"):
+            uv = _normalise(point)
+            bent = self.params[:2] * self.lens.distort(uv)
+            along = self.params[:2, None] * uv[..., None] * self.lens.by_coefficients(uv)[..., None, :]
+            return np.concatenate([bent[..., None] * np.eye(2), along], axis=-1)
 
     def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Normalised coordinates (u, v) (…, 2) of pixels (…, 2): the point lies in the direction (u, v, 1).

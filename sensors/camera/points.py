@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Records
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Part, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
@@ -25,13 +25,17 @@ MIN_DEPTH_FRACTION = 0.2
 class CameraModel(ObservationModel):
     """The chain from a landmark to pixels; a subclass says where the landmark lies.
 
-    A landmark nearer to the border than `margin_px` is not expected to be seen.
+    A landmark nearer to the border than `margin_px` is not expected to be seen. `about` (m,) is the substate with which the
+    camera is as given, where it is not known: its last four numbers are those of `Pinhole.tuned`.
     """
 
-    def __init__(self, camera: Pinhole | RectifiedStereo, margin_px: float = 0.0) -> None:
+    def __init__(self, camera: Pinhole | RectifiedStereo, margin_px: float = 0.0, about: Given = None) -> None:
         self.camera = camera
         self.margin_px = margin_px
         self.dim = camera.dim
+        self.about = about
+        if about is not None:
+            self.reads = self.reads | {Part.SUBSTATE}
 
     @abstractmethod
     def world_point(self, landmark: Array, const: Given) -> tuple[Array, Array]:
@@ -49,7 +53,15 @@ class CameraModel(ObservationModel):
 
     def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         assert landmark is not None
-        return self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
+        px = self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
+        if self.about is None or substate is None:
+            return px
+        return px + (self.by_substate(state, landmark, const) @ (substate - self.about)[..., None])[..., 0]
+
+    def by_substate(self, state: Array, landmark: Array, const: Given = None) -> Array:
+        assert isinstance(self.camera, Pinhole) and self.about is not None
+        slope = self.camera.by_tuning(clamp_depth(self.in_camera(state, landmark, const)))
+        return np.concatenate([np.zeros((*slope.shape[:-1], self.about.size - slope.shape[-1])), slope], axis=-1)
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
         """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the camera's slope."""
@@ -63,7 +75,8 @@ class CameraModel(ObservationModel):
         dx, dw = self.world_point_jacobian(landmark, const)
         moved = dx - SE3.translation(state[..., :7])[..., :, None] * dw
         turned = np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ moved
-        return Jacobians(by_state, slope @ turned)
+        by_substate = None if self.about is None or substate is None else self.by_substate(state, landmark, const)
+        return Jacobians(by_state, slope @ turned, by_substate)
 
     def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
         return self.camera.visible(self.in_camera(state, landmark, const), self.margin_px)
@@ -92,8 +105,10 @@ class CameraRay(CameraModel):
     `rho` (2,) is the inverse depth of a landmark just started: mean and standard deviation, 1/m.
     """
 
-    def __init__(self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0) -> None:
-        super().__init__(camera, margin_px)
+    def __init__(
+        self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0, about: Given = None
+    ) -> None:
+        super().__init__(camera, margin_px, about)
         if not (np.isfinite(rho).all() and min(rho) > 0.0):
             raise InputError(f"the prior of the inverse depth needs a positive mean and deviation, got {rho}")
         self.pinhole = camera
@@ -123,6 +138,15 @@ class CameraRay(CameraModel):
         full[:, 2, 2] = self.rho[1] ** 2
         anchor = np.broadcast_to(state[:, None, :7], (n, k, 7))
         return Records(np.broadcast_to(mean, (n, k, 3)), np.broadcast_to(full, (n, k, 3, 3)), anchor)
+
+    def new_by_substate(self, z: Array) -> Array | None:
+        """What is seen at z lies where another camera sees it: ∂(u, v)/∂s = −(∂z/∂(u, v))⁻¹ ∂z/∂s."""
+        if self.about is None:
+            return None
+        ahead = np.insert(self.pinhole.unproject(z), 2, 1.0, axis=1)
+        out = np.zeros((len(z), 3, self.about.size))
+        out[:, :2, -4:] = -self.pinhole.unproject_jacobian(z) @ self.pinhole.by_tuning(ahead)
+        return out
 
     def kernel(self) -> FusedKernel | None:
         from rbpf.sensors.camera.kernels import camera_ray

@@ -79,6 +79,12 @@ RESUMED = {
         (0, 4, 9, 12),
         joint=True,
     ),
+    "known points, camera unknown": Case(
+        lambda: mono(KNOWN, settled_frames=3, calibrate="online"),
+        lambda: list(sequence(16).frames()),
+        (0, 4, 9, 12),
+        joint=True,
+    ),
     "lost, joint map": Case(
         lambda: mono(KNOWN, map="joint", settled_frames=1),
         lambda: list(sequence(30, lambda t, image: blinking(t - 12, image)).frames()),

@@ -118,7 +118,7 @@ class ActiveSearch:
     def __init__(
         self, features: FeatureSensor, table: FeatureTable, config: SearchConfig, gate: OutlierGate | None = None
     ) -> None:
-        self.features, self.camera = features, features.camera
+        self.features = features
         self.table, self.config = table, config
         self.gate = gate or RobustMotionGate()
         self.noise = config.noise_px**2 * np.eye(2)  #: covariance of a found place, px².
@@ -157,7 +157,7 @@ class ActiveSearch:
         """Rows (K,) of features worth looking for from a pose, spread over the image; places (V, 2) of all in view."""
         from rbpf.sensors.camera.kernels import in_view
 
-        table, camera, config = self.table, self.camera, self.config
+        table, camera, config = self.table, self.features.camera, self.config
         of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)
         limits = np.array([*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float)
         rows, px = np.empty(len(table), dtype=np.int64), np.empty((len(table), 2))
@@ -178,7 +178,7 @@ class ActiveSearch:
 
     def templates(self, rows: np.ndarray, patches: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Templates of features (K,) as they look from a pose, of patches (F, S, S) that were seen from poses (F, 7)."""
-        affines = patch_affines(self.camera, self.table.position[rows], poses[rows], pose)
+        affines = patch_affines(self.features.camera, self.table.position[rows], poses[rows], pose)
         return warp(patches[rows], affines, self.config.template_px)
 
     def match(
@@ -187,7 +187,7 @@ class ActiveSearch:
         """Place (K, 2), score (K,), whether that is a match (K,), and whether another place is much alike (K,)."""
         config = self.config
         matches = search(image, templates, mean, cov, sigmas=config.ellipse_sigmas, most_px=config.max_radius_px)
-        accepted = (matches.score >= config.min_correlation) & self.camera.inside(matches.px)
+        accepted = (matches.score >= config.min_correlation) & self.features.camera.inside(matches.px)
         return matches.px, matches.score, accepted, matches.ratio >= AMBIGUOUS
 
     def _agreeing(self, image: np.ndarray, belief: Belief, templates: np.ndarray, result: SearchResult) -> SearchResult:

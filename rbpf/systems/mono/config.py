@@ -152,6 +152,21 @@ class RelocalisationConfig(Ranged):
 
 
 @dataclass(frozen=True)
+class CalibrationConfig(Ranged):
+    """A camera that calibrates itself: how far its calibration may be from what is given, as standard deviations."""
+
+    focal: Positive = 0.1  #: of both focal lengths together, as a fraction.
+    aspect: Positive = 0.01  #: of one by the other, as a fraction.
+    distortion: Positive = 0.1  #: of k1 and of k2.
+
+    def cov(self) -> np.ndarray:
+        """Covariance (4, 4) of log fx, log fy, k1 and k2."""
+        cov = np.diag(np.square([self.aspect, self.aspect, self.distortion, self.distortion]))
+        cov[:2, :2] += self.focal**2
+        return cov
+
+
+@dataclass(frozen=True)
 class MonoConfig(Ranged):
     """Monocular SLAM."""
 
@@ -179,6 +194,8 @@ class MonoConfig(Ranged):
     #: of a joint map: landmarks held, at most; of those not looked for the ones that were found least often are dropped, of
     #: named features the oldest.
     active: Count = 300
+    #: of a joint map: the camera calibrates itself, its focal lengths, k1 and k2 being estimated with everything else.
+    calibrate: Literal["off", "online"] = "off"
     #: landmarks started in one frame at most.
     max_new_per_frame: Annotated[CountOrNone, Formerly("births_per_frame")] = 1000
     #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
@@ -189,6 +206,8 @@ class MonoConfig(Ranged):
     inverse_depth: Annotated[InverseDepthConfig, Formerly("ray")] = field(default_factory=InverseDepthConfig)
     start: StartConfig = field(default_factory=StartConfig)  #: without known points.
     search: SearchConfig = field(default_factory=SearchConfig)  #: of features in images.
+    #: what is known of a camera that calibrates itself.
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     #: when the camera is lost.
     relocalisation: Annotated[RelocalisationConfig, Formerly("recovery")] = field(default_factory=RelocalisationConfig)
     #: where particles are sampled.

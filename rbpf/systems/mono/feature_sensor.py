@@ -13,6 +13,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import Belief, Landmark, NewLandmarks, Observations, Part, Records, Sensor
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
@@ -45,6 +46,10 @@ class UnknownDepth(ABC):
 
     landmark: Landmark  #: their parametrisation in the map; of one component.
     model: CameraModel  #: how a camera measures them.
+
+    def tune(self, camera: Pinhole, about: np.ndarray) -> None:
+        """As `FeatureSensor.tune`; to be overridden where there is a joint map."""
+        raise InputError(f"{type(self).__name__} has no camera that calibrates itself")
 
     @abstractmethod
     def starting(self, depths: np.ndarray) -> CameraModel:
@@ -95,6 +100,10 @@ class InverseDepthRays(UnknownDepth):
         self.model = CameraRay(camera, rho)
         self.epipolar = EpipolarRay(camera, rho)
 
+    def tune(self, camera: Pinhole, about: np.ndarray) -> None:
+        """As `FeatureSensor.tune`."""
+        self.camera, self.model = camera, CameraRay(camera, self.model.rho, about=about)
+
     def starting(self, depths: np.ndarray) -> CameraModel:
         """At the median inverse depth of the points in view, where there are enough of them.
 
@@ -106,7 +115,8 @@ class InverseDepthRays(UnknownDepth):
         rho = 1.0 / depths
         middle = float(np.median(rho))
         fraction = self.config.std_per_m / self.config.mean_per_m
-        return CameraRay(self.camera, (middle, max(fraction * middle, float(rho.std()))))
+        prior = middle, max(fraction * middle, float(rho.std()))
+        return CameraRay(self.camera, prior, about=self.model.about)
 
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
@@ -201,6 +211,11 @@ class FeatureSensor(Sensor):
         """From now on the map is a joint one, which holds the known points one by one, and `most` landmarks in all."""
         self.unknown_depth, self.most = unknown_depth, most
         self._take_group(None)
+
+    def tune(self, camera: Pinhole, about: np.ndarray) -> None:
+        """The camera of a joint map that it is estimated in, at the substate `about` (m,)."""
+        self.camera, self.point = camera, CameraPoint(camera, about=about)
+        self.unknown_depth.tune(camera, about)
 
     def _take_group(self, group: KnownPoints | None) -> None:
         self.group = group

@@ -139,7 +139,6 @@ class ImageSensor(Sensor):
         descriptor: Descriptor | None = None,
     ) -> None:
         self.features = features
-        self.camera = features.camera
         self.config = config
         self.table = FeatureTable()
         self.search = ActiveSearch(features, self.table, config, gate)
@@ -148,6 +147,11 @@ class ImageSensor(Sensor):
         self.bad_frames = 0
         """Frames in a row in which too little was found."""
         self._within = self.camera.field_of_view_mask(PATCH_HALF_PX + 1.0)
+
+    @property
+    def camera(self) -> Pinhole:
+        """Of the images, as far as it is known."""
+        return self.features.camera
 
     @property
     def lost(self) -> bool:

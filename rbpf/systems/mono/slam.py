@@ -9,7 +9,7 @@ search inside, what is reported, and, as long as depths are unknown, the batch a
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, final
@@ -30,6 +30,8 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.features import Descriptor, Detector
 from rbpf.sensors.readers import ImageFrame, KnownPixels
+from rbpf.sensors.readers.images.calibration import NAME as CAMERA
+from rbpf.sensors.readers.images.calibration import camera_text
 from rbpf.systems.anchoring import Anchored, relative_estimate
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.active_search import OutlierGate
@@ -41,6 +43,7 @@ from rbpf.systems.mono.joint import HandOver
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture, world_of
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
+from rbpf.systems.mono.self_calibration import NUMBERS
 from rbpf.systems.mono.unknown_start import UnknownStart
 from rbpf.systems.system import (
     DIAGNOSTICS,
@@ -153,7 +156,7 @@ class MonoSlam(System):
 
         rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
         is_fixed = known_map is not None
-        self.hand_over = HandOver(config, rays, is_fixed)
+        self.hand_over = HandOver(config, camera, points, rays, is_fixed)
         self.features = FeatureSensor(camera, rays, config.max_new_per_frame, group, is_fixed)
         self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
         self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
@@ -207,6 +210,8 @@ class MonoSlam(System):
         started = time.perf_counter()
         sensor, messages = self.sensor, list[str]()
         was_lost, never_found, first_new = sensor.lost, self.loss.never_found, len(sensor.table)
+
+        self.hand_over.tune(self.filter, sensor)
 
         # 1. Is there anything to measure?
         has_images = len(sensor.table) > 0
@@ -273,13 +278,15 @@ class MonoSlam(System):
         values = self._values(shown, report)
         observed = self._observed(shown, world, first_new)
 
+        seen = measured.features if isinstance(measured, Measurement) else frame
+        assert isinstance(seen, FeatureFrame)
+        # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
+        near = mixture_estimate(*report.mixture).mean[:7]
+
         # 6. While depths are unknown: batch adjustment of the frames so far, and particles drawn from it.
         revision: Revision | None = None
         if not self.start.over:
-            seen = measured.features if isinstance(measured, Measurement) else measured
             is_lost = sensor.lost and len(sensor.table) > 0
-            # From where the adjustment starts: the mixture before sampling, which no noise of a few particles moves.
-            near = mixture_estimate(*report.mixture).mean[:7]
             resampled, words = self.start.after_frame(self.filter, seen, near, not sensor.bad_frames, is_lost)
             if resampled is not None:
                 self.filter, revision = resampled.filter, resampled.revision
@@ -289,12 +296,18 @@ class MonoSlam(System):
                     self.loss.trust(self.filter, measured.image)
             messages = [words, *messages] if words is not None else messages
 
+        self.hand_over.note(seen, near, revision)
+
         # 7. Once depths are known: one Gaussian, if there is to be one. It stays where it is while the camera is lost.
         if self.start.over and not sensor.bad_frames:
             seen = measured.used if isinstance(measured, Measurement) else measured
             handed = self.hand_over.after_frame(self.filter, sensor, seen)
             if handed is not None:
-                self.filter = handed
+                self.filter = handed.filter
+                messages += [] if handed.words is None else [handed.words]
+                if handed.revision is not None:
+                    revision = handed.revision
+                    pose, cov = revision.poses[-1], revision.covs[-1]
                 if isinstance(measured, Measurement):
                     self.loss.trust(self.filter, measured.image)
         self.hand_over.hold(self.filter, sensor.lost)
@@ -357,7 +370,8 @@ class MonoSlam(System):
             px = np.concatenate([seen["px"][kept], seen["started_px"]])
             noise = np.tile(self.config.search.noise_px**2 * np.eye(2), (seen["started"].size, 1, 1))
             frames.append(FeatureFrame(stamp_ns, names, px, np.concatenate([seen["cov_px"][kept], noise])))
-        return FeatureLog(name, self.camera, frames, self.known_points)
+        found = self.hand_over.calibration(self.filter)
+        return FeatureLog(name, self.camera if found is None else found[0], frames, self.known_points)
 
     def summary(self, log: Recorded) -> dict[str, Any]:
         """Frames that were tracked, landmarks, and how much was found."""
@@ -369,6 +383,7 @@ class MonoSlam(System):
             "lost_frames": int(lost.sum()),
             "relocalisations": int(log["relocalised"].sum()),
             "map": "particles" if self.joint is None else "joint",
+            **self._calibration(),
             "known_points": 0 if self.known_points is None else int(self.known_points.names.size),
             **({} if self.known_map is None else localised),
             "landmarks_full": int((~landmarks.is_ray()).sum()),
@@ -377,14 +392,33 @@ class MonoSlam(System):
             "share_found": float(found[looked].sum() / searched[looked].sum()) if looked.any() else 0.0,
         }
 
-    def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
-        """The particles' paths; and, of images, the map as a place to be found in, unless the run was localised."""
+    def _calibration(self) -> dict[str, Any]:
+        """Entry of `summary`, of a camera that calibrates itself: px and none, with standard deviations."""
+        if self.config.calibrate == "off":
+            return {}
+        found = self.hand_over.calibration(self.filter)
+        if found is None:
+            return {"calibration": None}
+        camera, std = found
+        units = np.array([camera.fx, camera.fy, 1.0, 1.0])
+        pairs = zip(NUMBERS, camera.params[[0, 1, 4, 5]].tolist(), (units * std).tolist(), strict=True)
+        return {"calibration": {k: v for name, at, spread in pairs for k, v in ((name, at), (f"std_{name}", spread))}}
+
+    def files(self, log: Recorded) -> Mapping[str, dict[str, np.ndarray] | str]:
+        """The particles' paths; of images, the map as a place to be found in, unless the run was localised; the camera.
+
+        The camera of a run that has calibrated it.
+        """
         posterior = {
             "stamps_ns": self.filter.history.stamps_ns if self.joint is None else np.array([self.filter.stamp_ns]),
             "world_from_camera": self.particle_paths(),
             "log_weights": self.filter.particles.log_weights,
         }
-        files = {"posterior.npz": posterior}
+        files: dict[str, dict[str, np.ndarray] | str] = {"posterior.npz": posterior}
+        if (found := self.hand_over.calibration(self.filter)) is not None:
+            files[CAMERA] = camera_text(
+                found[0], "focal lengths, k1 and k2 as the run estimated them, calibrate=online"
+            )
         if self.known_map is None and len(self.sensor.table):
             files[NAME] = known_map_arrays(self.export_map(log.poses[~log.lost()]))
         return files
@@ -402,7 +436,7 @@ class MonoSlam(System):
             first = SE3.compose(SE3.inverse(world.mean[self.filter.belief().mode]), first)
         looks = table.first_patch[rows], table.first_px[rows], first
         views = distant_views(positions, poses)
-        return KnownMap(self.camera, self.gauge, rows, positions, found.cov[kept], *looks, views)
+        return KnownMap(self.features.camera, self.gauge, rows, positions, found.cov[kept], *looks, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The sensor's table, the last trusted pose, and the frames of a start that is not over."""
@@ -530,7 +564,7 @@ class MonoSlam(System):
         unknown, ends = self.features.extents(belief, rows, LINE_SIGMAS)
         if unknown.size:
             direction = directions(ends.reshape(-1, 4), pose)
-            px = self.camera.project(direction)
+            px = self.features.camera.project(direction)
             px[~(direction[:, 2] > 0.0)] = np.nan
             line[unknown] = px.reshape(-1, 2, 2)
         return {

@@ -19,7 +19,7 @@ image tells: it is held.
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import final
 
@@ -32,6 +32,7 @@ from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.joint_columns import by_frame
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import clamp_depth
@@ -107,6 +108,45 @@ class Resampled:
 
 
 @final
+class FirstFrames:
+    """What was seen in the first frames, and from where (7,) as far as is known, in the particles' world."""
+
+    def __init__(self) -> None:
+        self.seen: list[FeatureFrame] = []
+        self.path: list[np.ndarray] = []
+
+    def frame_of(self) -> np.ndarray:
+        """In which of the frames each of F features was seen first (F,), in the order of their names."""
+        _, first = np.unique(np.concatenate([frame.landmarks for frame in self.seen]), return_index=True)
+        return np.repeat(np.arange(len(self.seen)), [frame.landmarks.size for frame in self.seen])[first]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint; nothing where there are none."""
+        if not self.seen:
+            return {}
+        return {
+            "stamps_ns": np.array([frame.stamp_ns for frame in self.seen], dtype=np.int64),
+            "counts": np.array([frame.landmarks.size for frame in self.seen], dtype=np.int64),
+            "names": np.concatenate([frame.landmarks for frame in self.seen]),
+            "px": np.concatenate([frame.z for frame in self.seen]),
+            "cov_px": np.concatenate([frame.cov_z for frame in self.seen]),
+            "path": np.array(self.path),
+        }
+
+    @classmethod
+    def restored(cls, arrays: dict[str, np.ndarray], prefix: str) -> "FirstFrames":
+        """The inverse of `arrays`, whose names begin with a prefix; errors as `rbpf.core.checkpoint.read`."""
+        out = cls()
+        if f"{prefix}stamps_ns" in arrays:
+            held = read(arrays, _FRAMES, prefix)
+            columns = held["names"], held["px"], held["cov_px"]
+            parts = zip(*(split(column, held["counts"].tolist(), prefix[:-1]) for column in columns), strict=True)
+            out.seen = [FeatureFrame(t, *part) for t, part in zip(held["stamps_ns"].tolist(), parts, strict=True)]
+            out.path = list(held["path"])
+        return out
+
+
+@final
 class UnknownStart:
     """Gathers the first frames, adjusts them when it is time, and resamples the particles.
 
@@ -121,8 +161,7 @@ class UnknownStart:
         self.over = not (needed and config.start.batch_adjust)
         """Whether depths are known well enough, and the filter goes on alone."""
         self._next = config.start.first_adjustment
-        self._frames: list[FeatureFrame] = []
-        self._path: list[np.ndarray] = []
+        self._first = FirstFrames()
         nothing = np.zeros(0, dtype=np.int64)
         self._last = nothing, nothing, Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0))
         """Names, numbers of the frames, and optimum of the last adjustment; empty before one."""
@@ -144,18 +183,18 @@ class UnknownStart:
         """
         self.over = self.over or lost
         if self.over:
-            self._frames, self._path = [], []
+            self._first = FirstFrames()
             return None, None
-        self._frames.append(seen)
-        self._path.append(pose)
-        count = len(self._frames)
+        self._first.seen.append(seen)
+        self._first.path.append(pose)
+        count = len(self._first.seen)
         if count < self._next or not usable:
             return None, None
         self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
-        frames, path = self._frames, np.array(self._path)
+        first, frames, path = self._first, self._first.seen, np.array(self._first.path)
         best, self.over = self._adjusted(filter_, frames, path)
         if self.over:
-            self._frames, self._path = [], []
+            self._first = FirstFrames()
         if best is None:
             return None, DISCONNECTED if self.over else None
 
@@ -168,9 +207,9 @@ class UnknownStart:
         equal = uniform_log_weights(paths.shape[1])
         means = [mixture_estimate(Prior.exactly(SE3, poses), None, equal) for poses in paths]
         poses, covs = np.array([each.mean for each in means]), np.array([each.cov for each in means])
-        _, first = np.unique(np.concatenate([frame.landmarks for frame in frames]), return_index=True)
-        frame_of = np.repeat(np.arange(count), [frame.landmarks.size for frame in frames])[first]
-        self._path = [] if self.over else list(poses)
+        frame_of = first.frame_of()
+        if not self.over:
+            self._first.path = list(poses)
         path = paths[:, filter_.belief().mode]
         return Resampled(filter_, Revision(stamps, poses, covs), path, frame_of), None
 
@@ -185,17 +224,7 @@ class UnknownStart:
             "start/direction": structure.direction,
             "start/inverse": structure.inverse,
         }
-        if self._frames:
-            frames = self._frames
-            out |= {
-                "start/frames/stamps_ns": np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
-                "start/frames/counts": np.array([frame.landmarks.size for frame in frames], dtype=np.int64),
-                "start/frames/names": np.concatenate([frame.landmarks for frame in frames]),
-                "start/frames/px": np.concatenate([frame.z for frame in frames]),
-                "start/frames/cov_px": np.concatenate([frame.cov_z for frame in frames]),
-                "start/frames/path": np.array(self._path),
-            }
-        return out
+        return out | {f"start/frames/{name}": array for name, array in self._first.arrays().items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
@@ -204,46 +233,25 @@ class UnknownStart:
         self.over = bool(over)
         names, steps = last["names"], last["steps"]
         self._last = names, steps, Structure(last["path"], last["direction"], last["inverse"])
-        self._frames, self._path = [], []
-        if "start/frames/stamps_ns" in arrays:
-            held = read(arrays, _FRAMES, "start/frames/")
-            columns = held["names"], held["px"], held["cov_px"]
-            parts = zip(*(split(column, held["counts"].tolist(), "start/frames") for column in columns), strict=True)
-            stamps = held["stamps_ns"].tolist()
-            self._frames = [FeatureFrame(t, *part) for t, part in zip(stamps, parts, strict=True)]
-            self._path = list(held["path"])
-        if not self.over and names.size and not (steps.size and steps[-1] < len(self._frames)):
+        self._first = FirstFrames.restored(arrays, "start/frames/")
+        if not self.over and names.size and not (steps.size and steps[-1] < len(self._first.seen)):
             raise InputError("the last adjustment of the start is of frames that are not there")
 
     def _adjusted(
         self, filter_: Filter, frames: Sequence[FeatureFrame], path: np.ndarray
     ) -> "tuple[tuple[np.ndarray, Optimum] | None, bool]":
         """Numbers of the frames that took part, and the best optimum, or None; and whether the start is over."""
-        # Frames that see something, with a stamp of their own, the first and the last among them.
-        stamps = np.array([frame.stamp_ns for frame in frames])
-        fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
-        steps = np.flatnonzero(fresh)
-        most = min(self.config.start.max_frames, steps.size)
-        steps = steps[np.linspace(0, steps.size - 1, most).round().astype(np.int64)]
+        steps, names, seen = gathered(frames, self.features, filter_.belief().map.holds, self.config.start.max_frames)
         if steps.size < MIN_FRAMES:
             return None, False
-
-        # Features that the map still holds and that enough of these frames see.
-        chosen = [frames[t] for t in steps.tolist()]
-        seen_by = np.concatenate([frame.landmarks for frame in chosen])
-        names, views = np.unique(seen_by[filter_.belief().map.holds(seen_by)], return_counts=True)
-        names = names[views >= MIN_VIEWS]
-        seen = self._window(chosen, names)
-        sees = np.zeros((seen.stamps_ns.size, seen.feature.max(initial=-1) + 1), dtype=bool)
-        sees[seen.frame, seen.feature] = True
-        if not ((sees[1:] & sees[:-1]).sum(axis=1) >= MIN_SHARED).all():
+        if not seen.is_connected():
             return None, True
 
         # The lower of the minima downhill from where the filter is, and from where the last adjustment would have gone.
         which, position = self.features.positions(filter_.belief(), names)
         ordered = np.empty_like(position)
         ordered[which] = position
-        starts = [_structure(SE3.between(path[steps][:1], path[steps]), ordered)]
+        starts = [structure_of(SE3.between(path[steps][:1], path[steps]), ordered)]
         if self._last[0].size:
             starts.append(self._gone_on(seen, names, path[steps], steps))
         found = [optimum(seen, self.config, start) for start in starts]
@@ -257,19 +265,6 @@ class UnknownStart:
         relative = relative[np.isin(names, frames[-1].landmarks)]
         depths_known = relative.size > 0 and np.median(relative) < self.config.start.depth_std_ratio
         return (steps, best), bool(depths_known)
-
-    def _window(self, frames: list[FeatureFrame], names: np.ndarray) -> "Window":
-        """What frames saw of features of these names."""
-        parts = [np.isin(frame.landmarks, names) for frame in frames]
-        seen = [frame.landmarks[part] for frame, part in zip(frames, parts, strict=True)]
-        return Window(
-            self.features.camera,
-            np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
-            np.repeat(np.arange(len(frames)), [part.sum() for part in parts]),
-            np.searchsorted(names, np.concatenate(seen)),
-            np.concatenate([frame.z[part] for frame, part in zip(frames, parts, strict=True)]),
-            float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in frames for cov in frame.cov_z]))),
-        )
 
     def _gone_on(self, seen: "Window", names: np.ndarray, path: np.ndarray, steps: np.ndarray) -> "Structure":
         """The last adjustment's path and structure, gone on with as the filter moved, and what is new at the prior."""
@@ -288,7 +283,7 @@ class UnknownStart:
         position[:, 3] = rho
         _, now, then = np.intersect1d(names, before, return_indices=True)
         position[now] = np.concatenate([structure.direction, structure.inverse[:, None]], axis=1)[then]
-        return _structure(whole, position)
+        return structure_of(whole, position)
 
     def _along(self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
@@ -323,6 +318,15 @@ def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndar
 
 
 @dataclass(frozen=True)
+class Known:
+    """Which M features (M,) are at known positions (M, 3), with whiteners (M, 3, 3) of their errors."""
+
+    feature: np.ndarray
+    positions: np.ndarray
+    whitener: np.ndarray
+
+
+@dataclass(frozen=True)
 class Window:
     """What T frames saw of F features, K observations in all."""
 
@@ -332,6 +336,45 @@ class Window:
     feature: np.ndarray  #: (K,) which one; no feature twice in a frame.
     px: np.ndarray  #: (K, 2) where.
     noise_px: float  #: standard deviation, per axis.
+    known: Known | None = None  #: those of the features whose place is known.
+    tuning: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  #: (k, k) information of the camera's `tuned`.
+
+    def is_connected(self) -> bool:
+        """Whether every two frames in a row have enough features in common."""
+        sees = np.zeros((self.stamps_ns.size, self.feature.max(initial=-1) + 1), dtype=bool)
+        sees[self.frame, self.feature] = True
+        return bool(((sees[1:] & sees[:-1]).sum(axis=1) >= MIN_SHARED).all())
+
+
+def gathered(
+    frames: Sequence[FeatureFrame], features: FeatureSensor, held: Callable[[np.ndarray], np.ndarray], most: int
+) -> tuple[np.ndarray, np.ndarray, Window]:
+    """Numbers (T,) of `most` frames to adjust, names (F,) of features that are `held` and seen often enough, what was seen.
+
+    The frames see something, with a stamp of their own, the first and the last among them.
+    """
+    stamps = np.array([frame.stamp_ns for frame in frames])
+    fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
+    steps = np.flatnonzero(fresh)
+    steps = steps[np.linspace(0, steps.size - 1, min(most, steps.size)).round().astype(np.int64)]
+    chosen = [frames[t] for t in steps.tolist()]
+    none = [np.zeros(0, dtype=np.int64)]
+    seen_by = np.concatenate(none + [frame.landmarks for frame in chosen])
+    names, views = np.unique(seen_by[held(seen_by)], return_counts=True)
+    names = names[views >= MIN_VIEWS]
+    parts = [np.isin(frame.landmarks, names) for frame in chosen]
+    return (
+        steps,
+        names,
+        Window(
+            features.camera,
+            stamps[steps],
+            np.repeat(np.arange(len(chosen)), [part.sum() for part in parts]),
+            np.searchsorted(names, np.concatenate(none + [f.landmarks[p] for f, p in zip(chosen, parts, strict=True)])),
+            np.concatenate([np.zeros((0, 2)), *(f.z[p] for f, p in zip(chosen, parts, strict=True))]),
+            float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z] or [1.0]))),
+        ),
+    )
 
 
 @final
@@ -342,15 +385,20 @@ class Structure:
     path: np.ndarray  #: (T, 7) world_from_camera; the first one is the identity.
     direction: np.ndarray  #: (F, 3) unit vectors.
     inverse: np.ndarray  #: (F,) 1/m.
+    tuned: np.ndarray = field(default_factory=lambda: np.zeros(0))  #: (k,) of the camera, where it is not known.
+    frame: np.ndarray | None = None  #: (7,) first camera_from_known of the known points' frame, where there are some.
 
     def moved(self, step: np.ndarray) -> "Structure":
-        """By a step (6 (T − 1) + 3 F,) in the right charts of the poses, the tangent planes and 1/m."""
+        """By a step (6 (T − 1) + 3 F + k + 6,) in the right charts of the poses, the tangent planes and 1/m."""
         free = 6 * (self.path.shape[0] - 1)
-        path, of_features = self.path.copy(), step[free:].reshape(-1, 3)
+        end = free + 3 * self.inverse.size
+        path, of_features = self.path.copy(), step[free:end].reshape(-1, 3)
+        tuned, left = self.tuned + step[end : end + self.tuned.size], step[end + self.tuned.size :]
+        frame = None if self.frame is None else SE3.retract(self.frame, left)
         path[1:] = SE3.retract(path[1:], step[:free].reshape(-1, 6))
         direction = self.direction + (tangents(self.direction) @ of_features[:, :2, None])[..., 0]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        return Structure(path, direction, self.inverse + of_features[:, 2])
+        return Structure(path, direction, self.inverse + of_features[:, 2], tuned, frame)
 
 
 @final
@@ -360,7 +408,7 @@ class Optimum:
 
     structure: Structure  #: there.
     cost: float  #: the sum above.
-    #: (6 (T − 1) + 3 F, …) of the step from it: its inverse is the covariance of the minimum's error.
+    #: (6 (T − 1) + 3 F + k + 6, …) of the step from it: its inverse is the covariance of the minimum's error.
     information: np.ndarray
 
     @cached_property
@@ -379,7 +427,7 @@ class Optimum:
     def std_inverse(self) -> np.ndarray:
         """Standard deviations (F,) of the inverse distances, 1/m."""
         count = self.structure.inverse.size
-        rows = np.arange(count) * 3 + 2 + self.information.shape[0] - 3 * count
+        rows = np.arange(count) * 3 + 2 + 6 * (len(self.structure.path) - 1)
         picked = np.zeros((self.information.shape[0], count))
         picked[rows, np.arange(count)] = 1.0
         half = solve_triangular(self._factor, picked, lower=True)
@@ -421,7 +469,8 @@ class Linearised:
         position = SE3.translation(pose)
         place = at.direction[feature] + (1.0 - at.inverse[feature, None]) * position
         self._direction = clamp_depth(SE3.inverse_transform(pose, place))
-        self.misfit = (seen.px - seen.camera.project(self._direction)) / seen.noise_px
+        self.camera = seen.camera.tuned(at.tuned) if at.tuned.size else seen.camera
+        self.misfit = (seen.px - self.camera.project(self._direction)) / seen.noise_px
         squared = np.square(self.misfit).sum(axis=1) / CAUCHY_SCALE**2
         self.weight = 1.0 / (1.0 + squared)
         self._interval = np.diff(seen.stamps_ns) * 1e-9
@@ -436,9 +485,16 @@ class Linearised:
         self._whitener = np.linalg.inv(np.linalg.cholesky(cov))
         self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
         self.prior = (at.inverse - self.rho.mean_per_m) / self.rho.std_per_m
-        self._by_scale = 1.0 / (at.inverse.size * self.rho.mean_per_m * SCALE_STD)
-        self.scale = float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
-        quadratic = sum(np.square(part).sum() for part in (self.velocity, self.prior, self.scale))
+        # The scale is the known points', or held.
+        self._by_scale = 0.0 if seen.known else 1.0 / (at.inverse.size * self.rho.mean_per_m * SCALE_STD)
+        self.scale = 0.0 if seen.known else float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
+        self.known = np.zeros((0, 3))
+        if seen.known is not None and at.frame is not None:
+            self._places = (at.direction / at.inverse[:, None])[seen.known.feature]
+            self._local = SE3.inverse_transform(at.frame, self._places)
+            self.known = (seen.known.whitener @ (self._local - seen.known.positions)[..., None])[..., 0]
+        quadratic = sum(np.square(part).sum() for part in (self.velocity, self.prior, self.scale, self.known))
+        quadratic += at.tuned @ seen.tuning @ at.tuned
         self.cost = float(0.5 * CAUCHY_SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
 
     def _differences(self, velocity: np.ndarray) -> np.ndarray:
@@ -451,14 +507,17 @@ class Linearised:
         seen, at, direction = self.seen, self.at, self._direction
         frames, features = at.path.shape[0], at.inverse.size
         free = 6 * frames
-        h, b = np.zeros((free + 3 * features,) * 2), np.zeros(free + 3 * features)
+        end = free + 3 * features
+        frame = end + at.tuned.size
+        size = frame + (0 if seen.known is None else 6)
+        h, b = np.zeros((size, size)), np.zeros(size)
         of_poses = h[:free, :free].reshape(frames, 6, frames, 6)
-        of_features = h[free:, free:].reshape(features, 3, features, 3)
-        across = h[:free, free:].reshape(frames, 6, features, 3)
+        of_features = h[free:end, free:end].reshape(features, 3, features, 3)
+        across = h[:free, free:end].reshape(frames, 6, features, 3)
 
         # Derivatives of what should be seen by the pose (K, 2, 6) and by the feature (K, 2, 3).
         pose, inverse = at.path[seen.frame], at.inverse[seen.feature, None, None]
-        slope = seen.camera.jacobian(direction) / seen.noise_px
+        slope = self.camera.jacobian(direction) / seen.noise_px
         by_pose = np.concatenate([np.cross(slope, direction[:, None, :]), -inverse * slope], axis=2)
         turned = slope @ np.swapaxes(SE3.rotation(pose), 1, 2)
         along = turned @ tangents(at.direction)[seen.feature]
@@ -470,11 +529,20 @@ class Linearised:
         of_poses[each[0], :, each[0]] = _summed(of_pose @ by_pose, seen.frame, frames)
         of_features[each[1], :, each[1]] = _summed(of_feature @ by_feature, seen.feature, features)
         across[seen.frame, :, seen.feature] = of_pose @ by_feature
-        h *= loss_information
-        h[free:, :free] = h[:free, free:].T
         misfit = self.misfit[..., None]
         b[:free] = _summed((of_pose @ misfit)[..., 0], seen.frame, frames).ravel()
-        b[free:] = _summed((of_feature @ misfit)[..., 0], seen.feature, features).ravel()
+        b[free:end] = _summed((of_feature @ misfit)[..., 0], seen.feature, features).ravel()
+        if at.tuned.size:
+            by_camera = self.camera.by_tuning(direction) / seen.noise_px
+            of_camera = np.swapaxes(self.weight[:, None, None] * by_camera, 1, 2)
+            h[:free, end:frame] = _summed(of_pose @ by_camera, seen.frame, frames).reshape(free, -1)
+            h[free:end, end:frame] = _summed(of_feature @ by_camera, seen.feature, features).reshape(end - free, -1)
+            h[end:frame, end:frame] = (of_camera @ by_camera).sum(axis=0)
+            b[end:frame] = (of_camera @ misfit)[..., 0].sum(axis=0)
+        h *= loss_information
+        h[free:, :free], h[end:, free:end] = h[:free, free:].T, h[free:end, end:].T
+        h[end:frame, end:frame] += seen.tuning
+        b[end:frame] -= seen.tuning @ at.tuned
 
         # Velocities between frames; their logarithms' derivatives by the poses to first order in a step.
         steps = frames - 1
@@ -490,6 +558,18 @@ class Linearised:
         h[q, q] += self.rho.std_per_m**-2
         h[np.ix_(q, q)] += self._by_scale**2
         b[q] -= self.prior / self.rho.std_per_m + self.scale * self._by_scale
+
+        # The known points, in their own frame.
+        if seen.known is not None and at.frame is not None:
+            rows, q = np.zeros((*self.known.shape, size)), at.inverse[seen.known.feature, None, None]
+            back = np.swapaxes(SE3.rotation(at.frame), 0, 1)
+            place = np.concatenate([tangents(at.direction)[seen.known.feature], -self._places[..., None]], axis=2)
+            for m, feature in enumerate(seen.known.feature.tolist()):
+                rows[m, :, free + 3 * feature : free + 3 * feature + 3] = back @ place[m] / q[m]
+            rows[:, :, frame:] = -by_frame(SE3, self._local)
+            by_all = (seen.known.whitener @ rows).reshape(-1, size)
+            h += by_all.T @ by_all
+            b -= by_all.T @ self.known.ravel()
         return h[6:, 6:], b[6:]
 
 
@@ -508,7 +588,7 @@ def _summed(parts: np.ndarray, row: np.ndarray, count: int) -> np.ndarray:
     return out
 
 
-def _structure(path: np.ndarray, position: np.ndarray) -> Structure:
-    """From homogeneous points (F, 4)."""
+def structure_of(path: np.ndarray, position: np.ndarray) -> Structure:
+    """From poses (T, 7), and homogeneous points (F, 4)."""
     length = np.linalg.norm(position[:, :3], axis=1, keepdims=True)
     return Structure(path, position[:, :3] / length, position[:, 3] / length[:, 0])
