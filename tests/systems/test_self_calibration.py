@@ -41,6 +41,7 @@ def test_slopes_by_the_calibration(camera):
         np.testing.assert_allclose(ray.new_by_substate(seen)[:, :2, 6 + k], (one - other) / (2 * step), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_a_focal_length_that_is_too_long_is_found(known):
     """By a camera over a desk; it is nearer than it was, by more than chance, and within what is stated."""
