@@ -105,7 +105,7 @@ def draw_map(
     for axes, plane in shown:
         right, up = plane
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="path")
-        axes.plot(mean[:, right], mean[:, up], ".", color="black", ms=3, label="landmarks")
+        axes.plot(mean[:, right], mean[:, up], ".", color="black", ms=3, label=f"landmarks, {SIGMAS:g}σ")
         ellipses = outline(mean[near][:, plane], cov[near][:, plane][:, :, plane])
         axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color="black", lw=0.5, alpha=0.5)
         if landmarks.ray_ends is not None and landmarks.is_ray().any():
