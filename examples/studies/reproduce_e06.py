@@ -17,6 +17,7 @@ ours falls short.
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -45,6 +46,7 @@ def main(
     particles: int = 50,
     seed: int = 0,
     quick: bool = False,
+    map: Literal["particles", "auto"] = "particles",
 ) -> dict[str, float]:
     """Makes figures of the paper; prints the table.
 
@@ -55,13 +57,14 @@ def main(
         particles: of the filter.
         seed: of worlds and filter.
         quick: few small frames.
+        map: every particle's own, as the paper's, or the system's default, the joint map.
     """
     wanted = sorted({ALSO.get(figure, figure) for figure in figures})
     unknown = [figure for figure in wanted if figure not in FIGURES]
     if unknown:
         raise InputError(f"there is no figure {unknown[0]} to reproduce: choose from {[*FIGURES, *ALSO]}")
     out.mkdir(parents=True, exist_ok=True)
-    setting = Setting(out, width, particles, seed, quick)
+    setting = Setting(out, width, particles, seed, quick, map)
     rows = [row for figure in wanted for row in FIGURES[figure](setting)]
     header = ["figure", "what", "paper", "ours", "as asked"]
     write_table(out / "table.csv", header, [[row.figure, row.what, row.paper, row.ours, row.verdict] for row in rows])

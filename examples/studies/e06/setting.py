@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -52,6 +53,7 @@ class Setting:
         particles: of the filter.
         seed: of worlds, noise and filter.
         quick: few small frames, for a test.
+        map: the paper's, or "auto" for the system's default.
     """
 
     out: Path
@@ -59,6 +61,7 @@ class Setting:
     particles: int = 50
     seed: int = 0
     quick: bool = False
+    map: Literal["particles", "auto"] = "particles"
 
     @property
     def camera(self) -> Pinhole:
@@ -68,8 +71,8 @@ class Setting:
         return Pinhole(width, height, focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
 
     def config(self, ray: InverseDepthConfig | None = None) -> MonoConfig:
-        """Of a run: the defaults."""
-        config = MonoConfig(particles=self.particles, seed=self.seed, map="particles")
+        """Of a run: the defaults but the map."""
+        config = MonoConfig(particles=self.particles, seed=self.seed, map=self.map)
         return config if ray is None else replace(config, inverse_depth=ray)
 
     def sequence(
