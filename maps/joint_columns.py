@@ -149,7 +149,8 @@ class JointColumns:
         """Takes up what `arrays` gave, of n columns. Raises InputError: it is damaged."""
         rows, kinds = checkpoint.integers("landmarks", least=0), len(self.kinds)
         schema = {
-            "ids": rows, "first": rows, "kind": checkpoint.integers("landmarks", least=0, below=kinds),
+            "ids": checkpoint.integers("landmarks"), "first": rows,
+            "kind": checkpoint.integers("landmarks", least=0, below=kinds),
             "clones": checkpoint.elements(self.space, "clones"), "clone_first": checkpoint.integers("clones", least=0),
             "clone": checkpoint.integers("landmarks", least=-1, below="clones"),
         }  # fmt: skip

@@ -79,7 +79,8 @@ class JointMap(Map):
             frame; None has none. It may be observed together with a landmark.
         compiled: use the models' fused kernels where they have one.
         submap: landmarks with which a sub-map ends, so that a step costs the same however large the map becomes; None keeps
-            one Gaussian. Sub-maps hold points, no substate, and nothing may be observed in the world.
+            one Gaussian. With a substate it ends when landmarks are `put_away`, and what stays goes over into the next one;
+            else that begins with nothing. Nothing may be observed in the world.
         unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
 
     Attributes:
@@ -106,8 +107,6 @@ class JointMap(Map):
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
         gaussian.psd_factor(cov)
-        if submap is not None and mean.size:
-            raise InputError("sub-maps take no substate: what it knows would tie them")
         self._substate, self._first = (mean, cov), space.dim + mean.size
         self.held = JointColumns(space, self._first, [self.point])
         self.submap, self.unnamed = submap, unnamed
@@ -116,6 +115,7 @@ class JointMap(Map):
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n, self._next_id = n, 0
         self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed)
+        self._given_ids = self.leaving = self._returning = self._observed = np.zeros(0, dtype=np.int64)
         self._begin_submap()
 
     def begin_at(self, world: np.ndarray, substate: np.ndarray, ids: np.ndarray, cov: np.ndarray) -> None:
@@ -199,6 +199,8 @@ class JointMap(Map):
         return decided
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
+        ids = [group.ids.ravel() for group in groups if group.ids is not None]
+        self._observed = np.concatenate([np.zeros(0, dtype=np.int64), *ids])
         return self._seen_through(state, groups, prior).information()
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -223,12 +225,76 @@ class JointMap(Map):
         self.origin, self.held.clones, mean, self.cov = self._consolidated(particles)
         self.mean = np.repeat(mean[None], self.n, axis=0)
         if self.submap is not None:
-            present = self._finished(self.origin, mean, self.cov)
-            if not self._in_step and self.old.take(present, len(self.ids) >= self.submap):
+            if self.leaving.size or self._returning.size:
+                self._exchange()
+            elif not self._in_step and self._is_over():
                 self._begin_submap()
-                present = self._finished(self.origin, self.mean[0], self.cov)
-            self.old.look_from(present)
+            if self.old.maps:
+                self.old.look_from(self._finished(self.origin, self.mean[0], self.cov))
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
+
+    def _is_over(self) -> bool:
+        """Whether the present sub-map has been joined to the old ones, and another begins with nothing."""
+        if self.submap is None or self._substate[0].size:
+            return False
+        return self.old.take(self._finished(self.origin, self.mean[0], self.cov), len(self.ids) >= self.submap)
+
+    def put_away(self, ids: np.ndarray) -> None:
+        """Points (K,) go to the old sub-maps when the window ends: the present one ends there, and what stays goes over."""
+        self.leaving = np.union1d(self.leaving, ids)
+
+    def bring_back(self, ids: np.ndarray) -> None:
+        """Points (K,) of old sub-maps are held again when the window ends, with all that is known of them."""
+        self._returning = np.union1d(self._returning, ids)
+
+    def _exchange(self) -> None:
+        """Points leave for the old sub-maps, and others come back, Mathematics (passed-on); all particles are alike."""
+        leaving = self.leaving[self.holds(self.leaving)]
+        returning = np.intersect1d(self._returning[~self.holds(self._returning)], self.old.ids)
+        self.leaving = self._returning = leaving[:0]
+        if self._in_step:  # what has been observed already stays
+            observed = np.isin(leaving, self._observed)
+            self.leaving, leaving = leaving[observed], leaving[~observed]
+        # As many as tell a pose in space; fewer are not worth a solution of all.
+        far = int((~np.isin(returning, self.old.near)).sum()) >= 3
+        if leaving.size or far:
+            self._pass_on(leaving, returning if far else None)
+        returning = returning[np.isin(returning, self.old.near)]
+        if returning.size:
+            present = self._finished(self.origin, self.mean[0], self.cov)
+            seen, slope, rest = self.old.brought_back(returning, present)
+            columns = np.append(np.arange(self.space.dim), self.held.of_one_kind(present.ids).columns)
+            cross = slope @ self.cov[columns]
+            self.held.add(returning, self.point, np.full(returning.size, -1), self.held.clones[:0])
+            self.mean = np.concatenate([self.mean, np.tile(seen.ravel(), (self.n, 1))], axis=1)
+            self.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
+            self._given_ids = np.union1d(self._given_ids, returning)
+
+    def _pass_on(self, leaving: np.ndarray, wanted: np.ndarray | None) -> None:
+        """Ends the present sub-map; what does not leave goes over into the next one as it is."""
+        d, dim, seams = self.space.dim, self.point.dim, self._seams
+        # What drives the motion ties the two as landmarks do: as it is here it is held on, in numbers taken for places.
+        count = -(-self._substate[0].size // dim)
+        names = -1 - np.arange(count) - count * len(self.old.maps)
+        taken = np.append(np.arange(self.mean.shape[1]), np.arange(d, self._first))
+        self.mean, self.cov = self.mean[:, taken], self.cov[np.ix_(taken, taken)]
+        if more := count * dim - self._substate[0].size:
+            self.mean = np.pad(self.mean, ((0, 0), (0, more)))
+            self.cov = np.pad(self.cov, ((0, more), (0, more)))
+            self.cov[-more:, -more:] = np.eye(more)
+        self.held.add(names, self.point, np.full(count, -1), self.held.clones[:0])
+        self.old.join(self._finished(self.origin, self.mean[0], self.cov), wanted is not None, wanted)
+        self._keep(self.held.drop(self.held.rows_of(np.append(leaving, seams))))
+        self.origin = self.space.identity()
+        self.mean[:, :d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0
+        self._given_ids = self.held.table.ids[self.held.table.kind == 0]
+        if (known := self.old.given(self._given_ids)) is not None:
+            # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
+            columns = self.held.of_one_kind(known.ids).columns.ravel()
+            own = self.cov[np.ix_(columns, columns)]
+            gain = np.linalg.solve(own, self.cov[columns]).T
+            self.mean = self.mean + gain @ (known.points.ravel() - self.mean[0, columns])
+            self.cov = gaussian.symmetrise(self.cov + gain @ (known.cov - own) @ gain.T)
 
     def widened(self) -> "JointMap":
         """With the landmarks of old sub-maps that are next to the frame: what may be expected, and nothing is done with it."""
@@ -252,11 +318,18 @@ class JointMap(Map):
     def landmarks(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Names (M,) of all landmarks, means (M, D) and covariances (M, D, D) in the world."""
         origin, clones, mean, cov = self._consolidated(particles)
+        d, dim, held, names = self.space.dim, self.point.dim, copy(self.held), self.held.table.ids
+        held.clones, rays = clones, self.held.table.kind != 0
         if self.old.maps:
-            return self.old.landmarks(self._finished(origin, mean, cov))
-        d, dim, turn, held = self.space.dim, self.point.dim, self.space.rotation(origin), copy(self.held)
-        held.clones = clones
-        means, covs = np.empty((len(self.ids), dim)), np.empty((len(self.ids), dim, dim))
+            present = self._finished(origin, mean, cov)
+            whole = self.old.landmarks(present)
+            if not rays.any():
+                return whole
+            here, cov = self.old.end(present), cov.copy()
+            origin, cov[:d], cov[:, :d] = here.mean, 0.0, 0.0
+            cov[:d, :d] = here.cov
+        turn = self.space.rotation(origin)
+        means, covs = np.empty((names.size, dim)), np.empty((names.size, dim, dim))
         for kind in held.by_kind():
             points, slope = held.points(kind, mean)
             # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
@@ -265,7 +338,10 @@ class JointMap(Map):
             by_all = turn @ np.concatenate([by_frame(self.space, points), slope], axis=-1)
             means[kind.rows] = self.space.transform(origin, points)
             covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
-        return self.ids, means, covs
+        if self.old.maps:
+            of_rays = names[rays], means[rays], covs[rays]
+            names, means, covs = (np.concatenate(pair) for pair in zip(whole, of_rays, strict=True))
+        return names.copy(), means, covs
 
     def moments(self, particles: Particles, of: Part | np.ndarray = Part.LANDMARK) -> tuple[np.ndarray, np.ndarray]:
         """As `Belief.moments`; the substate stays in the robot's frame."""
@@ -285,9 +361,10 @@ class JointMap(Map):
         return self.landmarks(particles)[1:]
 
     def _finished(self, origin: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> SubMap:
-        columns = self.held.of_one_kind(self.ids).columns
+        points = self.held.table.ids[self.held.table.kind == 0]
+        columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self._given_ids, points)
         used = np.append(np.arange(self.space.dim), columns)
-        return SubMap(origin, self.ids, mean[columns], cov[np.ix_(used, used)])
+        return SubMap(origin, points, mean[columns], cov[np.ix_(used, used)], given=self.old.given(given))
 
     def world(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
         """World_from_robot (n, E) of some particles, without what is uncertain about each one's frame."""
@@ -361,7 +438,12 @@ class JointMap(Map):
 
     @property
     def ids(self) -> np.ndarray:
-        return self.held.table.ids.copy()
+        return self.held.table.ids[self.held.table.ids >= 0]
+
+    @property
+    def _seams(self) -> np.ndarray:
+        """Names of what drove the motion where the present sub-map began."""
+        return self.held.table.ids[self.held.table.ids < 0]
 
     @property
     def stored_fraction(self) -> float:
@@ -448,8 +530,6 @@ class JointMap(Map):
         if self.held.number(landmark) >= 0:
             return
         space, anchor = self.space, self.space.identity() if landmark.anchored else None
-        if landmark.anchored and self.submap is not None:
-            raise InputError(f"sub-maps hold points, not {type(landmark).__name__}")
         fits = landmark.components == 1 and landmark.constants == (0 if anchor is None else space.size)
         if not fits or landmark.point(np.zeros(landmark.dim), anchor)[0].shape != (self.point.dim,):
             raise InputError(
@@ -532,7 +612,10 @@ class JointMap(Map):
     def arrays(self) -> dict[str, np.ndarray]:
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}
         named = {f"joint/{name}": array for name, array in (named | self.held.arrays()).items()}
-        return named if self.submap is None else named | self.old.arrays()
+        if self.submap is None:
+            return named
+        waiting = {"given": self._given_ids, "leaving": self.leaving, "returning": self._returning}
+        return named | {f"joint/{name}": array for name, array in waiting.items()} | self.old.arrays()
 
     def options(self) -> dict[str, object]:
         kinds = [type(kind).__name__ for kind in self.held.kinds]
@@ -551,3 +634,8 @@ class JointMap(Map):
             raise InputError("the array joint/ids names a landmark twice, or one that was never started")
         if self.submap is not None:
             self.old.restore(arrays)
+            schema = {name: checkpoint.integers(f"{name} ids") for name in ("given", "leaving", "returning")}
+            found = checkpoint.read(arrays, schema, "joint/")
+            self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
+            if not np.isin(self._given_ids, self.old.near).all():
+                raise InputError("the array joint/given names a landmark that is not about the start of the sub-map")

@@ -30,8 +30,18 @@ CLOSE_ENOUGH = 1e-6
 ITERATIONS = 20
 EXACT = 1e-5
 """Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
+ROUNDING = 1e-12
+"""Variance [m²] below which nothing is told apart."""
 FIRM = 6
 """Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
+
+
+class Given(NamedTuple):
+    """What was known of landmarks (K,) before a sub-map: at `points` (K, D) as seen from its start, with `cov` (KD, KD)."""
+
+    ids: np.ndarray
+    points: np.ndarray
+    cov: np.ndarray
 
 
 class SubMap(NamedTuple):
@@ -45,6 +55,7 @@ class SubMap(NamedTuple):
     points: np.ndarray
     cov: np.ndarray
     tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
+    given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
 
 
 class Beside(NamedTuple):
@@ -157,6 +168,8 @@ class SubMaps:
         self.starts = [space.identity()]
         self.near, self.points = np.zeros(0, dtype=np.int64), np.zeros((0, dim))
         self.cov = np.zeros((space.dim, space.dim))
+        self._places: tuple[np.ndarray, np.ndarray] | None = None
+        self._inverse_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
         self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
 
     @property
@@ -202,31 +215,87 @@ class SubMaps:
         mean = np.concatenate([mean, found.points[new].ravel() + moved @ slope.T], axis=1)
         return wide, mean, np.block([[cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
 
-    def join(self, finished: SubMap, recall: bool = False) -> None:
+    def given(self, ids: np.ndarray) -> Given | None:
+        """What is known of landmarks (K,) about the start, by all that is finished."""
+        if not ids.size:
+            return None
+        row_of = {landmark: row for row, landmark in enumerate(self.near.tolist())}
+        rows = np.array([row_of[landmark] for landmark in ids.tolist()])
+        columns = (self.space.dim + self.dim * rows[:, None] + np.arange(self.dim)).ravel()
+        return Given(ids, self.points[rows], self.cov[np.ix_(columns, columns)])
+
+    def join(self, finished: SubMap, recall: bool = False, wanted: np.ndarray | None = None) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end.
 
-        All are solved for if landmarks have returned, or, to `recall` those about the end, if that is wanted.
+        All are solved for if landmarks have returned, or, to `recall` those about the end and those `wanted` there.
         """
         loop = recall or bool(self.returned(finished.ids).any())
         before = [self._last[name][0] for name in finished.ids.tolist() if name in self._last]
         self._take(finished)
         if loop:
-            self.solve()
-        if min(before, default=len(self.maps)) < len(self.maps) - 2:
+            self.solve(wanted)
+        if finished.given is None and min(before, default=len(self.maps)) < len(self.maps) - 2:
             self._fuse()
 
     def end(self, present: SubMap) -> Estimate:
         """World_from_end of the present sub-map, by it and what is known about its start."""
         space, d = self.space, self.space.dim
-        x, cov, half, _ = self._tied(present)
-        first = d + self.dim * self.near.size
-        ends = np.append(np.arange(d), first + np.arange(d))
-        end = space.retract(present.end, x[ends[d:]])
+        if present.given is not None and np.isin(present.ids, self.near).sum() == present.given.ids.size:
+            # All that both know was passed on: no more than the start has to follow.
+            moved, by_new, rest = self._followed(present, np.arange(d))
+            x, cross = np.append(moved, np.zeros(d)), by_new @ present.cov
+            spread = rest + cross @ by_new.T
+            own = np.block([[spread, cross[:, :d]], [cross[:, :d].T, present.cov[:d, :d]]])
+        else:
+            x, cov, half, _ = self._tied(present)
+            ends = np.append(np.arange(d), d + self.dim * self.near.size + np.arange(d))
+            x, own = x[ends], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
+        end = space.retract(present.end, x[d:])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
-        turn = np.concatenate([by_start, space.right_jacobian(x[ends[d:]])], axis=1)
-        own = cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
+        turn = np.concatenate([by_start, space.right_jacobian(x[d:])], axis=1)
         mean = space.compose(space.retract(self.start, x[:d]), end)
         return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
+
+    def _followed(self, new: SubMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What a new sub-map says of landmarks it was given moves all about the start, of which these rows (R,) of `cov`.
+
+        They are known by it now, with all that was known before: the rest is what it was given them, Mathematics
+        (passed-on). Returns how far the rows move (R,), by what slope with the new sub-map (R, d + MD), and what is left
+        of their covariance given it.
+        """
+        assert new.given is not None
+        space, d, dim = self.space, self.space.dim, self.dim
+        _, mine, its = np.intersect1d(self.near, new.given.ids, assume_unique=True, return_indices=True)
+        columns = (d + dim * mine[:, None] + np.arange(dim)).ravel()
+        held = self._inverse_of_given
+        if held is None or held[0] is not self.cov or not np.array_equal(held[1], columns):
+            own = self.cov[np.ix_(columns, columns)] + ROUNDING * np.eye(columns.size)
+            self._inverse_of_given = held = self.cov, columns, _inverse(own)
+        gain = self.cov[np.ix_(rows, columns)] @ held[2]
+        row_of = {landmark: row for row, landmark in enumerate(new.ids.tolist())}
+        theirs = np.array([row_of[landmark] for landmark in new.given.ids[its].tolist()])
+        seen = new.points[theirs]
+        by_points = gain.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)
+        by_new = np.zeros((rows.size, len(new.cov)))
+        by_new[:, (d + dim * theirs[:, None] + np.arange(dim)).ravel()] = by_points.reshape(rows.size, -1)
+        by_new[:, :d] = by_points.reshape(rows.size, -1) @ by_frame(space, seen).reshape(-1, d)
+        moved = gain @ (space.transform(new.end, seen) - self.points[mine]).ravel()
+        return moved, by_new, self.cov[np.ix_(rows, rows)] - gain @ self.cov[np.ix_(columns, rows)]
+
+    def brought_back(self, ids: np.ndarray, present: SubMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Landmarks (K,) about the start, as seen from the end of the present sub-map (K, D).
+
+        And by what slope (KD, d + MD) they move with its end and points, and the covariance that is left given these.
+        """
+        space, d, dim = self.space, self.space.dim, self.dim
+        row_of = {landmark: row for row, landmark in enumerate(self.near.tolist())}
+        at = np.array([row_of[landmark] for landmark in ids.tolist()])
+        moved, by_new, rest = self._followed(present, (d + dim * at[:, None] + np.arange(dim)).ravel())
+        seen = space.inverse_transform(present.end, self.points[at] + moved.reshape(-1, dim))
+        turn = np.kron(np.eye(at.size), space.rotation(present.end).T)
+        slope = turn @ by_new
+        slope[:, :d] -= by_frame(space, seen).reshape(-1, d)
+        return seen, slope, turn @ gaussian.symmetrise(rest) @ turn.T
 
     def _about(self, present: SubMap) -> Beside:
         """The old landmarks about the end of the present sub-map, by all that is known."""
@@ -271,7 +340,7 @@ class SubMaps:
     @property
     def ids(self) -> np.ndarray:
         """Of all landmarks (M,)."""
-        return np.array(list(self._last), dtype=np.int64)
+        return np.array([name for name in self._last if name >= 0], dtype=np.int64)
 
     def copied(self) -> "SubMaps":
         """What is told of all of them is solved for in a copy: to be asked changes nothing."""
@@ -294,7 +363,7 @@ class SubMaps:
         names, places, covs = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
         for number, (each, factor) in enumerate(zip(self.maps, solution.factors, strict=True)):
             # Of the landmarks that this sub-map is the last to hold, given those solved for, with its start and end.
-            mine = np.flatnonzero([self._last[name][0] == number for name in each.ids.tolist()])
+            mine = np.flatnonzero([name >= 0 and self._last[name][0] == number for name in each.ids.tolist()])
             if not mine.size:
                 continue
             theirs = d + dim * mine[:, None] + np.arange(dim)
@@ -326,8 +395,15 @@ class SubMaps:
         prior = np.concatenate([np.zeros(d), self.points.ravel(), np.zeros(d), new.points.ravel()])
         of_mine = d + dim * mine[:, None] + np.arange(dim)
         of_its = first + d + dim * its[:, None] + np.arange(dim)
+        if new.given is not None:
+            moved, by_new, rest = self._followed(new, np.arange(first))
+            prior[:first] += moved
+            cov[:first, first:] = cross = by_new @ new.cov
+            cov[first:, :first], cov[:first, :first] = cross.T, gaussian.symmetrise(rest + cross @ by_new.T)
+            fresh = ~np.isin(new.ids[its], new.given.ids)
+            of_mine, of_its = of_mine[fresh], of_its[fresh]
         x, half, turned = prior, np.zeros((0, size)), slice(first, first + d)
-        for _ in range(ITERATIONS if mine.size else 0):
+        for _ in range(ITERATIONS if of_mine.size else 0):
             # 0 = l − E Exp(ε) l′ for each landmark l that is l′ in the new one, which ends at E Exp(ε).
             end, seen = space.retract(new.end, x[turned]), x[of_its]
             rotation = space.rotation(end)
@@ -360,6 +436,7 @@ class SubMaps:
         others = np.setdiff1d(np.arange(self.near.size), mine)
         seen = space.inverse_transform(end, x[d:first].reshape(-1, dim)[others])
         kept = np.sort(np.argsort(np.linalg.norm(seen, axis=1), kind="stable")[: max(self.most - new.ids.size, 0)])
+        kept = kept[self.near[others[kept]] >= 0]
         others, seen = others[kept], seen[kept]
         by_end = space.right_jacobian(x[turned])
         turn = np.zeros((second + dim * others.size, size))
@@ -373,6 +450,7 @@ class SubMaps:
         self.points = np.concatenate([x[first + d :].reshape(-1, dim), seen])
         self.cov = gaussian.symmetrise(turn @ (cov - half.T @ half) @ turn.T)
         self.starts[-1:] = [start, space.compose(start, end)]
+        self._places = None
         self._hold(new)
 
     def _hold(self, new: SubMap) -> None:
@@ -455,8 +533,15 @@ class SubMaps:
     def _guess(self, ids: np.ndarray) -> np.ndarray:
         """Where landmarks (K,) are in the world (K, D), by the last sub-map that holds each."""
         held = np.array([self._last[landmark] for landmark in ids.tolist()], dtype=np.int64).reshape(-1, 2)
-        ends = np.array([self.starts[number + 1] for number in held[:, 0]])
-        return self.space.transform(ends, np.array([self.maps[number].points[row] for number, row in held]))
+        ends = np.array([self.starts[number + 1] for number in held[:, 0]]).reshape(-1, self.space.size)
+        points = np.array([self.maps[number].points[row] for number, row in held]).reshape(-1, self.dim)
+        return self.space.transform(ends, points)
+
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Names (M,) of all landmarks, and where in the world (M, D) the last sub-map that holds each has it."""
+        if self._places is None:
+            self._places = self.ids, self._guess(self.ids)
+        return self._places
 
     def _solve(self, ids: np.ndarray) -> _Solution:
         """Gauss-Newton over all starts and some landmarks; the others of a sub-map are left out of its factor."""
@@ -474,14 +559,26 @@ class SubMaps:
             at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
             cov = each.cov[np.ix_(own, own)]
+            if each.given is not None:
+                cov = cov + EXACT**2 * np.eye(
+                    len(cov)
+                )  # a short one may know what drives the motion exactly from its start
             if each.tied:
                 info = _information(cov, d)
             else:
                 info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
                 info[d:, d:] = _inverse(cov[d:, d:])
             parts.append((rows, at, own, columns, info))
-        where = np.concatenate([np.repeat(columns, columns.size) for *_, columns, _ in parts])
-        across = np.concatenate([np.tile(columns, columns.size) for *_, columns, _ in parts])
+        # What a sub-map was given is not its own: others say it.
+        taken = []
+        for number, each in enumerate(self.maps):
+            if each.given is not None:
+                at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
+                columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
+                taken.append((number, each.given.points, at, columns, _inverse(each.given.cov)))
+        blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
+        where = np.concatenate([np.repeat(columns, columns.size) for columns in blocks])
+        across = np.concatenate([np.tile(columns, columns.size) for columns in blocks])
         free = (where >= 0) & (across >= 0)  # the first start is where the world is
         for _ in range(ITERATIONS):
             factors, entries, gradient = list[_Factor](), list[np.ndarray](), np.zeros(size + d)
@@ -501,6 +598,15 @@ class SubMaps:
                 entries.append((half @ slope).ravel())
                 gradient[columns] += half @ residual  # columns below zero fall behind the end
                 factors.append(_Factor(own, columns, info, residual, slope))
+            for number, points, at, columns, info in taken:
+                seen = space.inverse_transform(starts[number], world[at])
+                slope = np.concatenate(
+                    [-by_frame(space, seen).reshape(-1, d), np.kron(np.eye(at.size), space.rotation(starts[number]).T)],
+                    1,
+                )
+                half = -slope.T @ info
+                entries.append((half @ slope).ravel())
+                gradient[columns] += half @ (seen - points).ravel()
             information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
             solver = splu(
                 information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
@@ -512,15 +618,17 @@ class SubMaps:
                 break
         return _Solution(ids, world, starts, factors, information, solver)
 
-    def solve(self) -> None:
-        """All of them together, linearised anew: the starts, and what is known about the last one."""
+    def solve(self, wanted: np.ndarray | None = None) -> None:
+        """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
         space, d, dim = self.space, self.space.dim, self.dim
-        ids, world, starts, _, _, solver = self._solve(self._shared())
-        self.starts = list(starts)
+        asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
+        ids, world, starts, _, _, solver = self._solve(np.union1d(self._shared(), asked))
+        self.starts, self._places = list(starts), None
         seen = space.inverse_transform(self.start, world)
-        last = np.isin(ids, self.maps[-1].ids)
+        last = np.isin(ids, self.maps[-1].ids) | np.isin(ids, asked)
         order = np.argsort(np.where(last, -1.0, np.linalg.norm(seen, axis=1)), kind="stable")
         kept = order[: max(self.most, int(last.sum()))]
+        kept = kept[last[kept] | (ids[kept] >= 0)]
         first = d * len(self.maps)
         columns = np.append(first - d + np.arange(d), first + dim * kept[:, None] + np.arange(dim))
         unit = np.zeros((first + world.size, columns.size))
@@ -535,6 +643,8 @@ class SubMaps:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All of it, for a checkpoint."""
+        none = Given(np.zeros(0, dtype=np.int64), np.zeros((0, self.dim)), np.zeros((0, 0)))
+        given = [each.given or none for each in self.maps]
         named = {
             "counts": np.array([each.ids.size for each in self.maps], dtype=np.int64),
             "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(each.ids for each in self.maps)]),
@@ -542,6 +652,10 @@ class SubMaps:
             "covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in self.maps)]),
             "ends": np.array([each.end for each in self.maps]).reshape(-1, self.space.size),
             "tied": np.array([each.tied for each in self.maps], dtype=np.int64),
+            "given": np.array([each.ids.size for each in given], dtype=np.int64),
+            "given_ids": np.concatenate([none.ids, *(each.ids for each in given)]),
+            "given_points": np.concatenate([none.points, *(each.points for each in given)]),
+            "given_covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in given)]),
             "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
         }  # fmt: skip
         named = {f"submaps/{name}": array for name, array in named.items()}
@@ -554,11 +668,14 @@ class SubMaps:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Takes up what `arrays` gave. Raises InputError: it is damaged."""
         schema = {
-            "counts": checkpoint.integers("maps", least=0), "ids": checkpoint.integers("landmarks", least=0),
+            "counts": checkpoint.integers("maps", least=0), "ids": checkpoint.integers("landmarks"),
+            "given": checkpoint.integers("maps", least=0), "given_ids": checkpoint.integers("given landmarks"),
+            "given_points": checkpoint.numbers("given landmarks", self.dim),
+            "given_covs": checkpoint.numbers("given entries"),
             "points": checkpoint.numbers("landmarks", self.dim), "covs": checkpoint.numbers("entries"),
             "ends": checkpoint.elements(self.space, "maps"), "starts": checkpoint.elements(self.space, "starts"),
             "tied": checkpoint.integers("maps", least=0, below=2),
-            "near": checkpoint.integers("near", least=0), "near_points": checkpoint.numbers("near", self.dim),
+            "near": checkpoint.integers("near"), "near_points": checkpoint.numbers("near", self.dim),
             "near_cov": checkpoint.numbers("size", "size"),
         }  # fmt: skip
         found = checkpoint.read(arrays, schema, "submaps/")
@@ -567,18 +684,26 @@ class SubMaps:
         ids = checkpoint.split(found["ids"], counts, "submaps/ids")
         points = checkpoint.split(found["points"], counts, "submaps/points")
         covs = checkpoint.split(found["covs"], [size * size for size in sizes], "submaps/covs")
+        known = found["given"].tolist()
+        given = zip(
+            checkpoint.split(found["given_ids"], known, "submaps/given_ids"),
+            checkpoint.split(found["given_points"], known, "submaps/given_points"),
+            checkpoint.split(found["given_covs"], [(self.dim * k) ** 2 for k in known], "submaps/given_covs"),
+            strict=True,
+        )
         if (
             len(found["starts"]) != len(counts) + 1
             or len(found["near_cov"]) != self.space.dim + found["near_points"].size
         ):
             raise InputError("the arrays submaps/starts and submaps/near_cov do not fit the sub-maps")
         self.maps, self._last = [], {}
-        for end, names, places, cov, size, tied in zip(
-            found["ends"], ids, points, covs, sizes, found["tied"].tolist(), strict=True
+        for end, names, places, cov, size, tied, (others, before, prior) in zip(
+            found["ends"], ids, points, covs, sizes, found["tied"].tolist(), given, strict=True
         ):
-            if np.unique(names).size < names.size:
-                raise InputError("the array submaps/ids names a landmark twice in a sub-map")
-            self._hold(SubMap(end, names, places, cov.reshape(size, size), bool(tied)))
+            if np.unique(names).size < names.size or not np.isin(others, names).all():
+                raise InputError("the arrays submaps/ids and submaps/given_ids name a landmark twice in a sub-map")
+            own = Given(others, before, prior.reshape(before.size, before.size)) if others.size else None
+            self._hold(SubMap(end, names, places, cov.reshape(size, size), bool(tied), own))
         if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
             raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
         self.starts, self.near = list(found["starts"]), found["near"]

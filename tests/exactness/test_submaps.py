@@ -8,6 +8,7 @@ import pytest
 
 from rbpf import RangeBearingConfig, RangeBearingSlam
 from rbpf.core.filter import Filter
+from rbpf.core.models import Part
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
@@ -17,9 +18,11 @@ from rbpf.maps.submaps import SubMap, SubMaps
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.exactness.models import Relative
-from tests.exactness.slam import NOISE, STEP, Q, Walk
+from tests.exactness.slam import DRIFTING, NOISE, STEP, Q, Walk
 
 RING = 80
+START = np.array([2.0, 0.5]), np.eye(2)
+"""A velocity."""
 
 
 class Reading:
@@ -187,9 +190,31 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
     assert np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov), error).mean() < 6.0
 
 
-def test_what_ties_sub_maps_is_refused():
-    with pytest.raises(InputError, match="sub-maps take no substate"):
-        JointMap(SE2, (np.zeros(3), np.eye(3)), submap=10)
+@pytest.mark.parametrize("most", [3, 50])
+def test_what_goes_over_is_known_as_in_one_gaussian(most):
+    """Of a velocity and landmarks out of view that come back, from near and, of the smaller, by a solution of all."""
+    readings, (whole, submaps) = walk(20)[0], (JointMap(Euclidean(2), START, submap=n) for n in (None, most))
+    options = {"n": 10, "lag": 1, "consolidation": Consolidation(1)}
+    filters = [
+        Filter(DRIFTING, NamedLandmarkSensor(Relative(), Point(2)), each, rng=np.random.default_rng(0), **options)
+        for each in (whole, submaps)
+    ]
+    for t, reading in enumerate(readings):
+        following = readings[min(t + 1, len(readings) - 1)].landmarks
+        if t % 3 == 2:
+            submaps.put_away(np.setdiff1d(submaps.ids, np.append(reading.landmarks, following)))
+        submaps.bring_back(following[~submaps.holds(following)])
+        for filter_ in filters:
+            filter_.step(reading)
+    told = []
+    for filter_ in filters:
+        belief = filter_.belief()
+        ids, places, covs = belief.map.landmarks(filter_.particles)
+        order = np.argsort(ids)
+        told += [[ids[order], places[order], covs[order], *belief.moments(Part.STATE), *belief.moments(Part.SUBSTATE)]]
+    assert len(submaps.old.maps) > 5 and submaps.cov.shape[0] < whole.cov.shape[0] / 2
+    for one, other in zip(*told, strict=True):
+        np.testing.assert_allclose(other, one, atol=3e-6)
 
 
 def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():

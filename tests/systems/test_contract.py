@@ -9,6 +9,7 @@ import pytest
 
 from examples.studies.hypotheses import corridor
 from examples.studies.image_faults import blur_motion
+from examples.studies.point_worlds import MONO, Measuring, RoomWorld, simulate_features
 from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
 from rbpf.lie import SE2
@@ -28,6 +29,8 @@ from tests.systems.stereo_sequences import errors_m, flat, missing, pairs
 
 pytestmark = pytest.mark.usefixtures("keypoints_once")
 KNOWN, LOG, DARK = known_points(), desk(2, frames=8), np.zeros((240, 320), dtype=np.uint8)
+ROOM = simulate_features(RoomWorld(frames=24, laps=0.15, points=120), Measuring(), MONO, 0)
+"""A way along a wall: points leave the view."""
 LOST = {TrackingState.TRACKED, TrackingState.LOST}
 
 
@@ -100,6 +103,12 @@ RESUMED = {
         lambda: MonoSlam(LOG.camera, replace(SMALL, start=StartConfig(first_adjustment=4))),
         lambda: without_known(LOG).frames,
         (0, 2, 3, 5),
+    ),
+    "named, sub-maps": Case(
+        lambda: MonoSlam(ROOM.camera, replace(SMALL, map="joint", settled_frames=1, submap=16), ROOM.known),
+        lambda: ROOM.frames,
+        (12, 15, 18),
+        joint=True,
     ),
     "pairs": Case(
         stereo, lambda: list(pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames()), (0, 5, 6, 9)

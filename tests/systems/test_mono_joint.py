@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, RoomWorld, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -82,22 +82,32 @@ def test_it_is_honest_where_the_baseline_was_hardly_known():
     assert 0.5 < np.mean(scores) < 2.0 and max(off) < 0.03
 
 
-def test_the_oldest_features_make_room():
-    slam = MonoSlam(CAMERA, replace(JOINT, active=20, particles=20, starting_particles=20), None)
-    for frame in sequence(40).frames():
+def test_features_of_old_sub_maps_are_found_again():
+    """What is put away is in the map all the time, and is looked for and found as it is in view."""
+    slam = MonoSlam(CAMERA, replace(JOINT, particles=20, starting_particles=20), None)
+    gone, held, found = np.arange(6), [], []
+    for t, frame in enumerate(sequence(40).frames()):
+        if t == 30:
+            slam.joint.put_away(gone)
         slam.take(frame)
-    held = slam.filter.belief().map.ids
-    assert slam.joint is not None and 15 <= held.size <= 28
-    np.testing.assert_array_equal(np.sort(held), np.flatnonzero(slam.sensor.table.alive))
+        if t >= 30:
+            held.append(slam.joint.holds(gone).any())
+            found.append(slam.sensor.table.found[gone].sum())
+        if t == 31:
+            assert np.isin(gone, slam.map().ids).all()
+    assert not all(held) and held[-1] and found[-1] >= found[0] + gone.size
 
 
-def test_the_oldest_names_make_room():
-    log, sizes = desk(3, frames=60), []
-    for most in (300, 14):
-        run = filter_features(log, replace(JOINT, active=most))
-        assert run.system.joint is not None
-        sizes.append((run.log["points"] + run.log["rays"])[-20:].max())
-    assert sizes[1] <= 14 < sizes[0]
+@pytest.mark.slow
+def test_a_loop_closes_on_landmarks_of_old_sub_maps():
+    """Once round a room, until the first landmarks are seen again: as good and as sure of itself as one Gaussian of all."""
+    log = simulate_features(RoomWorld(frames=300, laps=1.3, points=300), Measuring(), MONO, 0)
+    whole, submaps = (filter_features(log, MonoConfig(submap=most)) for most in (3000, 80))
+    assert len(submaps.system.joint.old.maps) > 2 and submaps.log["points"].max() < whole.log["points"].max() / 2
+    off = [np.linalg.norm(errors(run)[:, 3:], axis=1) for run in (whole, submaps)]
+    assert off[1][-40:].mean() < 1.5 * off[0][-40:].mean() + 0.01
+    assert nees(submaps).mean() < 1.2 * nees(whole).mean()
+    assert set(submaps.system.map().ids) == set(whole.system.map().ids)
 
 
 def test_what_is_refused():

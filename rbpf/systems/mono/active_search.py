@@ -155,15 +155,8 @@ class ActiveSearch:
 
     def choose(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (K,) of features worth looking for from a pose, spread over the image; places (V, 2) of all in view."""
-        from rbpf.sensors.camera.kernels import in_view
-
         table, camera, config = self.table, self.features.camera, self.config
-        of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)
-        limits = np.array([*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float)
-        rows, px = np.empty(len(table), dtype=np.int64), np.empty((len(table), 2))
-        columns = (table.position, table.first_pose, table.alive)
-        count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
-        rows, px = rows[:count], px[:count]
+        rows, px = self.in_view(pose, table.alive)
 
         # From each cell of the image the best one, then from each the second best, and so on.
         size = np.array([camera.width, camera.height])
@@ -175,6 +168,18 @@ class ActiveSearch:
         rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))
         best_first = order[np.lexsort((-worth[order], rank))]
         return np.asarray(rows[best_first[: config.measurements]]), px
+
+    def in_view(self, pose: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (V,) of features `among` (F,) bool that should be seen from a pose, not too differently; places (V, 2)."""
+        from rbpf.sensors.camera.kernels import in_view
+
+        table, camera, config = self.table, self.features.camera, self.config
+        of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)
+        limits = np.array([*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float)
+        rows, px = np.empty(len(table), dtype=np.int64), np.empty((len(table), 2))
+        columns = (table.position, table.first_pose, among)
+        count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
+        return rows[:count], px[:count]
 
     def templates(self, rows: np.ndarray, patches: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Templates of features (K,) as they look from a pose, of patches (F, S, S) that were seen from poses (F, 7)."""

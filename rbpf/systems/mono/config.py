@@ -191,9 +191,9 @@ class MonoConfig(Ranged):
     starting_particles: Count = 250
     #: … until half of the depths in view were known in so many frames in a row.
     settled_frames: Count = 30
-    #: of a joint map: landmarks held, at most; of those not looked for the ones that were found least often are dropped, of
-    #: named features the oldest.
-    active: Count = 300
+    #: of a joint map: landmarks beyond which a sub-map ends; those in view, and others up to half of these, go over into the
+    #: next one, and old ones come back when they are in view. No point is dropped; rays that are left behind are.
+    submap: Annotated[Count, Formerly("active")] = 300
     #: of a joint map: the camera calibrates itself, its focal lengths, k1 and k2 being estimated with everything else.
     calibrate: Literal["off", "online"] = "off"
     #: landmarks started in one frame at most.

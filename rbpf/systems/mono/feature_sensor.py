@@ -17,13 +17,14 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.maps.rows import BOTH, MAP, STATE
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
-from rbpf.sensors.landmark_management import surplus
 from rbpf.systems.mono.config import InverseDepthConfig
+from rbpf.systems.mono.feature_table import directions
 
 MIN_DEPTHS = 4
 """Depths that must be known in view for new features to start at them."""
@@ -203,12 +204,12 @@ class FeatureSensor(Sensor):
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
         self.most: int | None = None
-        """Landmarks that a joint map may hold, in which nothing is updated without the state; None where it is none."""
+        """Landmarks of a joint map's sub-map, in which nothing is updated without the state; None where it is none."""
         self.point = CameraPoint(camera)
         self._take_group(group)
 
     def become_joint(self, unknown_depth: UnknownDepth, most: int) -> None:
-        """From now on the map is a joint one, which holds the known points one by one, and `most` landmarks in all."""
+        """From now on the map is a joint one, which holds the known points one by one, in sub-maps of `most` landmarks."""
         self.unknown_depth, self.most = unknown_depth, most
         self._take_group(None)
 
@@ -253,17 +254,44 @@ class FeatureSensor(Sensor):
     def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """As `start`; in a joint map that is full the oldest features that are not seen make room."""
+        """As `start`; a joint map that is full puts features away, and brings those back whose names are seen."""
         started = self.start(frame, belief, observed)
-        if self.most is not None:
-            held, new = belief.map.ids, sum(len(group.z) for group in started)
-            belief.map.remove(surplus(held, np.arange(held.size), frame.landmarks, self.most - new))
+        self.make_room(belief, frame.landmarks)
         return started
+
+    def make_room(self, belief: Belief, seen: np.ndarray) -> np.ndarray:
+        """Names (K,) that a joint map does not look for any more: points are put away, rays are dropped.
+
+        Where it holds more than `most` it is what is out of view, the farthest first, until half of these are left, if
+        that is worth a sub-map.
+        """
+        joint = belief.map
+        if self.most is None or not isinstance(joint, JointMap):
+            return np.zeros(0, dtype=np.int64)
+        held = np.setdiff1d(joint.ids, joint.leaving)
+        if held.size <= self.most:
+            return held[:0]
+        others = np.setdiff1d(held, seen)
+        which, position = self.positions(belief, others)
+        direction = directions(position, self.pose(belief))
+        others, direction = (each[~self.camera.visible(direction)] for each in (others[which], direction))
+        if others.size < self.most // 4:
+            return others[:0]
+        order = np.argsort(direction[:, 2] / np.linalg.norm(direction, axis=1), kind="stable")
+        away = others[order[: held.size - self.most // 2]]
+        points = joint.are(away, Point(3))
+        joint.put_away(away[points])
+        joint.remove(away[~points])
+        return away
 
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """Turns features whose depth is known by now into points; starts one for every new name."""
         belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
         is_new = (self.members(frame.landmarks) < 0) & ~belief.map.holds(frame.landmarks)
+        if isinstance(belief.map, JointMap):
+            is_old = is_new & np.isin(frame.landmarks, belief.map.old.ids)
+            belief.map.bring_back(frame.landmarks[is_old])
+            is_new &= ~is_old
         new = np.flatnonzero(is_new & self.camera.inside(frame.z))
         new = new[np.isfinite(self.camera.unproject(frame.z[new])).all(axis=-1)][: self.max_new_per_frame]
         if not new.size:

@@ -10,6 +10,7 @@ import numpy as np
 from rbpf.core.checkpoint import grey, integers, numbers, poses, read, truths
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
+from rbpf.systems.mono.config import SearchConfig
 
 PATCH_HALF_PX = 15
 """The patch that is kept of an appearance reaches this far from its centre: enough to be turned and shrunk."""
@@ -83,6 +84,11 @@ class FeatureTable:
         self.attempts[rows] += 1
         self.found[rows] += found
         self.missed[rows] = np.where(found, 0, self.missed[rows] + 1)
+
+    def failing(self, rows: np.ndarray, config: SearchConfig) -> np.ndarray:
+        """Which features (k,) are not found too often."""
+        missed_often = 1.0 - self.found[rows] / self.attempts[rows] > config.max_failure_ratio
+        return np.asarray(missed_often & (self.attempts[rows] >= config.min_attempts))
 
     def found_fraction(self, rows: np.ndarray) -> np.ndarray:
         """Fraction (k,) of attempts that find features (k,), as expected after those so far (P. Laplace)."""

@@ -11,11 +11,11 @@ from rbpf.core.checkpoint import grey, integers, read, read_one, truths
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.joint_map import JointMap
 from rbpf.maps.rows import MAP
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
-from rbpf.sensors.landmark_management import surplus
 from rbpf.sensors.patches.search import cut
 from rbpf.systems.mono.active_search import ActiveSearch, OutlierGate, SearchResult
 from rbpf.systems.mono.config import SearchConfig
@@ -179,6 +179,8 @@ class ImageSensor(Sensor):
     def observe(self, frame: Measurement, belief: Belief) -> Sequence[Observations]:
         """What is found of the features that should be seen."""
         started = time.perf_counter()
+        if self.features.most is not None:
+            self._follow_sub_maps(belief)
         if frame.known_px is not None:
             rows, px = np.arange(frame.known_px.shape[0]), frame.known_px
             frame.used = self._features(frame.stamp_ns, rows, px)
@@ -216,8 +218,7 @@ class ImageSensor(Sensor):
         if rows.size and not self.bad_frames:
             table.count_search(rows, frame.search.found)
             if not self.features.fixed:
-                missed_often = 1.0 - table.found[rows] / table.attempts[rows] > config.max_failure_ratio
-                failing = rows[missed_often & (table.attempts[rows] >= config.min_attempts)]
+                failing = rows[table.failing(rows, config)]
                 table.alive[failing] = False
                 failing = failing[table.member[failing] < 0]
         self.place(belief, frame.used.landmarks)
@@ -231,15 +232,28 @@ class ImageSensor(Sensor):
             const = None if records.const is None else records.const[0]
             x, w = self.features.unknown_depth.model.world_point(records.mean[0], const)
             self.table.position[group.ids] = np.concatenate([x, w], axis=-1)
-        if self.features.most is not None:
-            held, most = belief.map.ids, self.features.most - frame.started.landmarks.size
-            held = held[table.alive[held]]
-            dropped = surplus(held, table.found[held], rows, most)
-            table.alive[dropped] = False
-            failing = np.append(failing, dropped)
         self.features.remove(belief, failing)
+        table.alive[self.features.make_room(belief, frame.features.landmarks)] = False
         frame.seconds_new_landmarks = time.perf_counter() - started
         return new_landmarks
+
+    def _follow_sub_maps(self, belief: Belief) -> None:
+        """Looks for what a joint map holds; asks it for old points that should be in view."""
+        joint, table = belief.map, self.table
+        assert isinstance(joint, JointMap) and self.features.most is not None
+        held = joint.ids
+        table.alive[:] = False
+        table.alive[held] = True
+        table.alive[joint.leaving] = False
+        old, places = joint.old.places()
+        if not old.size or self.bad_frames:
+            return
+        away = ~joint.holds(old)
+        table.position[old[away]] = np.insert(places[away], 3, 1.0, axis=1)
+        wanted = np.zeros(len(table), dtype=bool)
+        wanted[old[away & ~table.failing(old, self.config)]] = True
+        rows, _ = self.search.in_view(self.features.pose(belief), wanted)
+        joint.bring_back(rows[: max(min(self.features.most // 4, 2 * self.features.most - held.size), 0)])
 
     def resampled(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
         """Remembers where all features are and were seen first, after the particles were resampled from a batch posterior.

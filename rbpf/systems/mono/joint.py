@@ -226,7 +226,7 @@ class HandOver:
         config = self.config
         constants = 0 if self.first is None else len(NUMBERS)
         variances = np.pad(config.velocity.start_std() ** 2, (0, constants))
-        joint = JointMap(SE3, (np.zeros(variances.size), np.diag(variances)), config.compiled)
+        joint = JointMap(SE3, (np.zeros(variances.size), np.diag(variances)), config.compiled, config.submap)
         joint.register(rays.landmark)
         consolidation = Consolidation(config.window, config.resampling.ess_threshold)
         return Filter(
@@ -238,7 +238,7 @@ class HandOver:
         joint = filter_.belief().map
         assert isinstance(joint, JointMap)
         self.joint = joint
-        sensor.features.become_joint(rays, self.config.active)
+        sensor.features.become_joint(rays, self.config.submap)
         return filter_
 
 

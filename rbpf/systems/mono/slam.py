@@ -429,7 +429,10 @@ class MonoSlam(System):
         It has the points that are still held and whose depth is known, with how they look.
         """
         found, table, world = self.map(), self.sensor.table, world_of(self.filter)
-        kept = np.flatnonzero(~found.is_ray() & table.alive[found.ids])
+        is_lasting = table.alive[found.ids]
+        if self.joint is not None:
+            is_lasting |= ~table.failing(found.ids, self.config.search)
+        kept = np.flatnonzero(~found.is_ray() & is_lasting)
         rows, positions = found.ids[kept], found.mean[kept]
         first = table.first_pose[rows]
         if world is not None:
