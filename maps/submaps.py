@@ -120,6 +120,7 @@ class _Solution(NamedTuple):
     factors: list[_Factor]
     information: sparse.csc_matrix
     solver: SuperLU
+    is_whole: bool  #: is a minimum of all that is known, and nothing counts twice.
 
     def covariance(self) -> sparse.csr_matrix:
         """The entries of the inverse that belong together in a factor, and more, at the work of factoring."""
@@ -543,8 +544,11 @@ class SubMaps:
             self._places = self.ids, self._guess(self.ids)
         return self._places
 
-    def _solve(self, ids: np.ndarray) -> _Solution:
-        """Gauss-Newton over all starts and some landmarks; the others of a sub-map are left out of its factor."""
+    def _solve(self, ids: np.ndarray, is_whole: bool = True) -> _Solution:
+        """Gauss-Newton over all starts and some landmarks; the others of a sub-map are left out of its factor.
+
+        What sub-maps were given is taken off. Where that leaves no minimum, as when a filter has diverged, it is not.
+        """
         space, d, dim = self.space, self.space.dim, self.dim
         world, starts = self._guess(ids), np.array(self.starts)
         place = {landmark: row for row, landmark in enumerate(ids.tolist())}
@@ -572,7 +576,7 @@ class SubMaps:
         # What a sub-map was given is not its own: others say it.
         taken = []
         for number, each in enumerate(self.maps):
-            if each.given is not None:
+            if each.given is not None and is_whole:
                 at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
                 columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
                 taken.append((number, each.given.points, at, columns, _inverse(each.given.cov)))
@@ -611,18 +615,22 @@ class SubMaps:
             solver = splu(
                 information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
             )
+            if taken and not solver.U.diagonal().min() > 0.0:
+                return self._solve(ids, is_whole=False)
             step = -solver.solve(gradient[:size])
             starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
             world += step[first:].reshape(-1, dim)
             if np.abs(step).max() < CLOSE_ENOUGH:
                 break
-        return _Solution(ids, world, starts, factors, information, solver)
+        return _Solution(ids, world, starts, factors, information, solver, is_whole)
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
         space, d, dim = self.space, self.space.dim, self.dim
         asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
-        ids, world, starts, _, _, solver = self._solve(np.union1d(self._shared(), asked))
+        ids, world, starts, _, _, solver, is_whole = self._solve(np.union1d(self._shared(), asked))
+        if not is_whole:
+            return
         self.starts, self._places = list(starts), None
         seen = space.inverse_transform(self.start, world)
         last = np.isin(ids, self.maps[-1].ids) | np.isin(ids, asked)

@@ -14,7 +14,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
-from rbpf.maps.submaps import SubMap, SubMaps
+from rbpf.maps.submaps import Given, SubMap, SubMaps
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.exactness.models import Relative
@@ -234,3 +234,18 @@ def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
         damaged = {key: wrong(array) if key.endswith("/" + name) else array for key, array in maps.arrays().items()}
         with pytest.raises(InputError, match="submaps/"):
             SubMaps(SE2, 2, 10).restore(damaged)
+
+
+def test_what_was_given_and_cannot_be_taken_off_stays():
+    """As when a filter has diverged: what was known before says more than sub-maps do with it."""
+    finished, *_ = ring(SE2, 0)
+    maps = SubMaps(SE2, 2, RING)
+    for each in finished[:5]:
+        maps.join(each)
+    start, cov = maps.start, maps.cov
+    known = Given(maps.near[:3], maps.points[:3], 1e-8 * np.eye(6))
+    maps.maps[3] = maps.maps[3]._replace(given=known)
+    maps.solve()
+    np.testing.assert_array_equal(maps.start, start)
+    np.testing.assert_array_equal(maps.cov, cov)
+    assert np.linalg.eigvalsh(maps.landmarks()[2]).min() > 0.0
