@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.files import write_text
+from rbpf.sensors.readers.images.poses import normalised
 from rbpf.sensors.readers.text import read_columns
 
 MAX_DIFFERENCE_NS = 10_000_000
@@ -183,21 +184,14 @@ def _checked(estimate_points: ArrayLike, reference_points: ArrayLike) -> tuple[A
 
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-UNIT_TOLERANCE = 0.01  # files print few digits; more than this is no rotation
 NS_PER_S = 1_000_000_000
 
 
 def read_tum(path: Path) -> Trajectory:
     """Trajectory of a file in TUM format; quaternions are scaled to unit length. An InputError names file and line."""
     table = read_columns(path, TUM_COLUMNS, "a trajectory in TUM format")
-    quat_xyzw = table.block("qx", "qw")
-    length = np.sqrt(np.square(quat_xyzw).sum(1))
-    wrong = np.abs(length - 1.0) > UNIT_TOLERANCE
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise table.error(row, f"expected a quaternion qx qy qz qw of length 1, found length {length[row]:.6g}")
-    poses = np.concatenate([quat_xyzw, table.block("tx", "tz")], axis=1)
-    return Trajectory(table.stamps_ns(), SE3.normalise(poses))
+    poses = normalised(np.hstack([table.block("qx", "qw"), table.block("tx", "tz")]), table.error)
+    return Trajectory(table.stamps_ns(), poses)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

@@ -82,7 +82,7 @@ wheels | odometry.yaml | 1 | other: 1 | expected the keys robot_from_camera, fou
 wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 2, 0, 0, 0] | expected robot_from_camera to begin with a unit
 path | path.tum | 3 | 0.6 1 2 3 0 0 1 | expected 8 columns (timestamp, tx, ty, tz, qx, qy, qz, qw), found 7
 path | path.tum | 3 | 0.6 1 2 x 0 0 0 1 | expected tz to be a finite number, found 'x'
-path | path.tum | 2 | 0.5 1 2 3 0 0 0 0.9 | expected a quaternion qx qy qz qw of length 1, found length 0.9
+path | path.tum | 2 | 0.5 1 2 3 0 0 0 0.9 | expected a quaternion of length 1, found one of length 0.9
 path | path.tum | 3 | 0.25 1 2 3 0 0 0 1 | time runs backwards from 0.5 to 0.25
 relations | some.relations | 2 | 0 1 1 0 0 0 0 | expected 8 columns (t1, t2, x, y, z, roll, pitch, yaw), found 7
 relations | some.relations | 2 | 0 5e9 1 0 0 0 0 0 | expected the time in seconds
