@@ -266,7 +266,7 @@ def hand_over(old: Filter, features: FeatureSensor, rays: JointRays, new: Filter
     # The velocity; and the known points, in whose frame the world is.
     velocity = old.marginals.parts[Part.SUBSTATE]
     assert isinstance(velocity, KalmanSubstate)
-    means, covs = velocity.mean[chosen], take(velocity.cov, chosen).mean(axis=0)
+    means, covs = velocity.mean[chosen], take(velocity.cov, chosen)
     held = joint.driving()
     assert held is not None
     first = 6 + held.shape[1]  # numbers beside the velocity are left as they are, and certain
