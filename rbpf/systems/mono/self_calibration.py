@@ -40,7 +40,7 @@ NUMBERS = "fx", "fy", "k1", "k2"
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class FirstAdjustment:
     """The first frames, adjusted together with the camera."""
 
     best: Optimum
@@ -51,7 +51,7 @@ class Adjusted:
 
 def adjusted(
     first: FirstFrames, filter_: Filter, features: FeatureSensor, config: MonoConfig, given: KnownPoints | None
-) -> Adjusted | None:
+) -> FirstAdjustment | None:
     """The optimum downhill from where the particles are; None where the frames have too little in common."""
     belief = filter_.belief()
 
@@ -77,10 +77,12 @@ def adjusted(
     best = optimum(seen, config, start)
     if not (np.isfinite(best.cost) and np.isfinite(best.information).all()):
         return None
-    return Adjusted(best, names, is_known, seen.stamps_ns)
+    return FirstAdjustment(best, names, is_known, seen.stamps_ns)
 
 
-def begin(found: Adjusted, new: Filter, rays: InverseDepth, config: MonoConfig, stamps_ns: np.ndarray) -> Revision:
+def begin(
+    found: FirstAdjustment, new: Filter, rays: InverseDepth, config: MonoConfig, stamps_ns: np.ndarray
+) -> Revision:
     """Gives a filter on an empty joint map the Gaussian about an optimum; returns what the path was at stamps (T,).
 
     The frame is the last camera. What is known well enough is a point in it, all else a ray from there.
