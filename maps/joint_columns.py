@@ -112,8 +112,8 @@ class JointColumns:
     def of_one_kind(self, ids: np.ndarray) -> Kind:
         """Landmarks (K,) of one kind, in their order. Raises InputError: the map does not hold one, or their kinds differ."""
         rows = self.rows_of(ids)
-        kinds = np.unique(self.table.kind[rows])
-        if kinds.size > 1:
+        kinds = self.table.kind[rows]
+        if (kinds != kinds[:1]).any():
             raise InputError("a joint map is asked for landmarks of one parametrisation at a time: see `landmark_of`")
         return self._of_kind(int(kinds[0]) if kinds.size else 0, rows)
 

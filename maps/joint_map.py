@@ -25,7 +25,6 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
-from rbpf.core.linearisation import linearise
 from rbpf.core.models import (
     Belief,
     Jacobians,
@@ -44,8 +43,8 @@ from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 from rbpf.maps.joint_columns import JointColumns, by_frame
 from rbpf.maps.joint_rows import (
-    Given,
     Group,
+    Reading,
     Rows,
     apart,
     diagonal_blocks,
@@ -56,11 +55,13 @@ from rbpf.maps.joint_rows import (
     turned,
 )
 from rbpf.maps.point import Point
-from rbpf.maps.rows import checked_new_ids, expected, first_records, projected
+from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations, projected
 from rbpf.maps.submaps import SubMap, SubMaps
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
+SINGULAR = 1e-15
+"""Fraction of the largest variance of an increment below which another one is none."""
 
 
 @final
@@ -148,6 +149,7 @@ class JointMap(Map):
         self.held = JointColumns(self.space, self._first, self.held.kinds)
         self._in_step = False  # from prediction to correction: what is observed is associated with what is held
         self._gain: np.ndarray | None = None
+        self._reading: Reading | None = None  # of what is observed in this step
 
     def driving(self) -> np.ndarray | None:
         return self.mean[:, self.space.dim : self._first] if self._first > self.space.dim else None
@@ -180,8 +182,11 @@ class JointMap(Map):
         cov[:, here] = cov[:, here] @ A.T
         cov[here, here] += noise[d:, d:]
         cross[here] = A @ cross[here] + noise[d:, :d]
-        self._gain = cross @ np.linalg.pinv(increment, hermitian=True)
-        self._rest = gaussian.symmetrise(cov - self._gain @ increment @ self._gain.T)
+        values, vectors = np.linalg.eigh(increment)
+        known = values > SINGULAR * values[-1]
+        root = vectors[:, known] / np.sqrt(values[known])
+        half = cross @ root
+        self._gain, self._rest = half @ root.T, plus_gram(cov, half.T, -1.0)
         factor = gaussian.psd_factor(increment)[None]
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
@@ -205,13 +210,12 @@ class JointMap(Map):
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
-        given = self._given(state, increment)
-        self.mean, self.cov = given.mean, given.cov
+        self.mean, self.cov = self._given(increment)
         self._gain, self._in_step = None, False
         if not groups:
             return LogDensities(np.zeros(self.n), np.zeros(self.n))
-        total, moves, self.cov = given.rows(groups).update(self.cov)
-        self.mean = self.mean + moves
+        total, moves, self.cov = self._rows(state, self.mean, self.cov, groups).update(self.cov)
+        self.mean, self._reading = self.mean + moves, None
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
@@ -412,17 +416,21 @@ class JointMap(Map):
         frame = weighted_mean(self.mean[:, : self.space.dim], particles.weights)
         return self.space.adjoint(self.space.inverse(centre)) @ self.space.right_jacobian(frame)
 
-    def _given(self, state: np.ndarray, increment: np.ndarray | None) -> Given:
-        """What is held given states and increments (N, d), through which a substate has been seen."""
-        mean, cov = self.mean, self.cov
-        if self._gain is not None and increment is not None:
-            mean, cov = self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
-        return Given(self.held, self.origin if self.submap is None else None, self.compiled, state, mean, cov)
+    def _given(self, increment: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Means (N, n) given increments (N, d), and the covariance; a substate has been seen through the increment."""
+        if self._gain is None or increment is None:
+            return self.mean, self.cov
+        return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
+
+    def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
+        if self._reading is None or not self._reading.is_of(self.held, cov, groups):
+            self._reading = Reading(self.held, cov, groups)
+        return self._reading.rows(groups, state, mean, self.origin if self.submap is None else None, self.compiled)
 
     def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Rows:
         """The rows at predicted states; what has been seen through the increment of a substate moves with the state."""
         increment = None if self._gain is None else self.space.local(prior.base, state)
-        rows = self._given(state, increment).rows(groups)
+        rows = self._rows(state, *self._given(increment), groups)
         if increment is None or self._gain is None:
             return rows
         return rows.moving(self._gain, self.space.right_jacobian_inverse(increment))
@@ -431,7 +439,8 @@ class JointMap(Map):
         """Mean (R,) and covariance (R, R) of the innovations under all particles, and whose rows they are."""
         prior, weights = belief.prior, belief.weights
         rows = self._seen_through(belief.state, groups, prior)
-        spread = np.einsum("n,nra->ra", weights, rows.by_state @ prior.spread(prior.mean))
+        by_state = np.swapaxes(rows.said[:, 1:], 1, 2)
+        spread = np.einsum("n,nra->ra", weights, by_state @ prior.spread(prior.mean))
         nu = weighted_mean(rows.nu, weights)
         apart = rows.nu - nu
         return nu, rows.cov + spread @ spread.T + multiplied((weights[:, None] * apart).T, apart), rows.groups
@@ -540,7 +549,8 @@ class JointMap(Map):
         self.held.kinds.append(landmark)
 
     def remove(self, ids: np.ndarray) -> None:
-        self._keep(self.held.drop(self.held.rows_of(ids)))
+        if len(ids):
+            self._keep(self.held.drop(self.held.rows_of(ids)))
 
     def _keep(self, columns: np.ndarray) -> None:
         self.mean, self.cov = self.mean[:, columns], self.cov.take(columns, axis=0).take(columns, axis=1)
@@ -585,19 +595,16 @@ class JointMap(Map):
     def innovations(
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
-        records = self.read(ids, slice(particle, particle + 1))
-        const = None if records.const is None else records.const[0]
-        nu, jac = linearise(model, self.space, z, state[None], records.mean[0], const)
-        return nu, jac, records
+        return innovations(model, self.space, z, state, self.read(ids, slice(particle, particle + 1)), self.compiled)
 
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
     ) -> tuple[np.ndarray, np.ndarray]:
-        predicted, inside = expected(model, self.read(ids), belief)
+        predicted, inside = expected(model, self.read(ids), belief, self.compiled)
         return model.residual(z[:, None, :], predicted[:, None]), inside[:, None] + cov[:, None]
 
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        return projected(model, self.read(ids), belief)
+        return projected(model, self.read(ids), belief, self.compiled)
 
     def project_jointly(
         self, model: ObservationModel, ids: np.ndarray, belief: Belief

@@ -7,21 +7,22 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.blas import dsyrk
+from scipy.linalg.blas import dsyrk, dtrsm
 
 from rbpf import gaussian
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import NEW, NULL, Jacobians, Likelihood, Observations, Part
 from rbpf.core.particles import Information, weighted_mean
 from rbpf.errors import InputError
-from rbpf.kernels.dense import add_gram, congruent, mirror, product
-from rbpf.maps.joint_columns import JointColumns
+from rbpf.kernels.dense import add_gram, add_inner, congruent, gather, mirror, product
+from rbpf.maps.joint_columns import JointColumns, Kind
 from rbpf.maps.rows import GAUSSIAN, linearised
 
 QUICK = 30_000_000
 """Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
 TINY = float(np.finfo(float).tiny)
+IN_WORLD = frozenset({Part.STATE})
+"""What a model reads that measures the pose in the world."""
 
 
 class Group(NamedTuple):
@@ -30,70 +31,78 @@ class Group(NamedTuple):
     likelihood: Likelihood
     rows: np.ndarray
     log_odds: np.ndarray
+    kind: Kind | None  #: of the landmarks, where there are some.
 
 
 class Rows(NamedTuple):
-    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S (R, R).
+    """All rows of a step: ν and H in one (N, 1 + d, R), and what all particles share: J P (R, n), S (R, R).
 
-    J is sparse: an observation reads few columns, see `through`. `considered` are columns that the rows count with, but do
-    not change.
+    J is sparse: a row reads the map in columns `at` (R, q), by slopes (R, q).
     """
 
-    nu: np.ndarray
-    by_state: np.ndarray
-    slopes: list[tuple[np.ndarray, np.ndarray]]
-    columns: np.ndarray
+    said: np.ndarray
+    at: np.ndarray
+    slope: np.ndarray
+    carried: np.ndarray
     cov: np.ndarray
     groups: list[Group]
     log_factor: float
-    considered: np.ndarray
+
+    @property
+    def nu(self) -> np.ndarray:
+        return self.said[:, 0]
+
+    def through(self, matrix: np.ndarray) -> np.ndarray:
+        """J times (n, m)."""
+        out = np.empty((len(self.at), matrix.shape[1]))
+        gather(self.at, self.slope, np.ascontiguousarray(matrix), out)
+        return out
 
     def inliers(self) -> np.ndarray:
         """The rows that update, those of the surest observations first."""
         if all(group.likelihood.kernel_id == 0 for group in self.groups):
-            return np.arange(self.nu.shape[1])
-        found = [(-odds, *rows) for _, *part in self.groups for rows, odds in zip(*part, strict=True) if odds >= 0.0]
+            return np.arange(len(self.cov))
+        pairs = [pair for group in self.groups for pair in zip(group.log_odds, group.rows, strict=True)]
+        found = [(-odds, *rows) for odds, rows in pairs if odds >= 0.0]
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
     def factor(self) -> tuple[np.ndarray, np.ndarray]:
         """The `inliers`, and Cholesky's factor of their covariance."""
         inside = self.inliers()
-        return inside, gaussian.cholesky(self.cov[np.ix_(inside, inside)]) if inside.size else np.zeros((0, 0))
+        return inside, gaussian.cholesky(self.cov[inside[:, None], inside]) if inside.size else np.zeros((0, 0))
 
     def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
         """The same where all that is held moves with the state, by gain (n, d) times turn (N, d, d)."""
-        return self._replace(by_state=self.by_state + through(self.slopes, gain[self.columns] @ turn))
+        self.said[:, 1:] += np.swapaxes(turn, 1, 2) @ self.through(gain).T
+        return self
 
     def information(self) -> Information:
         """What the rows say of the state."""
         inside, chol = self.factor()
-        white = whitened(chol, np.concatenate([self.nu[..., None], self.by_state], axis=2)[:, inside])
-        nu, by_state = white[..., 0], white[..., 1:]
-        turned = np.swapaxes(by_state, 1, 2)
-        total = Information.zeros(*by_state.shape[::2])
-        total.info += turned @ by_state
-        total.vector += (turned @ nu[..., None])[..., 0]
-        total.quad += np.square(nu).sum(axis=1)
+        white = whitened(chol, self.said[..., inside])
+        gram = white @ np.swapaxes(white, 1, 2)
+        total = Information.zeros(len(gram), gram.shape[1] - 1)
+        total.info += gram[:, 1:, 1:]
+        total.vector += gram[:, 1:, 0]
+        total.quad += gram[:, 0, 0]
         total.log_factor += self.log_factor
         total.rows += inside.size
-        is_density = np.ones(self.nu.shape[1], dtype=bool)
-        for likelihood, own, log_odds in self.groups:
+        is_density = np.ones(len(self.cov), dtype=bool)
+        for likelihood, own, log_odds, _ in self.groups:
             count = int((log_odds >= 0.0).sum())
             total.log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
             is_density[own] = likelihood.normalised
-        total.log_det += log_det(chol[np.ix_(kept := is_density[inside], kept)])
+        total.log_det += log_det(np.diagonal(chol)[is_density[inside]])
         return total
 
     def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One gain for all particles: log p(z | x) (N,), by what the means move (N, n), and the covariance (n, n) after."""
         inside, chol = self.factor()
-        nu = whitened(chol, self.nu[:, inside, None])[..., 0]
-        total = self.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(chol))
+        nu = whitened(chol, self.nu[:, inside])
+        total = self.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(np.diagonal(chol)))
         total += beyond_gaussian(self, inside, chol, nu)
-        slope = through(self.slopes, cov[self.columns])[inside]
-        half = solve_triangular(chol, slope, lower=True, check_finite=False) if inside.size else slope
-        moves, after = multiplied(nu, half), plus_gram(cov, half, -1.0)
-        fixed = self.considered
+        half = np.ascontiguousarray(whitened(chol, self.carried[inside].T).T)
+        moves, after, fixed = multiplied(nu, half), plus_gram(cov, half, -1.0), self._considered(cov)
         if fixed.size:
             # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
             # are wider apart than they are uncertain would take more out of it than there is: they are off, not informative.
@@ -104,99 +113,134 @@ class Rows(NamedTuple):
             after[at] = cov[at] - gaussian.symmetrise(root.T @ root)
         return total, moves, after
 
+    def _considered(self, cov: np.ndarray) -> np.ndarray:
+        """Columns that the rows count with, but do not change."""
+        found = [np.zeros(0, dtype=np.int64)]
+        for group in self.groups:
+            if (kind := group.kind) is not None:
+                slope = self.slope[group.rows, : kind.columns.shape[1]]
+                found.append(kind.columns[kind.landmark.considered(slope, diagonal_blocks(cov, kind.columns))])
+        return np.unique(np.concatenate(found))
 
-class Given(NamedTuple):
-    """What a joint map holds, given states (N, E) in its frame: means (N, n) and a covariance (n, n)."""
 
-    held: JointColumns
-    origin: np.ndarray | None  #: (E,) G; None where nothing may be observed in the world.
-    compiled: bool  #: use the models' fused kernels where they have one.
-    state: np.ndarray
-    mean: np.ndarray
-    cov: np.ndarray
+class Reading:
+    """What the observations of a step read of a joint map: the same wherever they are linearised.
 
-    def rows(self, groups: Sequence[Observations]) -> Rows:
-        """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
-        held, state, mean = self.held, self.state, self.mean
-        (n, d), space = (len(state), held.space.dim), held.space
-        nus, by_states = [np.zeros((n, 0))], [np.zeros((n, 0, d))]
-        noises, log_factor, parts = list[np.ndarray](), 0.0, list[Group]()
-        considered, read = [np.zeros(0, dtype=np.int64)], list[tuple[np.ndarray, np.ndarray]]()
+    Args:
+        held: which columns there are.
+        cov: (n, n) of the map.
+        groups: the observations.
+    """
+
+    def __init__(self, held: JointColumns, cov: np.ndarray, groups: Sequence[Observations]) -> None:
+        self._table, self._groups, self._of, self.held = held.table, groups, cov, held
+        self._cov, self._log_factor = np.ascontiguousarray(cov), 0.0
+        self._parts = list[tuple[np.ndarray, Kind | None, np.ndarray]]()  # which measurements, of what, rows (K, p)
+        read, noises, first = list[np.ndarray](), list[np.ndarray](), 0
         for group in groups:
-            model, z, noise, ids = group.model, group.z, group.cov, checked_ids(group)
-            log_odds = np.full(len(z), np.inf) if group.log_odds is None else group.log_odds
-            at, kind, landmarks, anchors, substate = state[:, None], None, None, None, None
+            ids, kind, reads = checked_ids(group), None, group.model.reads
+            seen = np.arange(len(group.z)) if ids is None else np.flatnonzero(ids >= 0)
+            at = [np.zeros((seen.size, 0), dtype=np.int64)]
             if ids is not None:
-                log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
-                z, noise, log_odds, ids = z[ids >= 0], noise[ids >= 0], log_odds[ids >= 0], ids[ids >= 0]
-                kind = held.of_one_kind(ids)
+                new, clutter = int((ids == NEW).sum()), int((ids == NULL).sum())
+                self._log_factor += group.log_new * new + group.log_clutter * clutter
+                kind = held.of_one_kind(ids[seen])
+                at += [kind.columns, kind.clones]
+            if Part.SUBSTATE in reads:
+                at.append(np.tile(np.arange(held.space.dim, held.first), (seen.size, 1)))
+            if reads == IN_WORLD:
+                at.append(np.tile(np.arange(held.space.dim), (seen.size, 1)))
+            p = group.z.shape[1]
+            rows = first + np.arange(seen.size * p).reshape(seen.size, p)
+            self._parts.append((seen, kind, rows))
+            read.append(np.repeat(np.concatenate(at, axis=1), p, axis=0))
+            noises.append(group.cov[seen])
+            first += rows.size
+        widest = max((columns.shape[1] for columns in read), default=0)
+        self._at, self._noise = np.zeros((first, widest), dtype=np.int64), np.zeros((first, first))
+        for (_, _, rows), columns, noise in zip(self._parts, read, noises, strict=True):
+            self._at[rows.ravel(), : columns.shape[1]] = columns
+            self._noise[rows[:, :, None], rows[:, None]] = noise
+
+    def is_of(self, held: JointColumns, cov: np.ndarray, groups: Sequence[Observations]) -> bool:
+        """Whether it is of these observations, whatever their likelihoods are, and of a map that has not changed."""
+        same = held is self.held and held.table is self._table and cov is self._of and len(groups) == len(self._groups)
+        return same and all(
+            one.model is two.model and one.z is two.z and one.ids is two.ids and one.cov is two.cov
+            for one, two in zip(groups, self._groups, strict=True)
+        )
+
+    def rows(
+        self,
+        groups: Sequence[Observations],
+        state: np.ndarray,
+        mean: np.ndarray,
+        origin: np.ndarray | None,
+        compiled: bool,
+    ) -> Rows:
+        """Linearises all groups, at states (N, E) and the particles' own means (N, n).
+
+        Jacobians by what is held are averaged over the particles. `origin` is None where nothing may be observed in the
+        world; `compiled` uses the models' fused kernels where they have one.
+        """
+        held, space, (n, d) = self.held, self.held.space, (len(state), self.held.space.dim)
+        count, parts = len(self._at), list[Group]()
+        said, by_held = np.zeros((n, 1 + d, count)), np.zeros(self._at.shape)
+        for group, (seen, kind, rows) in zip(groups, self._parts, strict=True):
+            model, z, at = group.model, group.z[seen], state[:, None]
+            log_odds = np.full(seen.size, np.inf) if group.log_odds is None else group.log_odds[seen]
+            parts.append(Group(group.likelihood or GAUSSIAN, rows, log_odds, kind))
+            landmarks = anchors = substate = None
+            if kind is not None:
                 landmarks = mean[:, kind.columns]
                 anchors = held.poses(kind, mean) if kind.landmark.anchored else None
             if Part.SUBSTATE in model.reads:
                 substate = mean[:, None, d : held.first]
-            in_world = model.reads == frozenset({Part.STATE})
-            if in_world:
-                if self.origin is None:
+            if in_world := model.reads == IN_WORLD:
+                if origin is None:
                     name = type(model).__name__
                     raise InputError(f"{name} observes the pose in the world: sub-maps do not take that")
-                at = space.compose(space.retract(self.origin, mean[:, :d]), state)[:, None]
-            if landmarks is None or (substate is not None and model.about is None) or not self.compiled:
-                nu, jac = linearise(model, space, z, at, landmarks, anchors, substate)
+                at = space.compose(space.retract(origin, mean[:, :d]), state)[:, None]
+            if landmarks is None or (substate is not None and model.about is None) or not compiled:
+                found, jac = linearise(model, space, z, at, landmarks, anchors, substate)
             else:
-                nu, *found = linearised(model, space, z, state, landmarks, anchors, True)
-                jac = Jacobians(*found)
+                found, *by = linearised(model, space, z, state, landmarks, anchors, True)
+                jac = Jacobians(*by)
                 if substate is not None:
                     # By what all particles have in common: in the slope they differ in the second order.
                     centre = space.mean(state, np.full(n, 1.0 / n))
                     const = None if kind is None or anchors is None else held.poses(kind, mean.mean(axis=0))
                     by_substate = model.by_substate(centre, landmarks.mean(axis=0), const)
-                    nu = nu - np.moveaxis(by_substate @ (substate[:, 0] - model.about).T, -1, 0)
+                    found = found - np.moveaxis(by_substate @ (substate[:, 0] - model.about).T, -1, 0)
                     jac = jac._replace(substate=by_substate[None])
-            count, p = z.shape
-            # What each observation reads of the Gaussian, and by what slope.
-            used = [(np.zeros((count, 0), dtype=np.int64), np.zeros((count, p, 0)))]
-            if kind is not None and jac.landmark is not None:
-                slope = jac.landmark.mean(axis=0)
-                used.append((kind.columns, slope))
-                considered.append(
-                    kind.columns[kind.landmark.considered(slope, diagonal_blocks(self.cov, kind.columns))]
-                )
+            # By what slope each observation reads the Gaussian, in the order of its columns.
+            used = list[np.ndarray]()
+            if kind is not None:
+                assert jac.landmark is not None
+                used.append(jac.landmark.mean(axis=0))
             if kind is not None and anchors is not None and jac.state is not None:
                 # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
-                turn = space.adjoint(space.between(state[:, None], anchors)) @ space.right_jacobian(
-                    mean[:, kind.clones]
-                )
-                used.append((kind.clones, -(jac.state @ turn).mean(axis=0)))
+                turn = space.adjoint(space.between(at, anchors)) @ space.right_jacobian(mean[:, kind.clones])
+                used.append(-(jac.state @ turn).mean(axis=0))
             if jac.substate is not None:
-                used.append((np.tile(np.arange(d, held.first), (count, 1)), jac.substate.mean(axis=0)))
+                used.append(jac.substate.mean(axis=0))
             if in_world and jac.state is not None:
                 # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
                 turn = space.adjoint(space.inverse(state)) @ space.right_jacobian(mean[:, :d])
-                used.append((np.tile(np.arange(d), (count, 1)), (jac.state @ turn[:, None]).mean(axis=0)))
-            where, slopes = zip(*used, strict=True)
-            read.append((np.concatenate(where, axis=1), np.concatenate(slopes, axis=2)))
-            by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
-            nus.append(np.broadcast_to(nu, (n, count, p)).reshape(n, -1))
-            by_states.append(np.broadcast_to(by_state, (n, count, p, d)).reshape(n, -1, d))
-            first = sum(len(each) for each in noises)
-            parts.append(Group(group.likelihood or GAUSSIAN, first + np.arange(count * p).reshape(count, p), log_odds))
-            noises.extend(noise)
-        columns = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(at.ravel() for at, _ in read)]))
-        sparse = [(np.searchsorted(columns, at), slope) for at, slope in read]
-        innovation = gaussian.symmetrise(through(sparse, through(sparse, self.cov[np.ix_(columns, columns)]).T))
-        end = 0
-        for noise in noises:
-            rows = slice(end, end := end + noise.shape[0])
-            innovation[rows, rows] += noise
-        nu, by_state = np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1)
-        return Rows(nu, by_state, sparse, columns, innovation, parts, log_factor, np.unique(np.concatenate(considered)))
-
-
-def through(slopes: list[tuple[np.ndarray, np.ndarray]], matrix: np.ndarray) -> np.ndarray:
-    """J (R, c) times (…, c, m): of each group which of the c an observation reads (K, q), and by what slope (K, p, q)."""
-    *many, _, m = matrix.shape
-    parts = [(slope @ matrix[..., at, :]).reshape(*many, slope.shape[0] * slope.shape[1], m) for at, slope in slopes]
-    return np.concatenate([np.zeros((*many, 0, m)), *parts], axis=-2)
+                used.append((jac.state @ turn[:, None]).mean(axis=0))
+            if not rows.size:
+                continue
+            own = slice(int(rows[0, 0]), int(rows[-1, -1]) + 1)
+            said[:, 0, own] = np.broadcast_to(found, (n, *rows.shape)).reshape(n, -1)
+            if jac.state is not None:
+                slopes = np.broadcast_to(jac.state, (n, *rows.shape, d)).reshape(n, -1, d)
+                said[:, 1:, own] = np.swapaxes(slopes, 1, 2)
+            slope = np.concatenate(used, axis=2)
+            by_held[own, : slope.shape[2]] = slope.reshape(rows.size, -1)
+        carried, innovation = np.empty((count, len(self._cov))), self._noise.copy()
+        gather(self._at, by_held, self._cov, carried)
+        add_inner(self._at, by_held, carried, innovation)
+        return Rows(said, self._at, by_held, carried, innovation, parts, self._log_factor)
 
 
 def checked_ids(group: Observations) -> np.ndarray | None:
@@ -214,9 +258,9 @@ def checked_ids(group: Observations) -> np.ndarray | None:
     return ids
 
 
-def log_det(chol: np.ndarray) -> float:
-    """Log |2πS| of S = L Lᵀ."""
-    return 2.0 * float(np.log(np.diagonal(chol)).sum()) + len(chol) * float(np.log(2.0 * np.pi))
+def log_det(diagonal: np.ndarray) -> float:
+    """Log |2πS| of S = L Lᵀ, by the diagonal of L."""
+    return 2.0 * float(np.log(diagonal).sum()) + len(diagonal) * float(np.log(2.0 * np.pi))
 
 
 def diagonal_blocks(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -229,13 +273,13 @@ def log_odds_of(nu: np.ndarray, cov: np.ndarray, groups: list[Group]) -> list[np
 
     Begins with those that are inliers when seen alone; then the one that is most at odds with its place changes it.
     """
-    alone = [likelihood.log_odds(nu[rows], diagonal_blocks(cov, rows)) for likelihood, rows, _ in groups]
+    alone = [group.likelihood.log_odds(nu[group.rows], diagonal_blocks(cov, group.rows)) for group in groups]
     taken = [odds >= 0.0 for odds in alone]
-    inside = np.concatenate([rows[took].ravel() for (_, rows, _), took in zip(groups, taken, strict=True)])
+    inside = np.concatenate([group.rows[took].ravel() for group, took in zip(groups, taken, strict=True)])
     given = _swept(np.concatenate([cov, nu[:, None]], axis=1), inside, False)
     for _ in range(2 * sum(len(each) for each in taken) + 1):
         found = []
-        for (likelihood, rows, _), took in zip(groups, taken, strict=True):
+        for (likelihood, rows, *_), took in zip(groups, taken, strict=True):
             # An inlier is left out of what it is judged by: ν = Π⁻¹ (S⁻¹ν) with covariance Π⁻¹, Π its block of S⁻¹.
             own, spread = given[rows, -1], diagonal_blocks(given, rows)
             spread[took] = -np.linalg.inv(spread[took])
@@ -273,7 +317,7 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray, chol: np.ndarray, white: np.
     """
     total, place = np.zeros(len(white)), np.empty(rows.nu.shape[1], dtype=np.int64)
     place[inside] = np.arange(inside.size)
-    for likelihood, own, log_odds in rows.groups:
+    for likelihood, own, log_odds, _ in rows.groups:
         if likelihood.kernel_id == 0:
             continue
         at = place[own[log_odds >= 0.0]]
@@ -281,7 +325,7 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray, chol: np.ndarray, white: np.
         nu, cov = (lower @ white[:, at][..., None])[..., 0], gaussian.gram(lower)
         total += (likelihood.log_density(nu, cov) - gaussian.log_density(nu, cov)).sum(axis=1)
         out = own[log_odds < 0.0]
-        half = whitened(chol, rows.cov[np.ix_(inside, out.ravel())][None])[0]
+        half = whitened(chol, rows.cov[np.ix_(out.ravel(), inside)]).T
         nu = (rows.nu[:, out.ravel()] - white @ half).reshape(len(white), *out.shape)
         explained = diagonal_blocks(half.T @ half, np.arange(out.size).reshape(out.shape))
         total += likelihood.log_density(nu, diagonal_blocks(rows.cov, out) - explained).sum(axis=1)
@@ -289,13 +333,11 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray, chol: np.ndarray, white: np.
 
 
 def whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """L⁻¹ of rows (N, R, k), with one L (R, R) for all."""
-    n, count, k = rows.shape
+    """L⁻¹ of rows (…, R), with one L (R, R) for all."""
     if not rows.size:
         return rows
-    flat = rows.transpose(1, 0, 2).reshape(count, -1)
-    solved = solve_triangular(chol, flat, lower=True, check_finite=False)
-    return np.asarray(solved).reshape(count, n, k).transpose(1, 0, 2)
+    flat = np.ascontiguousarray(rows).reshape(-1, len(chol)).T
+    return np.asarray(dtrsm(1.0, chol, flat, lower=1).T).reshape(rows.shape)
 
 
 def multiplied(left: np.ndarray, right: np.ndarray) -> np.ndarray:

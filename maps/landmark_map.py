@@ -163,11 +163,9 @@ class LandmarkMap(Map):
     def innovations(
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
-        records = self.read(ids, slice(particle, particle + 1))
-        nu, by_state, by_landmark = rows.linearised(
-            model, self.space, z, state[None], records.mean, records.const, self.compiled
+        return rows.innovations(
+            model, self.space, z, state, self.read(ids, slice(particle, particle + 1)), self.compiled
         )
-        return nu[0], Jacobians(by_state[0], by_landmark[0]), records
 
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief

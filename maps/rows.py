@@ -21,6 +21,7 @@ from rbpf.core.models import (
     NULL,
     Belief,
     FusedKernel,
+    Jacobians,
     Likelihood,
     LogDensities,
     ObservationModel,
@@ -382,20 +383,30 @@ def _likelihood(group: Observations) -> Likelihood:
 # What every map does alike: numbers for new landmarks, and what the particles expect to measure of the ones they hold.
 
 
-def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+def expected(
+    model: ObservationModel, records: Records, belief: Belief, compiled: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
     prior, state = belief.prior, belief.state[:, None, :]
-    predicted = model.predict(state, records.mean, records.const)
-    _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
-    assert jac.state is not None and jac.landmark is not None
-    moved = jac.state @ prior.spread(prior.mean)[:, None]
-    within = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
+    if compiled and fused_kernel(model) is not None:
+        zero = np.zeros((records.mean.shape[1], model.dim))
+        nu, *slopes = linearised(model, prior.space, zero, belief.state, records.mean, records.const, True)
+        predicted, jac = -nu, Jacobians(*slopes)
+    else:
+        predicted = model.predict(state, records.mean, records.const)
+        _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
+    by_state, by_landmark, _ = jac
+    assert by_state is not None and by_landmark is not None
+    moved = by_state @ prior.spread(prior.mean)[:, None]
+    within = by_landmark @ records.cov @ np.swapaxes(by_landmark, -1, -2)
     return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
 
 
-def projected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+def projected(
+    model: ObservationModel, records: Records, belief: Belief, compiled: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """The moments (K, p), (K, p, p) of all particles' expectations together, see `Belief.project`."""
-    predicted, within = expected(model, records, belief)
+    predicted, within = expected(model, records, belief, compiled)
     # Relative to the particle of highest weight, so that angles need not be wrapped.
     mode = predicted[belief.mode]
     mean, cov = gaussian.mixture_moments(belief.weights, model.residual(predicted, mode), within)
@@ -425,6 +436,14 @@ def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state
     """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
     name = type(model).__name__
     return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))
+
+
+def innovations(
+    model: ObservationModel, space: LieGroup, z: Array, state: Array, records: Records, compiled: bool
+) -> tuple[Array, Jacobians, Records]:
+    """Of one particle's records (1, K, …) at its state (E,), as `Map.innovations`."""
+    nu, *slopes = linearised(model, space, z, state[None], records.mean, records.const, compiled)
+    return nu[0], Jacobians(*(slope[0] for slope in slopes)), records
 
 
 def linearised(

@@ -33,24 +33,32 @@ class EkfProposal(Proposal):
 
     Args:
         exact: correct by the importance ratio at the sampled state; False is E06's weight, the linearised marginal.
-        iterations: linearisations; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
+        iterations: linearisations at most; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
         start: (d,) increment in each particle's chart where the first one is, where more is known than the prior says;
             None is the prior's mean.
+        settled: none is made any more when the last one moved no particle's mean by so many of its standard deviations.
     """
 
-    def __init__(self, exact: bool = True, iterations: int = 1, start: np.ndarray | None = None) -> None:
+    def __init__(
+        self, exact: bool = True, iterations: int = 1, start: np.ndarray | None = None, settled: float = 0.0
+    ) -> None:
         if iterations < 1:
             raise InputError(f"EkfProposal needs at least one iteration, got {iterations}")
         self.exact = exact
-        self.iterations = iterations
+        self.iterations, self.settled = iterations, settled
         self.start = start
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
         at = prior.mean if self.start is None else np.tile(self.start, (prior.base.shape[0], 1))
-        for iteration in range(self.iterations):
+        proposed = refined(prior, linearise(at))
+        for _ in range(self.iterations - 1):
+            before = proposed
+            at = prior.mean + np.einsum("nar,nr->na", prior.factor, before.mean)
             proposed = refined(prior, linearise(at))
-            if iteration + 1 < self.iterations:
-                at = prior.mean + np.einsum("nar,nr->na", prior.factor, proposed.mean)
+            if self.settled:
+                moved = np.linalg.solve(proposed.root, (proposed.mean - before.mean)[..., None])
+                if np.abs(moved).max() < self.settled:
+                    break
         return proposed
 
 

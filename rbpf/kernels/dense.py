@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, void
+
+from rbpf.kernels.signature import INDEX_MATRIX, MATRIX
 
 
 @njit(cache=True, error_model="numpy")
@@ -60,11 +62,44 @@ def product(left, right):
     return out
 
 
+@njit(void(INDEX_MATRIX, MATRIX, MATRIX, MATRIX), cache=True, error_model="numpy")
+def gather(at, slope, matrix, out):
+    """Fills (R, m) with J times a matrix (n, m), where J has in each row q entries `slope` (R, q) in columns `at` (R, q)."""
+    for r in range(at.shape[0]):
+        out[r] = 0.0
+        for q in range(at.shape[1]):
+            factor, row = slope[r, q], matrix[at[r, q]]
+            if factor != 0.0:
+                for j in range(row.size):
+                    out[r, j] += factor * row[j]
+
+
+@njit(void(INDEX_MATRIX, MATRIX, MATRIX, MATRIX), cache=True, error_model="numpy")
+def add_inner(at, slope, rows, out):
+    """Adds rows (R, n) times Jᵀ, see `gather`, to a matrix (R, R), where that is symmetric."""
+    for r in range(at.shape[0]):
+        for s in range(r + 1):
+            total = 0.0
+            for q in range(at.shape[1]):
+                total += rows[r, at[s, q]] * slope[s, q]
+            out[r, s] += total
+            if s < r:
+                out[s, r] = out[r, s]
+
+
 @njit(cache=True, error_model="numpy")
 def add_gram(matrix, rows, sign):
     """Adds ± rowsᵀ rows, of rows (k, n), to the lower triangle of (n, n)."""
-    for k in range(rows.shape[0]):
-        for i in range(matrix.shape[0]):
+    count = rows.shape[0]
+    whole = count - count % 4
+    for i in range(matrix.shape[0]):  # a row stays in the cache
+        for k in range(0, whole, 4):
+            a, b, c, d = sign * rows[k, i], sign * rows[k + 1, i], sign * rows[k + 2, i], sign * rows[k + 3, i]
+            for j in range(i + 1):
+                matrix[i, j] = (((matrix[i, j] + a * rows[k, j]) + b * rows[k + 1, j]) + c * rows[k + 2, j]) + d * rows[
+                    k + 3, j
+                ]
+        for k in range(whole, count):
             factor = sign * rows[k, i]
             for j in range(i + 1):
                 matrix[i, j] += factor * rows[k, j]

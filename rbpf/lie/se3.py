@@ -176,7 +176,11 @@ def _two(
 
 def _spread(x: Array, shape: tuple[int, ...]) -> Array:
     """With the leading axes `shape`; a single row stays one, the kernels repeat it."""
-    return x if x.size == x.shape[-1] else np.broadcast_to(x, (*shape, x.shape[-1]))
+    if x.size == x.shape[-1]:
+        return x
+    out = np.empty((*shape, x.shape[-1]))  # as np.broadcast_to, which takes as long as a kernel
+    out[...] = x
+    return out
 
 
 def _require_size(x: Array, size: int) -> None:

@@ -14,7 +14,6 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.joint_map import JointMap
-from rbpf.maps.joint_rows import through
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.camera import Pinhole
@@ -156,14 +155,13 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
     ]
 
     def measured(mean: np.ndarray, state: np.ndarray = particles.state) -> np.ndarray:
-        return -joint._given(state, None)._replace(mean=mean[None]).rows(groups).nu[0]
+        return -joint._rows(state, mean[None], joint.cov, groups).nu[0]
 
-    rows = joint._given(particles.state, None).rows(groups)
-    by_mean = np.zeros((10, joint.mean.shape[1]))
-    by_mean[:, rows.columns] = through(rows.slopes, np.eye(rows.columns.size))
+    rows = joint._rows(particles.state, joint.mean, joint.cov, groups)
+    by_mean = rows.through(np.eye(joint.mean.shape[1]))
     np.testing.assert_allclose(by_mean, numeric(measured, joint.mean[0]), atol=1e-4)
     by_state = numeric(lambda xi: measured(joint.mean[0], SE3.retract(particles.state, xi)), np.zeros(6))
-    np.testing.assert_allclose(rows.by_state[0], by_state, atol=1e-4)
+    np.testing.assert_allclose(rows.said[0, 1:].T, by_state, atol=1e-4)
 
 
 def test_what_is_told_of_rays_is_the_gaussian_carried_over():

@@ -8,7 +8,7 @@ from rbpf.core.linearisation import linearise
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import NEW, NULL, Observations
 from rbpf.core.particles import Prior, Proposed
-from rbpf.core.proposals import refined
+from rbpf.core.proposals import EkfProposal, refined
 from rbpf.lie import SE2, SE3
 from tests.exactness.models import Kalman, known
 from tests.exactness.scenes import Scene, sensors
@@ -78,6 +78,27 @@ def test_refinement_equals_sequential_updates(space, compiled, rank, shared, rng
         groups = [scene.observe(model, np.array([2, 0, 3]))]
         proposed = refined(prior, scene.map(compiled).information(scene.state, groups, prior))
         assert_equal(prior, proposed, sequential(scene, groups, prior, rng))
+
+
+def test_nothing_is_linearised_any_more_once_that_moves_nothing(rng):
+    scene = Scene.random(SE3, rng)
+    prior, group, asked = scene.prior(6, shared=True), [scene.observe(sensors(SE3, rng)[0], np.array([2, 0, 3]))], []
+    linearise_at = Marginals(SE3, [scene.map(True)]).linearised(prior, group)
+
+    def linearised(increment):
+        asked.append(increment)
+        return linearise_at(increment)
+
+    counts = []
+    for settled in (0.0, 1e-9, 1e-3, 1e9):
+        asked.clear()
+        found = EkfProposal(iterations=12, settled=settled).propose(prior, linearised, rng)
+        counts.append(len(asked))
+        if settled == 0.0:
+            last = found.mean
+        elif settled < 1.0:
+            np.testing.assert_allclose(found.mean, last, atol=settled)
+    assert counts[0] == 12 and counts[-1] == 2 and counts == sorted(counts, reverse=True) and counts[1] > counts[2] > 2
 
 
 @compiled_or_not

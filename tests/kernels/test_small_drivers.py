@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.kernels import forest
-from rbpf.kernels.dense import product
+from rbpf.kernels.dense import add_gram, add_inner, gather, product
 from rbpf.kernels.increment import are_sound, conditioned
 from rbpf.kernels.rigid_fit import rigid_fit
 from rbpf.kernels.robust_fit import robust_fit
@@ -96,6 +96,23 @@ def test_soundness(rng):
 def test_a_product_is_numpys(m, k, n, rng):
     left, right = rng.normal(size=(m, k)), rng.normal(size=(k, n))
     np.testing.assert_allclose(product(left, right), left @ right, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [0, 3, 6])
+def test_rows_that_read_few_columns_are_a_matrix(count, rng):
+    """One row reads a column twice."""
+    cov, slope, at = covariances(rng, 1, 9)[0], rng.normal(size=(count, 2)), rng.integers(0, 9, (count, 2))
+    at[:1] = 4
+    whole = np.einsum("rq,rqn->rn", slope, np.eye(9)[at])
+    rows, out = np.empty((count, 9)), np.eye(count)
+    gather(at, slope, cov, rows)
+    np.testing.assert_allclose(rows, whole @ cov, rtol=1e-12, atol=1e-12)
+    add_inner(at, slope, rows, out)
+    np.testing.assert_allclose(out, whole @ cov @ whole.T + np.eye(count), rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(out, out.T)
+    add_gram(cov, rows, -1.0)
+    expected = covariances(np.random.default_rng(4), 1, 9)[0] - rows.T @ rows
+    np.testing.assert_allclose(np.tril(cov), np.tril(expected), rtol=1e-11, atol=1e-11)
 
 
 def test_the_forest_is_compiled_as_it_is_loaded():

@@ -40,6 +40,8 @@ from rbpf.systems.system import Revision
 
 LINEARISATIONS = 3
 """Of the proposal: moments of the samples hand on what a few weights cannot mend."""
+SETTLED = 0.2
+"""Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that."""
 LEAST_PARALLAX_PX = 3.0
 """Parallax of one standard deviation of depth from where on it is measured; before, it is considered."""
 JOINT = "joint/mean"
@@ -229,9 +231,10 @@ class HandOver:
         joint = JointMap(SE3, (np.zeros(variances.size), np.diag(variances)), config.compiled, config.submap)
         joint.register(rays.landmark)
         consolidation = Consolidation(config.window, config.resampling.ess_threshold)
+        motion = MarginalVelocity(config.velocity.walk_std(), constants)
+        proposal = EkfProposal(iterations=LINEARISATIONS, settled=SETTLED)
         return Filter(
-            MarginalVelocity(config.velocity.walk_std(), constants), sensor, joint, EkfProposal(iterations=LINEARISATIONS),
-            n=config.particles, rng=rng, lag=1, consolidation=consolidation,
+            motion, sensor, joint, proposal, n=config.particles, rng=rng, lag=1, consolidation=consolidation
         )  # fmt: skip
 
     def _use(self, filter_: Filter, rays: JointRays, sensor: ImageSensor) -> Filter:
