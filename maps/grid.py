@@ -227,22 +227,17 @@ class GridMap(Conditional):
         reach = float(np.hypot(beams[:, [0, 2]], beams[:, [1, 3]]).max()) + pitch
         low = np.floor((state[:, :0:-1].min(axis=0) - reach) / pitch).astype(np.int64)
         high = np.floor((state[:, :0:-1].max(axis=0) + reach) / pitch).astype(np.int64) + 1
-        n, *size = self.index.shape
         if not (self.index >= 0).any():
-            before, after = np.array(low), np.array(high)
-            self.origin, old = low, np.zeros((n, 0, 0), dtype=np.int32)
-        else:
-            before, after = self.origin, self.origin + size
-            old = self.index
-        if (low >= before).all() and (high <= after).all() and old.size:
-            return
+            self.index, self.origin = self.index[:, :0, :0], low
+        before, after = self.origin, self.origin + self.index.shape[1:]
         low, high = np.minimum(low, before), np.maximum(high, after)
+        if (low == before).all() and (high == after).all():
+            return
         height, width = (high - low).tolist()
-        require_memory(4.0 * n * height * width, f"a map of {height * pitch:.0f} m by {width * pitch:.0f} m")
-        self.index = np.full((n, height, width), -1, dtype=np.int32)
-        y, x = before - low
-        self.index[:, y : y + old.shape[1], x : x + old.shape[2]] = old
-        self.origin = low
+        need = 4.0 * len(self.index) * height * width
+        require_memory(need, f"a map of {height * pitch:.0f} m by {width * pitch:.0f} m")
+        more = zip(before - low, high - after, strict=True)
+        self.index, self.origin = np.pad(self.index, ((0, 0), *more), constant_values=-1), low
 
 
 def beams_of(group: Observations) -> np.ndarray:

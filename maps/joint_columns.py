@@ -104,10 +104,7 @@ class JointColumns:
 
     def number(self, landmark: Landmark) -> int:
         """Of a parametrisation; −1 for one that the map does not know."""
-        for number, held in enumerate(self.kinds):
-            if type(held) is type(landmark) and vars(held) == vars(landmark):
-                return number
-        return -1
+        return self.kinds.index(landmark) if landmark in self.kinds else -1
 
     def of_one_kind(self, ids: np.ndarray) -> Kind:
         """Landmarks (K,) of one kind, in their order. Raises InputError: the map does not hold one, or their kinds differ."""

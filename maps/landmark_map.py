@@ -76,7 +76,7 @@ class LandmarkMap(Map):
         return self._layout_of(landmark_id).landmark
 
     def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
-        return self.store.columns.kinds(ids) == self._kind(landmark)
+        return self.store.columns.kinds(ids) == self.register(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         records = rows.first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
@@ -88,7 +88,7 @@ class LandmarkMap(Map):
     ) -> np.ndarray:
         if log_odds is not None and not self.evidence:
             raise InputError("landmarks of some particles only need a map with evidence=True")
-        kind = self._kind(landmark)
+        kind = self.register(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
         count = columns.shape[0]
         ids = rows.checked_new_ids(ids, count, self.store.columns.next_id, self.holds)
@@ -108,7 +108,7 @@ class LandmarkMap(Map):
             layout = self._layout_of(landmark_id)
             column = self.store.read(int(landmark_id))
             records = layout.landmark.promote(layout.unpack(column[None]))
-            kind = self._kind(to or Point(records.mean.shape[-1]))
+            kind = self.register(to or Point(records.mean.shape[-1]))
             log_odds = column[-1][:, None] if self.evidence else None
             self.store.replace(int(landmark_id), self.layouts[kind].pack(records, log_odds)[0])
             self.store.columns.kind[self.store.columns.row(int(landmark_id))] = kind
@@ -292,20 +292,15 @@ class LandmarkMap(Map):
             raise InputError("the landmarks' records have other sizes than their parametrisations")
         self.store.columns.kind[:count] = kinds
 
-    def register(self, landmark: Landmark) -> None:
-        """Names a parametrisation before it is first used, so that a checkpoint can be read back.
+    def register(self, landmark: Landmark) -> int:
+        """Names a parametrisation before it is first used, so that a checkpoint can be read back; returns its number.
 
         The filter that saves and the one that loads name the same ones in the same order.
         """
-        self._kind(landmark)
-
-    def _kind(self, landmark: Landmark) -> int:
-        for number, layout in enumerate(self.layouts):
-            held = layout.landmark
-            if type(held) is type(landmark) and vars(held) == vars(landmark):
-                return number
-        self.layouts.append(Layout(landmark, self.evidence))
-        return len(self.layouts) - 1
+        layout = Layout(landmark, self.evidence)
+        if layout not in self.layouts:
+            self.layouts.append(layout)
+        return self.layouts.index(layout)
 
     def _plan(self, groups: Sequence[Observations]) -> rows.Plan:
         """A step asks for the plan of the same groups again and again; a resampling may have replaced some."""

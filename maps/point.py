@@ -9,6 +9,10 @@ from rbpf.core.models import Landmark, Records, RigidSpace
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 
+#: Distance from the heaviest component of a mixture, in its standard deviations, within which another one says the same;
+#: and the weight that these must have together for the mixture to be a single Gaussian.
+REACH, DOMINANT = 3.0, 0.99
+
 
 @final
 class Point(Landmark):
@@ -47,21 +51,14 @@ class AnchoredPoint(Landmark):
 
 @final
 class MixturePoint(Landmark):
-    """A world point as C weighted Gaussians, as the ring that a range-only beacon leaves: Mathematics (mixture).
+    """A world point as C ≥ 2 weighted Gaussians in 2 or 3 dimensions, as the ring that a range-only beacon leaves.
 
-    Args:
-        components: C, at least 2.
-        dim: 2 or 3.
-        dominant: it is ready to become a single Gaussian when the components within reach of the heaviest one have
-            this weight together.
-        reach: distance from the heaviest component, in its standard deviations, within which another one says the same.
+    It is ready to become a single one when the components within reach of the heaviest dominate: Mathematics (mixture).
     """
 
-    def __init__(self, components: int, dim: int = 2, dominant: float = 0.99, reach: float = 3.0) -> None:
+    def __init__(self, components: int, dim: int = 2) -> None:
         self.components = components
         self.dim = dim
-        self.dominant = dominant
-        self.reach = reach
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         return np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
@@ -72,8 +69,8 @@ class MixturePoint(Landmark):
         mean = np.take_along_axis(records.mean, heaviest, axis=2)
         cov = np.take_along_axis(records.cov, heaviest[..., None], axis=2)
         offset = gaussian.solve_lower(gaussian.cholesky(np.broadcast_to(cov, records.cov.shape)), records.mean - mean)
-        near = np.square(offset).sum(axis=-1) <= self.reach**2
-        return (np.exp(records.log_weights) * near).sum(axis=-1) >= self.dominant
+        near = np.square(offset).sum(axis=-1) <= REACH**2
+        return (np.exp(records.log_weights) * near).sum(axis=-1) >= DOMINANT
 
 
 def ring_components(radius: float, std_radius: float, dim: int = 2) -> int:

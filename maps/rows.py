@@ -241,7 +241,7 @@ class RowEngine:
         )
 
     def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
-        columns = np.array([self.store.read(int(i)) for i in ids])
+        columns = self.store.read_all(ids)
         return columns, self.layout_of(int(ids[0])).unpack(columns)
 
     def _write(self, ids: np.ndarray, columns: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> None:

@@ -9,6 +9,7 @@ LAPACK, called once per matrix, cannot do. Sums use no BLAS: equal input gives e
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 
 import numpy as np
@@ -103,14 +104,11 @@ def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n 
     cov = np.asarray(cov, dtype=float)
     with np.errstate(invalid="ignore"):  # from entries that are infinite, which the complaint covers
         if cov.shape[-1] > _UNROLLED:
-            try:
+            with suppress(np.linalg.LinAlgError):  # which does not say which matrix of the batch failed
                 chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
-                definite = np.asarray(np.isfinite(chol).all((-1, -2)))
-            except np.linalg.LinAlgError:
-                # LAPACK does not say which matrix of the batch failed.
-                chol, definite = _cholesky_batch(cov, 0.0)
-        else:
-            chol, definite = _cholesky_batch(cov, 0.0)
+                if np.isfinite(chol).all():
+                    return chol
+        chol, definite = _cholesky_batch(cov, 0.0)
     _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
     return chol
 

@@ -292,6 +292,12 @@ class Landmark(ABC):
     #: world.
     anchored: bool = False
 
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and vars(other) == vars(self)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
     @abstractmethod
     def homogeneous(
         self, mean: Float[np.ndarray, "*#batch D"], const: Float[np.ndarray, "*#batch A"] | None = None
