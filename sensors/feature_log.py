@@ -21,6 +21,14 @@ class FeatureFrame:
     z: np.ndarray  #: (K, p) pixels: (u, v), or (u_left, v, u_right) of a stereo pair.
     cov_z: np.ndarray  #: (K, p, p) their covariance, px².
 
+    @property
+    def cov(self) -> np.ndarray:
+        """(K, p, p), as features of any kind have it."""
+        return self.cov_z
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
     def take(self, rows: np.ndarray | slice) -> "FeatureFrame":
         """Some of its features, by number or by mask."""
         return FeatureFrame(self.stamp_ns, self.landmarks[rows], self.z[rows], self.cov_z[rows])

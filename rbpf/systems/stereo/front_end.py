@@ -22,19 +22,11 @@ from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.landmarks import (
-    DescriptorLandmarks,
-    F,
-    FeatureKind,
-    Landmarks,
-    NamedLandmarks,
-    NamedPixels,
-    Pair,
-)
+from rbpf.systems.stereo.landmarks import DescriptorLandmarks, F, FeatureKind, Landmarks, NamedLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
 _LABELS = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
-_NAMED = {
+_PAIR = {
     "z": numbers("features", 3),
     "cov": numbers("features", 3, 3),
     "names": integers("features", least=0),
@@ -190,8 +182,8 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
 
 
 @final
-class NamedFrontEnd(FrontEnd[NamedPixels]):
-    """Pixels of landmarks that have names: known association.
+class NamedFrontEnd(FrontEnd[FeatureFrame]):
+    """Pixels of landmarks that have names.
 
     The frames' stamps are `ns_per_stamp` nanoseconds long: 10⁹ where they count frames of unknown time.
     """
@@ -203,25 +195,24 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
         self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
         self.landmarks: NamedLandmarks = NamedLandmarks(rig, config)
 
-    def measure(self, frame: FeatureFrame) -> tuple[Pair[NamedPixels], str]:
-        pixels = NamedPixels(frame.z, frame.cov_z, frame.landmarks)
-        return self._pair(self.ns_per_stamp * frame.stamp_ns, pixels, pixels.names % 2 == 0), ""
+    def measure(self, frame: FeatureFrame) -> tuple[Pair[FeatureFrame], str]:
+        return self._pair(self.ns_per_stamp * frame.stamp_ns, frame, frame.landmarks % 2 == 0), ""
 
-    def match(self, before: Pair[NamedPixels], now: Pair[NamedPixels]) -> tuple[np.ndarray, np.ndarray]:
-        names = before.features.names, now.features.names
+    def match(self, before: Pair[FeatureFrame], now: Pair[FeatureFrame]) -> tuple[np.ndarray, np.ndarray]:
+        names = before.features.landmarks, now.features.landmarks
         _, first, second = np.intersect1d(*names, assume_unique=True, return_indices=True)
         used = before.for_odometry[first]
         return first[used], second[used]
 
-    def landmarks_of(self, pair: Pair[NamedPixels], updated: bool) -> tuple[np.ndarray, np.ndarray]:
+    def landmarks_of(self, pair: Pair[FeatureFrame], updated: bool) -> tuple[np.ndarray, np.ndarray]:
         """Their names, whether the filter has taken them or not."""
         kind = FeatureKind.LANDMARK if updated else FeatureKind.FEATURE
-        return pair.features.names, np.full(len(pair), kind)
+        return pair.features.landmarks, np.full(len(pair), kind)
 
-    def arrays(self, pair: Pair[NamedPixels]) -> dict[str, np.ndarray]:
-        features = pair.features
-        return {"pair/names": features.names, "pair/z": features.z, "pair/cov": features.cov, "pair/stood": pair.labels}
+    def arrays(self, pair: Pair[FeatureFrame]) -> dict[str, np.ndarray]:
+        shown = pair.features.landmarks, pair.features.z, pair.features.cov, pair.labels
+        return {f"pair/{name}": array for name, array in zip(("names", "z", "cov", "stood"), shown, strict=True)}
 
-    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[NamedPixels]:
-        z, cov, names, labels = read(arrays, _NAMED, "pair/").values()
-        return replace(self._pair(0, NamedPixels(z, cov, names), names % 2 == 0), labels=labels)
+    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[FeatureFrame]:
+        z, cov, names, labels = read(arrays, _PAIR, "pair/").values()
+        return replace(self._pair(0, FeatureFrame(0, names, z, cov), names % 2 == 0), labels=labels)

@@ -82,22 +82,6 @@ F = TypeVar("F", bound=PairFeatures)
 
 
 @final
-@dataclass(frozen=True)
-class NamedPixels:
-    """Features, as `PairFeatures`, whose landmarks are known."""
-
-    z: np.ndarray
-    cov: np.ndarray
-    names: np.ndarray  #: (K,) int64 of the landmarks.
-
-    def __len__(self) -> int:
-        return self.names.size
-
-    def take(self, rows: np.ndarray) -> "NamedPixels":
-        return NamedPixels(self.z[rows], self.cov[rows], self.names[rows])
-
-
-@final
 @dataclass(frozen=True, eq=False)
 class Pair(Generic[F]):
     """What one frame showed; as the map is asked about it and the filter updated by it, without what is of moving things."""
@@ -424,8 +408,17 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         known = self.ids >= 0
         seen = self.ids[known]
         if self.noise is not None:
+            # From what the update left of the innovations, but for outliers.
             for group in observed:
-                self._learn(group, belief, self.noise)
+                assert group.ids is not None
+                sure = group.ids >= 0
+                if group.log_odds is not None:
+                    sure &= group.log_odds >= 0.0
+                if sure.any():
+                    ids = group.ids[sure]
+                    mean, cov = self.expected(belief, ids)
+                    noise = group.cov[sure] / self.noise.factor(ids)[:, None, None]
+                    self.noise.learn(ids, group.z[sure] - mean, cov, noise)
         dropped = self.manager.observe(seen)
         if self.config.kind == "joint":
             more = surplus(self.manager.names, self.manager.observations, seen, self.config.active)
@@ -474,15 +467,20 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         rows = np.flatnonzero(pair.for_map)
         features = pair.features.take(rows)
         subsample = ParticleSubsample.of(belief, self.config.subsample)
-        ids = self._alike(features.descriptors, subsample)
+        ids = self.places.in_view(subsample.middle, subsample.std_direction_rad)
+        store, limits = self.store, self.config.limits
+        if ids.size and rows.size:
+            # Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
+            most = limits.largest(store.length) / limits.ratio
+            products = features.descriptors @ store.descriptors[store.rows(ids)].T
+            ids = ids[products.max(axis=0) >= 1.0 - 0.5 * most**2]
         if pair.uncertain:
             ids = ids[np.isin(ids, self.seen_again())]
         if not (ids.size and rows.size):
             return out
         expected = subsample.expected(belief, self.model, ids)
         k, m = self.gate.pairs(features, expected)
-        store = self.store
-        found = match_pairs(features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits)
+        found = match_pairs(features.descriptors, store.descriptors, (k, store.rows(ids)[m]), limits)
         taken = store.ids[found.second]
         agreed = self._agreed(
             expected.take(np.searchsorted(ids, taken)), features.take(found.first), pair.uncertain, belief.rng
@@ -541,30 +539,6 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if self.noise is not None:
             self.noise.restore(arrays)
 
-    def _learn(self, group: Observations, belief: Belief, noise: PlaceNoise) -> None:
-        """From what an update left of a group's innovations, but for outliers."""
-        assert group.ids is not None
-        sure = group.ids >= 0
-        if group.log_odds is not None:
-            sure &= group.log_odds >= 0.0
-        if sure.any():
-            ids = group.ids[sure]
-            mean, cov = self.expected(belief, ids)
-            noise.learn(ids, group.z[sure] - mean, cov, group.cov[sure] / noise.factor(ids)[:, None, None])
-
-    def _alike(self, descriptors: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
-        """Landmarks that may be in view and whose descriptors come near to that of any feature, ascending.
-
-        Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
-        """
-        store, limits = self.store, self.config.limits
-        ids = self.places.in_view(subsample.middle, subsample.std_direction_rad)
-        if not ids.size or not descriptors.shape[0]:
-            return ids[:0]
-        most = limits.largest(store.length) / limits.ratio
-        near = (descriptors @ store.descriptors[store.rows(ids)].T).max(axis=0) >= 1.0 - 0.5 * most**2
-        return np.asarray(ids[near])
-
     def _agreed(
         self, expected: Expected, features: StereoFeatures, uncertain: bool, rng: np.random.Generator
     ) -> np.ndarray:
@@ -583,8 +557,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
 
 
 @final
-class NamedLandmarks(Landmarks[NamedPixels]):
-    """Landmarks by the names that the recording gives them: known association."""
+class NamedLandmarks(Landmarks[FeatureFrame]):
+    """Landmarks by the names that the recording gives them."""
 
     def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
         self.rig, self.config, self.model, self.landmark = rig, config.map, StereoPoint(rig), Point(3)
@@ -594,21 +568,20 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         self._held = np.zeros(0, dtype=np.int64)
         self._observations = np.zeros(0, dtype=np.int64)
 
-    def observe(self, frame: Pair[NamedPixels], belief: Belief) -> Sequence[Observations]:
-        self.ids = np.where(frame.for_map, frame.features.names, NULL)
-        return self._sensor.observe(_free(frame), belief)
+    def observe(self, frame: Pair[FeatureFrame], belief: Belief) -> Sequence[Observations]:
+        self.ids = np.where(frame.for_map, frame.features.landmarks, NULL)
+        return self._sensor.observe(frame.features.take(frame.for_map), belief)
 
     def new_landmarks(
-        self, frame: Pair[NamedPixels], belief: Belief, observed: Sequence[Observations]
+        self, frame: Pair[FeatureFrame], belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        names = np.unique(frame.features.names[frame.for_map])
-        self._observations[np.isin(self._held, names)] += 1
-        started = self._sensor.new_landmarks(_free(frame), belief, observed)
-        held = np.union1d(self._held, names)
-        observations = np.ones(held.size, dtype=np.int64)
-        observations[np.searchsorted(held, self._held)] = self._observations
+        shown = frame.features.take(frame.for_map)
+        started = self._sensor.new_landmarks(shown, belief, observed)
+        held = np.union1d(self._held, shown.landmarks)
+        observations = np.isin(held, shown.landmarks).astype(np.int64)
+        observations[np.searchsorted(held, self._held)] += self._observations
         if self.config.kind == "joint":
-            dropped = surplus(held, observations, names, self.config.active)
+            dropped = surplus(held, observations, shown.landmarks, self.config.active)
             if dropped.size:
                 belief.map.remove(dropped)
             kept = ~np.isin(held, dropped)
@@ -616,10 +589,10 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         self._held, self._observations = held, observations
         return started
 
-    def associate(self, pair: Pair[NamedPixels], belief: Belief) -> np.ndarray:
+    def associate(self, pair: Pair[FeatureFrame], belief: Belief) -> np.ndarray:
         """By their names; where the view is uncertain, only those that were observed more than once."""
-        known = self.seen_again() if pair.uncertain else self._held
-        return np.where(pair.for_map & np.isin(pair.features.names, known), pair.features.names, NULL)
+        known, names = self.seen_again() if pair.uncertain else self._held, pair.features.landmarks
+        return np.where(pair.for_map & np.isin(names, known), names, NULL)
 
     def seen_again(self) -> np.ndarray:
         return self._held[self._observations >= SEEN_AGAIN]
@@ -629,8 +602,3 @@ class NamedLandmarks(Landmarks[NamedPixels]):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self._held, self._observations = read(arrays, _NAMES, "names/").values()
-
-
-def _free(pair: Pair[NamedPixels]) -> Any:
-    features = pair.features.take(pair.for_map)
-    return FeatureFrame(pair.stamp_ns, features.names, features.z, features.cov)

@@ -1,6 +1,6 @@
 """Dead reckoning: where the camera has come by visual odometry, pair after pair, also over pairs that could not be used."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -54,7 +54,7 @@ class DeadReckoning:
         cross: np.ndarray | None = None,
         noise: np.ndarray | None = None,
     ) -> "DeadReckoning":
-        """At a pair, `step` after the last measured one, which it was matched with.
+        """At a pair, `step` after the last measured one, which it was matched with, or that is passed over.
 
         `step` is what was expected where it `is_assumed`; `cross` (6, 6) is the covariance of the last step's error and this
         one's, None for independent ones, `noise` that of this step, as the attribute.
@@ -70,20 +70,6 @@ class DeadReckoning:
             hidden=hidden,
             velocity_at_update=self.velocity_at_update,
             noise=np.zeros((0, 6, 3)) if noise is None else noise,
-        )
-
-    def passing_over(self) -> "DeadReckoning":
-        """After a pair that could not be measured: the next one is measured from the same pair as this one."""
-        return self if self.stamp_ns is None else replace(self, passed_over=self.passed_over + 1)
-
-    def extrapolated(self, step: Odometry) -> "DeadReckoning":
-        """What to report of a pair that was passed over, where the camera is expected to have moved by `step`."""
-        return DeadReckoning(
-            self.stamp_ns,
-            self.velocity,
-            self.since_update.then(step),
-            SE3.compose(self.world_from_camera, step.delta),
-            assumed=self.assumed + self.passed_over,
         )
 
     def updated(self) -> "DeadReckoning":

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, poses, read, truths
-from rbpf.core.filter import Filter, StepReport
+from rbpf.core.filter import Filter
 from rbpf.core.models import NULL, Landmark, Part, Proposal
 from rbpf.core.particles import Estimate
 from rbpf.core.resampling import Consolidation
@@ -23,7 +23,7 @@ from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
-from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry, pixel_gains
+from rbpf.motion.stereo_vo import VisualOdometry, pixel_gains
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
@@ -46,8 +46,8 @@ from rbpf.systems.system import (
     NIS_DOF,
     RESAMPLED,
     Column,
+    FrameLog,
     Ragged,
-    Recorded,
     System,
     Tracked,
     TrackingState,
@@ -136,10 +136,10 @@ class StereoSlam(System):
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
-        self.joint = JointMap(SE3, compiled=config.compiled) if config.map.kind == "joint" else None
-        self._once = self.joint is not None or config.odometry.role == "proposal"
-        self._proposal = ProposalConfig("ekf", 1) if self.joint else config.proposal
-        refined = self.joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
+        joint = JointMap(SE3, compiled=config.compiled) if config.map.kind == "joint" else None
+        self._once = joint is not None or config.odometry.role == "proposal"
+        self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
+        refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
         if self._once and not refined:
             raise InputError(
                 "odometry.role=proposal needs proposal.kind=ekf and map.weigh=all: the motion is then known by the landmarks "
@@ -151,13 +151,13 @@ class StereoSlam(System):
         self.filter = Filter(
             OdometryMotion(SE3, added, free),
             self.front_end.landmarks,
-            self.joint or own,
+            joint or own,
             self._proposal.build(),
             config.resampling.build(),
             config.particles,
             np.random.default_rng(config.seed),
-            lag=1 if self.joint else self.lag,
-            consolidation=Consolidation(config.map.window, config.resampling.ess_threshold) if self.joint else None,
+            lag=1 if joint else self.lag,
+            consolidation=Consolidation(config.map.window, config.resampling.ess_threshold) if joint else None,
         )
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
@@ -209,10 +209,11 @@ class StereoSlam(System):
                 few = f"it shows {len(pair)} features, {least} are needed"
             why = f"{problem}; {few}" if problem and len(pair) else problem or few
             messages.append(f"passed over: {why}; the last velocity is assumed, widely")
-            self.reckoning = expected = self.reckoning.passing_over()
-            if expected.stamp_ns is not None:
-                step = self.visual_odometry.prior.increment(expected.velocity, dt)
-                expected = expected.extrapolated(self._constrained(step))
+            expected = last = self.reckoning
+            if last.stamp_ns is not None:  # the next pair is measured from the same one as this
+                self.reckoning = replace(last, passed_over=last.passed_over + 1)
+                step = self._constrained(self.visual_odometry.prior.increment(last.velocity, dt))
+                expected = last.moved(last.stamp_ns, step, last.velocity, is_assumed=True)
             motion = _Motion(expected)
         at = motion.at
         seconds_odometry = time.perf_counter() - started - seconds_features
@@ -261,6 +262,10 @@ class StereoSlam(System):
         state = TrackingState.PREDICTED
         if measured and not (updated and assumed):
             state = TrackingState.LOST if assumed else TrackingState.TRACKED
+        figures = {"observed": 0, "resampled": False, "nis_dof": 0, "ess": 0.0, "log_evidence": 0.0, "nis": 0.0}
+        if report is not None:
+            weighed = [group.ids for group in report.groups if Part.STATE in group.updates and group.ids is not None]
+            figures = filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed)}
         ids, kinds = front_end.landmarks_of(pair, updated)
         previous = np.full(len(pair), NULL, dtype=np.int64)
         previous[motion.rows[1][motion.inliers]] = motion.rows[0][motion.inliers]
@@ -274,7 +279,7 @@ class StereoSlam(System):
                 "agreeing": int(motion.inliers.sum()),
                 "assumed": assumed,
                 "updated": updated,
-                **_figures(report),
+                **figures,
                 "seconds_features": seconds_features,
                 "seconds_odometry": seconds_odometry,
                 "seconds_matching": landmarks.seconds if updated else 0.0,
@@ -293,9 +298,9 @@ class StereoSlam(System):
 
     def particle_poses(self) -> np.ndarray:
         """(N, 7) world_from_camera of the particles at the last pair: between updates the odometry moves them."""
-        return SE3.compose(self.filter.belief().map.world(self.filter.particles.state), self.since_update)
+        return SE3.compose(super().particle_poses(), self.since_update)
 
-    def measurements(self, name: str, log: Recorded) -> FeatureLog:
+    def measurements(self, name: str, log: FrameLog) -> FeatureLog:
         """Every pixel that odometry or map used, once, as tracks; of pixels with names all of them."""
         shown = [log.observed(t) for t in range(len(log))]
         if self.front_end.names_landmarks:
@@ -306,7 +311,7 @@ class StereoSlam(System):
             frames = tracked_features(log.stamps_ns, log["measured"], shown)
         return FeatureLog(name, self.rig, frames)
 
-    def summary(self, log: Recorded) -> dict[str, Any]:
+    def summary(self, log: FrameLog) -> dict[str, Any]:
         """What the pairs showed, and the filter's figures over its updates."""
         updated = log["updated"].astype(bool)
         evidence = log["log_evidence"][updated]
@@ -389,8 +394,14 @@ class StereoSlam(System):
         )
         moving = np.zeros(len(matches), dtype=bool)
         if doubted:
-            support, informed = self._log_support(pair, found), bool(before.velocity.any())
-            chosen = camera_motion(found, labels, before.hidden, support, informed)
+            # What the map says of each candidate, and of the prior alone.
+            support = np.zeros(len(found.motions) + 1)
+            if self.filter.steps:
+                view = replace(pair, uncertain=before.assumed > 0)
+                for number, step in enumerate([*(motion.odometry for motion in found.motions), found.prior]):
+                    belief = self.filter.expect(before.since_update.then(self._constrained(step)), stamp_ns)
+                    support[number] = self.front_end.landmarks.log_support(view, belief)
+            chosen = camera_motion(found, labels, before.hidden, support, bool(before.velocity.any()))
             for number, other in enumerate(found.motions):
                 moving |= other.inliers & (number != chosen)
             many = " and ".join(str(motion.inliers.sum()) for motion in found.motions)
@@ -471,16 +482,6 @@ class StereoSlam(System):
         prior = self._constrained(self.visual_odometry.prior.increment(self.reckoning.velocity_at_update, dt))
         return view, prior, self._proposal.build(SE3.local(prior.delta, moved.delta))
 
-    def _log_support(self, pair: Pair[Any], found: CandidateMotions) -> np.ndarray:
-        """What the map says (M + 1,) of each candidate, and of the prior alone."""
-        steps = [*(motion.odometry for motion in found.motions), found.prior]
-        if not self.filter.steps:
-            return np.zeros(len(steps))
-        view, before = replace(pair, uncertain=self.reckoning.assumed > 0), self.reckoning.since_update
-        controls = [before.then(self._constrained(step)) for step in steps]
-        beliefs = (self.filter.expect(control, pair.stamp_ns) for control in controls)
-        return np.array([self.front_end.landmarks.log_support(view, belief) for belief in beliefs])
-
 
 _NO_ROWS, _NO_MATCHES = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)
 
@@ -494,11 +495,3 @@ class _Motion(NamedTuple):
     inliers: np.ndarray = _NO_MATCHES  # (M,) which agree with the camera's motion
     moving: np.ndarray = _NO_MATCHES  # (M,) which agree on another one: they are of things that move
     message: str = ""  # in words, what had to be assumed
-
-
-def _figures(report: StepReport | None) -> dict[str, Any]:
-    """Values of an update; zeros without one."""
-    if report is None:
-        return {"observed": 0, "resampled": False, "nis_dof": 0, "ess": 0.0, "log_evidence": 0.0, "nis": 0.0}
-    weighed = (group.ids for group in report.groups if Part.STATE in group.updates)
-    return filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed if ids is not None)}

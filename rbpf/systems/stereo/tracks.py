@@ -60,8 +60,27 @@ class _Tracks:
         tracks = np.full(len(numbers), NULL, dtype=np.int64)
         previous = shown["previous"]
         matched = np.argsort(previous, kind="stable")[(previous < 0).sum() :]
-        tracks[matched] = self._continued(previous[matched])
-        self._name(tracks, shown["landmarks"])
+        # Those that go on from the last pair; what has no track there yet begins in it.
+        before, (last_tracks, last_numbers) = previous[matched], self._last
+        if before.max(initial=-1) >= last_tracks.size:
+            raise InputError("the run's log is damaged: a feature follows one that the pair before it has not")
+        fresh = before[last_tracks[before] < 0]
+        last_tracks[fresh] = self._begin(fresh.size)
+        self._append(self._step, last_tracks[fresh], last_numbers[fresh])
+        tracks[matched] = last_tracks[before]
+        # Those that the map names; where odometry says another one, both are joined.
+        present, names = set(tracks.tolist()), shown["landmarks"]
+        for row in np.flatnonzero(names >= 0).tolist():
+            track, name = int(tracks[row]), int(names[row])
+            known = self._named.get(name)
+            if track < 0:
+                track = known if known is not None and known not in present else int(self._begin(1)[0])
+                tracks[row] = track
+                present.add(track)
+            elif known is not None and known != track:
+                self._joined.append((known, track))
+            if known is None:
+                self._named[name] = track
         seen = tracks >= 0
         self._append(step, tracks[seen], numbers[seen])
         self._step, self._last = step, (tracks, numbers)
@@ -84,31 +103,6 @@ class _Tracks:
         first = max(self._named, default=-1) + 1
         roots = [_root(parent, track) for track in range(self._count)]
         return np.array([name_of.get(root, first + root) for root in roots], dtype=np.int64)
-
-    def _continued(self, before: np.ndarray) -> np.ndarray:
-        """Tracks of rows of the last pair; those that have none yet begin there."""
-        tracks, numbers = self._last
-        if before.max(initial=-1) >= tracks.size:
-            raise InputError("the run's log is damaged: a feature follows one that the pair before it has not")
-        fresh = before[tracks[before] < 0]
-        tracks[fresh] = self._begin(fresh.size)
-        self._append(self._step, tracks[fresh], numbers[fresh])
-        return tracks[before]
-
-    def _name(self, tracks: np.ndarray, names: np.ndarray) -> None:
-        """Fills in the tracks (K,) of features that the map names; where odometry says another one, both are joined."""
-        present = set(tracks.tolist())
-        for row in np.flatnonzero(names >= 0).tolist():
-            track, name = int(tracks[row]), int(names[row])
-            known = self._named.get(name)
-            if track < 0:
-                track = known if known is not None and known not in present else int(self._begin(1)[0])
-                tracks[row] = track
-                present.add(track)
-            elif known is not None and known != track:
-                self._joined.append((known, track))
-            if known is None:
-                self._named[name] = track
 
     def _begin(self, count: int) -> np.ndarray:
         self._count += count
