@@ -19,10 +19,9 @@ import numpy as np
 
 from rbpf.core.checkpoint import fitting, load_arrays, read_one, text
 from rbpf.errors import InputError, printable
-from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.provenance import decisive_settings, require_same
 from rbpf.runs.truth import RunTruth
-from rbpf.systems.system import System, Tracked
+from rbpf.systems.system import FrameLog, System, Tracked
 
 
 class Source(Protocol):

@@ -12,18 +12,29 @@ which leaves the posterior invariant (a Gibbs step for x_0, W. Gilks and C. Berz
 it is instead of a draw from it, marginalises the world's place exactly. Poses and landmarks are reported relative to it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import elements, integers, numbers, read, read_one
-from rbpf.core.filter import Filter, StepReport
+from rbpf.core.checkpoint import elements, integers, numbers, read
+from rbpf.core.filter import StepReport
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import innovation_covariance, linearise
-from rbpf.core.models import NULL, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Records
+from rbpf.core.models import (
+    NULL,
+    Conditional,
+    Likelihood,
+    LogDensities,
+    ObservationModel,
+    Observations,
+    Part,
+    Records,
+    Transition,
+)
 from rbpf.core.particles import Estimate, Information, Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
@@ -32,8 +43,6 @@ from rbpf.maps.landmark_map import LandmarkMap
 
 #: A landmark that owes more than this fraction of its information to the first frame says nothing about the start.
 _MOST_OF_ALL = 0.999
-# Names in a checkpoint, of the parts of the first motion and of the latest re-estimation.
-_SECOND, _LATEST = ("second", "state", "delta", "factor"), ("latest", "latest_mean", "latest_factor")
 
 
 @dataclass(frozen=True)
@@ -44,146 +53,105 @@ class Anchored:
     factor: np.ndarray
 
 
-def relative_estimate(
-    space: LieGroup, anchored: Anchored, state: np.ndarray, log_weights: np.ndarray, origin: np.ndarray | None = None
-) -> Estimate:
-    """Mean and covariance of states (N, E) relative to the anchored frame, origin · x_0⁻¹ · x; no origin, the identity."""
+def relative_estimate(space: LieGroup, anchored: Anchored, state: np.ndarray, log_weights: np.ndarray) -> Estimate:
+    """Mean and covariance of states (N, E) relative to the anchored frame, x_0⁻¹ · x."""
     relative = space.between(anchored.mean, state)
     factor = space.adjoint(space.inverse(relative)) @ anchored.factor
-    base = relative if origin is None else space.compose(origin, relative)
-    return mixture_estimate(Prior(space, base, np.zeros((1, space.dim)), factor), None, log_weights)
+    return mixture_estimate(Prior(space, relative, np.zeros((1, space.dim)), factor), None, log_weights)
 
 
 @final
-class StartAnchor:
-    """Remembers the first frame and motion of a filter started from one known state, and re-estimates the start.
+class StartAnchor(Conditional):
+    """Remembers the first frame and motion of a filter that starts from the identity, and re-estimates the start.
 
-    Call `after_step` after every step; between re-estimations, `every` so many, descendants inherit their ancestor's. The
-    likelihood is of the first frame's innovations, by default Gaussian.
+    A part of the filter, so that descendants inherit what is kept of their ancestor. Call `after_step` after every step.
+
+    Args:
+        landmarks: the filter's map.
+        model: how the first frame measured landmarks.
+        every: steps between re-estimations.
+        likelihood: of the first frame's innovations, by default Gaussian.
+
+    Raises InputError: `every` is not positive.
     """
 
-    def __init__(self, filter_: Filter, every: int = 10, likelihood: Likelihood | None = None) -> None:
+    supplies = Part("anchor")
+
+    def __init__(
+        self, landmarks: LandmarkMap, model: ObservationModel, every: int = 10, likelihood: Likelihood | None = None
+    ) -> None:
         if every < 1:
             raise InputError(f"an anchor is re-estimated every 1, 2, … steps, got {every}")
-        self._filter, self._every = filter_, every
-        self._start = filter_.particles.state[0].copy()
-        self._proposal = EkfProposal(iterations=2)
+        self.space, self._landmarks, self._model, self._every = landmarks.space, landmarks, model, every
         self._likelihood = likelihood or Gaussian()
-        self._seen: list[tuple[np.ndarray, NewLandmarks]] = []
-        self._second: _FirstMotion | None = None
-        self._latest: tuple[int, Anchored] | None = None
+        self._proposal, self._rng = EkfProposal(iterations=2), np.random.default_rng(0)  # it draws nothing
 
-    def after_step(self, report: StepReport, control: object = None) -> Anchored:
-        """Takes note of a step that moved by `control`; returns the start in each present particle's world."""
-        filter_, steps = self._filter, self._filter.steps
-        if steps == 1:
-            first = 0
-            for new_landmarks in report.first_observations:
-                count = new_landmarks.z.shape[0]
-                self._seen.append((report.new_landmarks[first : first + count], new_landmarks))
-                first += count
-            self._stamp_ns = report.stamp_ns
-        elif steps == 2:
-            dt = (report.stamp_ns - self._stamp_ns) * 1e-9
-            transition = filter_.motion.transition(self._start[None], control, dt)
-            delta = filter_.space.between(self._start, transition.mean[0])
-            generation = filter_.lineage.generation
-            filter_.lineage.retain(generation)
-            self._second = _FirstMotion(generation, filter_.particles.state.copy(), delta, transition.noise_factor[0])
-        if self._latest is None or steps % self._every == 0 or steps <= 3:
-            anchored, lineage = self.estimate(), self._filter.lineage
-            if self._latest is not None:
-                lineage.release(self._latest[0])
-            lineage.retain(lineage.generation)
-            self._latest = (lineage.generation, anchored)
-        return self.current()
+    def begin(self, n: int, lineage: Lineage) -> None:
+        space, p = self.space, self._model.dim
+        self._steps = 0
+        # Landmarks of the first frame, and their measurements.
+        self._ids, self._z, self._cov = np.zeros(0, dtype=np.int64), np.zeros((0, p)), np.zeros((0, p, p))
+        # Where the first motion led each particle (N, E), its mean Δ (E,) and noise factor (d, r).
+        self._second, self._delta, self._factor = space.identity((n,)), space.identity(), np.zeros((space.dim, 0))
+        self._latest = Anchored(space.identity((n,)), np.zeros((n, space.dim, space.dim)))
 
-    def current(self) -> Anchored:
-        """The latest re-estimation, inherited by the present particles."""
-        assert self._latest is not None
-        generation, anchored = self._latest
-        rows = self._filter.lineage.rows(generation)
-        return Anchored(anchored.mean[rows], anchored.factor[rows])
+    def predict(self, transition: Transition, space: LieGroup, dt: float) -> None:
+        self._transition = transition
+
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """Takes note of the first motion: all particles came from the start, and moved alike but for noise."""
+        self._steps += 1
+        if self._steps == 2:
+            self._second, self._delta = state.copy(), self._transition.mean[0]
+            self._factor = self._transition.noise_factor[0]
+        return LogDensities(*np.zeros((2, len(state))))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        self._second = self._second[ancestors]
+        self._latest = Anchored(self._latest.mean[ancestors], self._latest.factor[ancestors])
+
+    def after_step(self, report: StepReport) -> Anchored:
+        """The start in each present particle's world; between re-estimations as it was inherited."""
+        if self._steps == 1 and report.first_observations:
+            first = report.first_observations
+            self._ids, self._z = report.new_landmarks, np.concatenate([each.z for each in first])
+            self._cov = np.concatenate([each.cov for each in first])
+        if self._steps <= 3 or self._steps % self._every == 0:
+            self._latest = self.estimate()
+        return self._latest
 
     def estimate(self) -> Anchored:
         """The start in each present particle's world from all that is known now; before any motion, the start."""
-        space, n = self._filter.space, self._filter.n
-        if self._second is None:
-            return Anchored(np.repeat(self._start[None], n, axis=0), np.zeros((n, space.dim, space.dim)))
+        if self._steps < 2:
+            return self._latest
         # The first motion, backwards: x_0 = x_1 · Exp(−w) · Δ⁻¹ = x_1 Δ⁻¹ · Exp(−Ad_Δ w), with Δ = x_0⁻¹ E[x_1].
-        second = self._second
-        ancestors = second.state[self._filter.lineage.rows(second.generation)]
-        base = space.compose(ancestors, space.inverse(second.delta))
-        backwards = np.repeat((space.adjoint(second.delta) @ second.factor)[None], n, axis=0)
+        space, n = self.space, len(self._second)
+        base = space.compose(self._second, space.inverse(self._delta))
+        backwards = np.repeat((space.adjoint(self._delta) @ self._factor)[None], n, axis=0)
         prior = Prior(space, base, np.zeros((1, space.dim)), backwards)
         # The first frame's measurements of landmarks that are still held, which must be known from elsewhere too.
-        rest, groups = LandmarkMap(space, compiled=False), list[Observations]()
+        rest, held = LandmarkMap(space, compiled=False), self._landmarks.holds(self._ids)
         rest.begin(n, Lineage(n))
-        for ids, first in self._seen:
-            held = ids[self._filter.belief().map.holds(ids)]
-            if held.size:
-                groups.append(self._without_first_frame(rest, held, first, np.isin(ids, held)))
+        groups = [self._without_first_frame(rest, held)] if held.any() else []
 
         def linearise_at(increment: np.ndarray) -> Information:
             total = rest.information(prior.at(increment), groups, prior)
             charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
             return charted.shifted(np.broadcast_to(increment - prior.mean, (n, space.dim)))
 
-        proposed = self._proposal.propose(prior, linearise_at, self._filter.rng)
+        proposed = self._proposal.propose(prior, linearise_at, self._rng)
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
         # A square factor (N, d, d), also of noise of lower rank.
         factor = prior.factor @ proposed.root
         lacking = np.zeros((n, space.dim, space.dim - factor.shape[2]))
         return Anchored(mean, np.concatenate([factor, lacking], axis=2))
 
-    def state_estimate(self, anchored: Anchored) -> Estimate:
-        """Mean and covariance of the present state relative to the start, start · x_0⁻¹ · x."""
-        space, particles = self._filter.space, self._filter.particles
-        return relative_estimate(space, anchored, particles.state, particles.log_weights, self._start)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        out = {"anchor/groups": np.array(len(self._seen))}
-        for number, (ids, first) in enumerate(self._seen):
-            out |= {f"anchor/{number}/ids": ids, f"anchor/{number}/z": first.z, f"anchor/{number}/cov": first.cov}
-        if self._second is not None:
-            out |= {f"anchor/{name}": np.asarray(part) for name, part in zip(_SECOND, self._second, strict=True)}
-        if self._latest is not None:
-            generation, anchored = self._latest
-            parts = np.array(generation), anchored.mean, anchored.factor
-            out |= {f"anchor/{name}": part for name, part in zip(_LATEST, parts, strict=True)}
-        return out
-
-    def restore(self, arrays: dict[str, np.ndarray], model: ObservationModel, landmark: Landmark) -> None:
-        """The inverse of `arrays`; all first observations must have been of one model and parametrisation."""
-        lineage, space, sizes = self._filter.lineage, self._filter.space, {"n": self._filter.n}
-        z, cov = numbers("seen", model.dim), numbers("seen", model.dim, model.dim)
-        seen = {"ids": integers("seen", least=0), "z": z, "cov": cov}
-        for number in range(int(read_one(arrays, "anchor/groups", integers(least=0)))):
-            found = read(arrays, seen, f"anchor/{number}/")
-            self._seen.append((found["ids"], NewLandmarks(found["z"], found["cov"], model, landmark)))
-        if "anchor/second" in arrays:
-            kinds = integers(), elements(space, "n"), elements(space), numbers(space.dim, "rank")
-            second = dict(zip(_SECOND, kinds, strict=True))
-            generation, *parts = read(arrays, second, "anchor/", **sizes).values()
-            self._second = _FirstMotion(int(generation), *parts)
-            lineage.take_up(self._second.generation)
-        if "anchor/latest" in arrays:
-            latest = dict(
-                zip(_LATEST, (integers(), elements(space, "n"), numbers("n", space.dim, space.dim)), strict=True)
-            )
-            generation, *parts = read(arrays, latest, "anchor/", **sizes).values()
-            self._latest = int(generation), Anchored(*parts)
-            lineage.take_up(self._latest[0])
-
-    def _without_first_frame(
-        self, rest: LandmarkMap, ids: np.ndarray, first: NewLandmarks, rows: np.ndarray
-    ) -> Observations:
+    def _without_first_frame(self, rest: LandmarkMap, held: np.ndarray) -> Observations:
         """Adds landmarks (K,) without the first frame's information, by a Kalman update with −R; its rows, to be used anew."""
-        space, n, landmark_map = self._filter.space, self._filter.n, self._filter.belief().map
-        model, z, cov_z = first.model, first.z[rows], first.cov[rows]
-        records, present = landmark_map.read(ids), ~np.isneginf(landmark_map.log_odds(ids))
-        start = np.repeat(self._start[None, None], n, axis=0)
-        nu, jac = linearise(model, space, z, start, records.mean, records.const)
+        ids, z, cov_z = self._ids[held], self._z[held], self._cov[held]
+        records, present = self._landmarks.read(ids), ~np.isneginf(self._landmarks.log_odds(ids))
+        start = self.space.identity((len(self._second), 1))
+        nu, jac = linearise(self._model, self.space, z, start, records.mean, records.const)
         assert jac.landmark is not None
         explained = innovation_covariance(jac.landmark, records.cov, np.zeros_like(cov_z))
         chol = np.broadcast_to(gaussian.cholesky(cov_z), explained.shape)
@@ -194,14 +162,21 @@ class StartAnchor:
         gain = records.cov @ np.swapaxes(jac.landmark, -1, -2) @ gaussian.inverse(left)
         mean = records.mean - np.einsum("nkdp,nkp->nkd", gain, nu)
         cov = gaussian.symmetrise(records.cov + gain @ jac.landmark @ records.cov)
-        added = rest.add_records(Records(mean, cov, records.const), landmark_map.landmark_of(int(ids[0])))
-        return Observations(z, cov_z, model, self._likelihood, ids=np.where(use, added, NULL))
+        added = rest.add_records(Records(mean, cov, records.const), self._landmarks.landmark_of(int(ids[0])))
+        return Observations(z, cov_z, self._model, self._likelihood, ids=np.where(use, added, NULL))
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        latest = {"latest_mean": self._latest.mean, "latest_factor": self._latest.factor}
+        first = {"ids": self._ids, "z": self._z, "cov": self._cov, "steps": np.array(self._steps)}
+        return first | {"second": self._second, "delta": self._delta, "factor": self._factor} | latest
 
-class _FirstMotion(NamedTuple):
-    """Where the first motion led each particle of a generation (N, E), its mean Δ (E,) and noise factor (d, r)."""
-
-    generation: int
-    state: np.ndarray
-    delta: np.ndarray
-    factor: np.ndarray
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        space, d, p = self.space, self.space.dim, self._model.dim
+        schema = {
+            "ids": integers("seen", least=0), "z": numbers("seen", p), "cov": numbers("seen", p, p),
+            "steps": integers(least=0), "second": elements(space, "n"), "delta": elements(space),
+            "factor": numbers(d, "rank"), "latest_mean": elements(space, "n"), "latest_factor": numbers("n", d, d),
+        }  # fmt: skip
+        self._ids, self._z, self._cov, steps, *moved, mean, factor = read(arrays, schema, n=len(self._second)).values()
+        self._steps, self._latest = int(steps), Anchored(mean, factor)
+        self._second, self._delta, self._factor = moved

@@ -46,7 +46,16 @@ def load_settings(
         raise InputError(f"{path} holds settings of the system {found!r}, not of {system}")
     values = {name: value for name, value in values.items() if name not in HEADER}
     for pair in pairs:
-        _put(values, pair)
+        key, equals, text = pair.partition("=")
+        if not equals or not key:
+            raise InputError(f"--set takes key=value, got {pair!r}")
+        *outer, last = key.split(".")
+        group: Any = values
+        for name in outer:
+            group = group.setdefault(name, {})
+            if not isinstance(group, dict):
+                raise InputError(f"--set {pair}: {name} is no group of settings")
+        group[last] = None if text in ("", "null", "none") else text
     values.update(given)
     _refuse_unknown(values, kind, "")
     try:
@@ -58,19 +67,6 @@ def load_settings(
         if isinstance(error.__cause__, SettingError):
             name, words = f"{name}.{error.__cause__.name}".lstrip("."), error.__cause__.words
         raise InputError(f"settings: {name} {words}".replace(" Expected", ": expected")) from error
-
-
-def _put(values: dict[str, Any], pair: str) -> None:
-    key, equals, text = pair.partition("=")
-    if not equals or not key:
-        raise InputError(f"--set takes key=value, got {pair!r}")
-    *outer, last = key.split(".")
-    group: Any = values
-    for name in outer:
-        group = group.setdefault(name, {})
-        if not isinstance(group, dict):
-            raise InputError(f"--set {pair}: {name} is no group of settings")
-    group[last] = None if text in ("", "null", "none") else text
 
 
 def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

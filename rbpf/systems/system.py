@@ -5,23 +5,25 @@
         frame = slam.track(image, stamp_ns)      # pose, covariance, state of tracking, what was observed
 
 A system does not know where its frames come from nor how many there are, and keeps what it needs to go on, no more. Who
-wants a record of a run, pictures or files listens to what `track` returns (`rbpf.runs`).
+wants a record of a run, pictures or files listens to what `track` returns (`FrameLog`, `rbpf.runs`).
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
 from rbpf.arrays import Float, Int
-from rbpf.core.checkpoint import fitting
+from rbpf.core.checkpoint import elements, fitting, integers, numbers, read, split
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import Map, Part
+from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
+from rbpf.maps.joint_map import JointMap
 from rbpf.ranges import require_memory
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
@@ -124,27 +126,133 @@ class Tracked:
     revision: Revision | None = None  #: earlier poses that this frame has changed; None where there are none.
 
 
-class Recorded(Protocol):
-    """What a run has kept of what the system said, see `rbpf.runs.frame_log.FrameLog`."""
+#: Columns of every system; times are written in milliseconds.
+COMMON = (
+    Column("seconds", "time that the system took, without reading and decoding", "s", table=TIMINGS),
+    Column("state", "state of tracking, as its place in `TrackingState`", kind=int),
+)
+
+#: Likewise; written where a system has a name for it (`System.waiting`).
+WAITING = Column("seconds_waiting", "time until the frame was read and decoded", "s")
+_STATES = list(TrackingState)
+
+
+@final
+class FrameLog:
+    """What a run remembers of every frame that a system takes: a row of its columns, and what the frame showed.
+
+    `log["ess"]` is a column (T, …); `log.poses`, `log.covs` and `log.stamps_ns` are the path as it is known now;
+    `log.observed(t)` is what frame t showed.
+    """
+
+    def __init__(self, system: "System") -> None:
+        self.space, self.ragged = system.space, tuple(system.observed)
+        waiting = replace(WAITING, table=None if system.waiting is None else TIMINGS, heading=system.waiting)
+        self.columns = (*COMMON, *system.columns, waiting)
+        self._path: dict[str, list[Any]] = {"stamps_ns": [], "poses": [], "covs": []}
+        self._rows: dict[str, list[Any]] = {column.name: [] for column in self.columns}
+        self._observed: dict[str, list[np.ndarray]] = {each.name: [] for each in self.ragged}
+
+    def __len__(self) -> int:
+        return len(self._path["stamps_ns"])
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        column = next((column for column in self.columns if column.name == name), None)
+        if column is None:
+            raise KeyError(f"no column is called {name!r}: {', '.join(self._rows)}")
+        return np.array(self._rows[name], dtype=column.kind).reshape(len(self), *column.shape)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._rows
 
     @property
     def stamps_ns(self) -> np.ndarray:
-        """(T,) times of the frames."""
+        return np.array(self._path["stamps_ns"], dtype=np.int64)
 
     @property
     def poses(self) -> np.ndarray:
-        """(T, E) world_from_body."""
+        """(T, E) world_from_body: filtered means, revised ones where the system has revised them."""
+        return np.array(self._path["poses"], dtype=float).reshape(len(self), self.space.size)
 
-    def __len__(self) -> int: ...
+    @property
+    def covs(self) -> np.ndarray:
+        """(T, d, d) covariances of the poses in the right chart at each."""
+        return np.array(self._path["covs"], dtype=float).reshape(len(self), self.space.dim, self.space.dim)
 
-    def __getitem__(self, name: str) -> np.ndarray:
-        """A column (T, …)."""
-
-    def observed(self, t: int) -> dict[str, np.ndarray]:
-        """What frame t showed."""
+    @property
+    def states(self) -> list[TrackingState]:
+        """State of tracking after each frame."""
+        return [_STATES[int(state)] for state in self._rows["state"]]
 
     def lost(self) -> np.ndarray:
-        """(T,) bool."""
+        """(T,) bool, whether the system said that it was lost."""
+        return np.array([state is TrackingState.LOST for state in self.states], dtype=bool)
+
+    def observed(self, t: int) -> dict[str, np.ndarray]:
+        """What frame t showed, arrays by name."""
+        return {name: frames[t] for name, frames in self._observed.items()}
+
+    def append(self, tracked: Tracked, seconds: float, waiting: float = 0.0) -> None:
+        own = {"seconds": seconds, "seconds_waiting": waiting, "state": _STATES.index(tracked.state)}
+        for name, values in self._rows.items():
+            values.append(own[name] if name in own else tracked.values[name])
+        for each in self.ragged:
+            rows = np.asarray(tracked.observed[each.name], dtype=each.kind)
+            self._observed[each.name].append(rows.reshape(-1, *each.shape))
+        for name, value in zip(self._path, (tracked.stamp_ns, tracked.pose, tracked.cov), strict=True):
+            self._path[name].append(value)
+        revision = tracked.revision
+        if revision is not None:
+            first = len(self) - len(revision.poses)
+            self._path["poses"][first:] = list(revision.poses)
+            self._path["covs"][first:] = list(revision.covs)
+
+    def table(self, name: str) -> tuple[list[str], list[list[Any]]]:
+        """A table of the run folder: its header, and its columns as plain numbers; times in milliseconds."""
+        header, columns = ["step"], [list(range(len(self)))]
+        if name == DIAGNOSTICS:
+            header, columns = ["step", "stamp_ns"], [*columns, self._path["stamps_ns"]]
+        for column in self.columns:
+            if column.table != name:
+                continue
+            values = self[column.name]
+            if name == TIMINGS:
+                header.append("milliseconds" if column.name == "seconds" else column.heading or column.name)
+                columns.append((1e3 * values).round(4).tolist())
+            else:
+                header.append(column.heading or column.name)
+                columns.append((values.astype(int) if column.kind is bool else values).tolist())
+        return header, columns
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        out = {"log/stamps_ns": self.stamps_ns, "log/poses": self.poses, "log/covs": self.covs}
+        out |= {f"log/{column.name}": self[column.name] for column in self.columns}
+        for each in self.ragged:
+            frames = self._observed[each.name]
+            empty = np.zeros((0, *each.shape), dtype=each.kind)
+            out[f"observed/{each.name}"] = np.concatenate([empty, *frames])
+            out[f"observed/{each.name}/counts"] = np.array([len(rows) for rows in frames], dtype=np.int64)
+        return out
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """The inverse of `arrays`, into an empty log of the same system; errors as `rbpf.core.checkpoint.read`."""
+        dim = self.space.dim
+        covs = numbers("frames", dim, dim)
+        path = {"stamps_ns": integers("frames"), "poses": elements(self.space, "frames"), "covs": covs}
+        columns = {c.name: numbers("frames", *c.shape, dtype=c.kind, values="any") for c in self.columns}
+        columns["state"] = integers("frames", least=0, below="states")
+        found = read(arrays, path | columns, "log/", states=len(_STATES))
+        for held in (self._path, self._rows):
+            held |= {name: list(found[name]) if found[name].ndim > 1 else found[name].tolist() for name in held}
+        for each in self.ragged:
+            entries = {
+                f"{each.name}/counts": integers("frames", least=0),
+                each.name: numbers("rows", *each.shape, dtype=each.kind, values="any"),
+            }
+            counts, rows = read(arrays, entries, "observed/", frames=len(self)).values()
+            if each.per and counts.tolist() != [len(rows) for rows in self._observed[each.per]]:
+                raise InputError(f"the array observed/{each.name} has other rows than observed/{each.per}")
+            self._observed[each.name] = split(rows, counts.tolist(), f"observed/{each.name}")
 
 
 class System(ABC):
@@ -189,18 +297,24 @@ class System(ABC):
         """The landmarks as they are known now, each a Gaussian within + between particles, in the reported world."""
 
     @abstractmethod
-    def measurements(self, name: str, log: Recorded) -> FeatureLog | Measurements | None:
+    def measurements(self, name: str, log: FrameLog) -> FeatureLog | Measurements | None:
         """What the system used of a recording of this name, landmarks named as in `map`: for a batch optimiser."""
+
+    @property
+    def joint(self) -> JointMap | None:
+        """One Gaussian of the whole map; None where, or as long as, every particle has a map of its own."""
+        held = self.filter.marginals.parts.get(Part.LANDMARK)
+        return held if isinstance(held, JointMap) else None
 
     def particle_poses(self) -> np.ndarray:
         """(N, E) world_from_body of the particles as they are now, in the reported world."""
-        return self.filter.particles.state[:, : self.space.size]
+        return self.filter.belief().map.world(self.filter.particles.state[:, : self.space.size])
 
-    def summary(self, log: Recorded) -> dict[str, Any]:
+    def summary(self, log: FrameLog) -> dict[str, Any]:
         """Further entries of a run's summary.json; they go before the common ones of the same name."""
         return {}
 
-    def files(self, log: Recorded) -> Mapping[str, dict[str, np.ndarray] | str]:
+    def files(self, log: FrameLog) -> Mapping[str, dict[str, np.ndarray] | str]:
         """Further files of a run's folder by name, arrays by their own names or text."""
         return {}
 

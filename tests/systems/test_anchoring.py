@@ -26,9 +26,10 @@ def frame(rng, pose, stamp_ns):
 
 
 def started(n):
-    sensor = NamedLandmarkSensor(RelativePosition(SE2), Point(2))
-    filter_ = Filter(OdometryMotion(SE2), sensor, LandmarkMap(SE2), EkfProposal(), n=n, rng=np.random.default_rng(0))
-    return filter_, StartAnchor(filter_, 1)
+    model, own = RelativePosition(SE2), LandmarkMap(SE2)
+    sensor, anchor = NamedLandmarkSensor(model, Point(2)), StartAnchor(own, model, 1)
+    filter_ = Filter(OdometryMotion(SE2), sensor, [own, anchor], EkfProposal(), n=n, rng=np.random.default_rng(0))
+    return filter_, anchor
 
 
 CONTROL = Odometry(np.array([0.1, 0.5, 0.0]), np.diag([0.02, 0.1, 0.1]) ** 2)
@@ -43,7 +44,7 @@ def drive(steps):
         if t:
             pose = SE2.retract(SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3))
         report = filter_.step(frame(rng, pose, t * 10**9), control, t * 10**9)
-        anchored = anchor.after_step(report, control)
+        anchored = anchor.after_step(report)
     return filter_, anchor, anchored
 
 
@@ -52,9 +53,7 @@ def test_law_of_the_start_equals_the_joint_gaussian():
     filter_, anchor, _ = drive(4)
     anchored = anchor.estimate()
     records = filter_.belief().read(np.arange(len(LANDMARKS)))
-    second = anchor._second
-    x1 = second.state[filter_.lineage.rows(second.generation)]
-    z0 = anchor._seen[0][1].z
+    x1, z0 = anchor._second, anchor._z
     model = RelativePosition(SE2)
     for i in (0, 17, 49):
         start = SE2.compose(x1[i], SE2.inverse(CONTROL.delta))
@@ -83,9 +82,8 @@ def test_law_of_the_start_equals_the_joint_gaussian():
 
 
 def test_zero_period_is_refused():
-    filter_, _ = started(2)
     with pytest.raises(InputError, match="every 1, 2"):
-        StartAnchor(filter_, 0)
+        StartAnchor(LandmarkMap(SE2), RelativePosition(SE2), 0)
 
 
 # Poses relative to a frame that each particle knows in its own world, up to a covariance.

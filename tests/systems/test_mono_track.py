@@ -8,7 +8,6 @@ import pytest
 from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers import ImageFrame
@@ -16,7 +15,7 @@ from rbpf.systems.mono.active_search import MotionFit, OutlierGate, RobustMotion
 from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.feature_sensor import InverseDepthRays
 from rbpf.systems.mono.slam import MonoSlam
-from rbpf.systems.system import Tracked, TrackingState
+from rbpf.systems.system import FrameLog, Tracked, TrackingState
 from tests.exactness.models import known
 from tests.systems.mono_logs import desk
 from tests.systems.plane_sequences import CAMERA, known_points, made_up_map, sequence

@@ -27,7 +27,7 @@ from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.laser import BeamSensor, Scan, Scanner
 from rbpf.systems.laser.config import LaserConfig
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.system import DIAGNOSTICS, FILTER_COLUMNS, Column, Recorded, System, Tracked, TrackingState
+from rbpf.systems.system import DIAGNOSTICS, FILTER_COLUMNS, Column, FrameLog, System, Tracked, TrackingState
 
 BARELY = 0.1  #: A scan that fits its map less than this, of 1, says nothing of where the robot is.
 
@@ -151,13 +151,13 @@ class LaserSlam(System):
         """The grid of the particle of highest weight."""
         return self.grid.picture(int(np.argmax(self.filter.particles.log_weights)))
 
-    def measurements(self, name: str, log: Recorded) -> None:
+    def measurements(self, name: str, log: FrameLog) -> None:
         """Scans are not measurements of landmarks: there is no batch problem of them."""
 
     def particle_poses(self) -> np.ndarray:
         return SE2.compose(self.filter.particles.state, self._since)
 
-    def summary(self, log: Recorded) -> dict[str, Any]:
+    def summary(self, log: FrameLog) -> dict[str, Any]:
         picture, fits = self.picture(), log["fit"][np.isfinite(log["fit"])]
         return {
             "scans_used": self._used,
@@ -168,7 +168,7 @@ class LaserSlam(System):
             "ancestors_of_first_generation": self.filter.history.distinct_first(),
         }
 
-    def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
+    def files(self, log: FrameLog) -> dict[str, dict[str, np.ndarray]]:
         """The grid; and the particles' paths at every scan since their first kept step, by odometry between steps."""
         picture, history, odometry = self.picture(), self.filter.history, log["odometry"]
         grid = {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner}

@@ -22,7 +22,6 @@ from rbpf.core.models import Conditional, MotionModel, Records, Sensor
 from rbpf.core.particles import mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
@@ -49,9 +48,9 @@ from rbpf.systems.system import (
     DIAGNOSTICS,
     FILTER_COLUMNS,
     Column,
+    FrameLog,
     Gauge,
     Ragged,
-    Recorded,
     Revision,
     System,
     Tracked,
@@ -184,11 +183,6 @@ class MonoSlam(System):
         """How far the camera was recognised in the last frame; None where it was not lost before it."""
         self.report: StepReport | None = None
         """What the filter did in the last frame."""
-
-    @property
-    def joint(self) -> JointMap | None:
-        """One Gaussian of the whole map; None as long as every particle has a map of its own."""
-        return self.hand_over.joint
 
     def track(self, image: np.ndarray | None, stamp_ns: int) -> Tracked:
         """Takes an image (H, W) uint8, grey, of the camera's size; None where there is none at this time.
@@ -343,7 +337,7 @@ class MonoSlam(System):
 
     def particle_poses(self) -> np.ndarray:
         """(N, 7) world_from_camera of the particles as they are now, in the reported world."""
-        poses, world = self.filter.belief().map.world(self.filter.particles.state[:, :7]), world_of(self.filter)
+        poses, world = super().particle_poses(), world_of(self.filter)
         return poses if world is None else SE3.between(world.mean, poses)
 
     def particle_paths(self) -> np.ndarray:
@@ -357,7 +351,7 @@ class MonoSlam(System):
         paths, world = self.filter.history.paths()[..., :7], world_of(self.filter)
         return paths if world is None else SE3.between(world.mean, paths)
 
-    def measurements(self, name: str, log: Recorded) -> FeatureLog:
+    def measurements(self, name: str, log: FrameLog) -> FeatureLog:
         """The features that the filter used, and those that started landmarks, under their numbers.
 
         Of a frame in which too little agreed to be trusted nothing was used.
@@ -373,7 +367,7 @@ class MonoSlam(System):
         found = self.hand_over.calibration(self.filter)
         return FeatureLog(name, self.camera if found is None else found[0], frames, self.known_points)
 
-    def summary(self, log: Recorded) -> dict[str, Any]:
+    def summary(self, log: FrameLog) -> dict[str, Any]:
         """Frames that were tracked, landmarks, and how much was found."""
         lost, searched, found, landmarks = log.lost(), log["searched"], log["found"], self.map()
         tracked, looked = np.flatnonzero(~lost), searched > 0
@@ -404,7 +398,7 @@ class MonoSlam(System):
         pairs = zip(NUMBERS, camera.params[[0, 1, 4, 5]].tolist(), (units * std).tolist(), strict=True)
         return {"calibration": {k: v for name, at, spread in pairs for k, v in ((name, at), (f"std_{name}", spread))}}
 
-    def files(self, log: Recorded) -> Mapping[str, dict[str, np.ndarray] | str]:
+    def files(self, log: FrameLog) -> Mapping[str, dict[str, np.ndarray] | str]:
         """The particles' paths; of images, the map as a place to be found in, unless the run was localised; the camera.
 
         The camera of a run that has calibrated it.

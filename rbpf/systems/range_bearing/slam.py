@@ -13,7 +13,7 @@ import numpy as np
 from rbpf.core.checkpoint import elements, integers, read, read_one, split
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import NEW, NULL, Part, Sensor
+from rbpf.core.models import NEW, NULL, Sensor
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
@@ -26,11 +26,11 @@ from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkS
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.measurements import Kind, Measurements
-from rbpf.systems.anchoring import StartAnchor
+from rbpf.systems.anchoring import StartAnchor, relative_estimate
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.hypotheses import HYPOTHESES, Hypotheses
-from rbpf.systems.system import FILTER_COLUMNS, Column, Ragged, Recorded, System, Tracked, TrackingState, filter_values
+from rbpf.systems.system import FILTER_COLUMNS, Column, FrameLog, Ragged, System, Tracked, TrackingState, filter_values
 
 
 @final
@@ -90,10 +90,13 @@ class RangeBearingSlam(System):
             evidence = unknown.gates(self.model.dim), unknown.existence()
             sensor = AnonymousLandmarkSensor(self.model, self.point, *evidence, likelihood)
         self.sensor = sensor
+        self.anchor: StartAnchor | None = None
+        if config.anchor_every and joint is None:
+            self.anchor = StartAnchor(own, self.model, config.anchor_every, likelihood)
         self.filter = Filter(
             OdometryMotion(space),
             sensor if wrapped is None else wrapped(sensor),
-            joint or own,
+            [joint or own, *([] if self.anchor is None else [self.anchor])],
             config.proposal.build(),
             config.resampling.build(),
             config.particles,
@@ -104,8 +107,6 @@ class RangeBearingSlam(System):
         self.hypotheses: Hypotheses | None = None
         if joint is not None and config.association == "ml":
             self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
-        anchored = config.anchor_every and joint is None
-        self.anchor = StartAnchor(self.filter, config.anchor_every, likelihood) if anchored else None
         self._names: set[int] = set()
         self._odometry = space.identity()
         self._associations = _Associations(self.filter) if keep_associations and not self.hypotheses else None
@@ -124,12 +125,6 @@ class RangeBearingSlam(System):
             Ragged("z", "measurements", (p,), per="landmarks"),
             Ragged("cov_z", "their covariance", (p, p), per="landmarks"),
         )
-
-    @property
-    def joint(self) -> JointMap | None:
-        """The joint map, of the most probable hypothesis; None where every particle has a map of its own."""
-        held = self.filter.marginals.parts[Part.LANDMARK]
-        return held if isinstance(held, JointMap) else None
 
     @classmethod
     def of_log(
@@ -166,7 +161,16 @@ class RangeBearingSlam(System):
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
-            used = self._used(names, report)
+            if self.config.association == "known":
+                # One that comes a second time in its first frame is not used.
+                again = np.ones(names.size, dtype=bool)
+                again[np.unique(names, return_index=True)[1]] = False
+                new = np.array([name not in self._names for name in names.tolist()], dtype=bool)
+                self._names |= set(names.tolist())
+                used = np.where(new & again, NULL, names)
+            else:  # the best particle's
+                ids = _ids_with_new(report, len(names))
+                used = ids[self.filter.belief().mode if len(ids) > 1 else 0]
         else:
             used, report = self.hypotheses.step(z, cov_z, odometry, stamp_ns)
             self.filter = self.hypotheses.held[0].filter
@@ -176,7 +180,8 @@ class RangeBearingSlam(System):
         # Poses are reported relative to where the start lies in each particle's world, as far as that is known by now.
         estimate = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
         if self.anchor is not None:
-            estimate = self.anchor.state_estimate(self.anchor.after_step(report, odometry))
+            particles, anchored = self.filter.particles, self.anchor.after_step(report)
+            estimate = relative_estimate(self.space, anchored, particles.state, particles.log_weights)
 
         if self._associations is not None:
             self._associations.record(report, len(z))
@@ -212,10 +217,7 @@ class RangeBearingSlam(System):
         held = self.hypotheses.held[0].exist(found.ids)
         return MapEstimate(found.ids[held], found.mean[held], found.cov[held])
 
-    def particle_poses(self) -> np.ndarray:
-        return self.filter.belief().map.world(self.filter.particles.state)
-
-    def measurements(self, name: str, log: Recorded) -> Measurements:
+    def measurements(self, name: str, log: FrameLog) -> Measurements:
         """The odometry, and every observation that updated a landmark or started one."""
         frames = [log.observed(t) for t in range(len(log))]
         landmarks = self._final(log)
@@ -242,7 +244,7 @@ class RangeBearingSlam(System):
             cov_z=gathered("cov_z", (p, p)),
         )
 
-    def summary(self, log: Recorded) -> dict[str, Any]:
+    def summary(self, log: FrameLog) -> dict[str, Any]:
         """How much was observed and kept, and how far the particles have forgotten the past, if they sample it."""
         distinct = {"ancestors_of_first_generation": self.filter.history.distinct_first()}
         return {
@@ -263,7 +265,7 @@ class RangeBearingSlam(System):
         assert self._associations is not None
         return self._associations.of(self.filter.belief().mode)
 
-    def _final(self, log: Recorded) -> list[np.ndarray]:
+    def _final(self, log: FrameLog) -> list[np.ndarray]:
         """The landmark of every observation, one array (K,) per step, as known now."""
         if self._associations is not None or (self.hypotheses is not None and self.hypotheses.keep):
             return self.associations()
@@ -277,7 +279,7 @@ class RangeBearingSlam(System):
             kept |= self._associations.arrays()
         if self.hypotheses is not None:
             kept |= self.hypotheses.arrays()
-        return kept if self.anchor is None else kept | self.anchor.arrays()
+        return kept
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self._names = set(read_one(arrays, "names", integers("names")).tolist())
@@ -288,22 +290,6 @@ class RangeBearingSlam(System):
             self._associations.restore(arrays)
         if self.hypotheses is not None:
             self.hypotheses.restore(arrays)
-        if self.anchor is not None:
-            self.anchor.restore(arrays, self.model, self.point)
-
-    def _used(self, names: np.ndarray, report: StepReport) -> np.ndarray:
-        """The landmark of each observation (K,) as known now, −1 where none was updated or started by it.
-
-        With names, one that comes a second time in its first frame is not used; without, it is the best particle's.
-        """
-        if self.config.association == "known":
-            again = np.ones(names.size, dtype=bool)
-            again[np.unique(names, return_index=True)[1]] = False
-            new = np.array([name not in self._names for name in names.tolist()], dtype=bool)
-            self._names |= set(names.tolist())
-            return np.where(new & again, NULL, names)
-        ids = _ids_with_new(report, len(names))
-        return ids[self.filter.belief().mode if len(ids) > 1 else 0]
 
 
 _ASSOCIATIONS = {"shapes": integers("steps", 3, least=0), "ids": integers("ids", least=NULL)}
