@@ -120,7 +120,12 @@ def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch 
     whatever else is in the batch. Raises InputError: NaN, not symmetric, or an eigenvalue below -1e-9 times the largest.
     """
     cov = np.asarray(cov, dtype=float)
-    _require_symmetric(cov)
+    finite, swapped = np.isfinite(cov), np.swapaxes(cov, -1, -2)
+    # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
+    if not (finite.all() and (cov == swapped).all()):
+        _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
+        skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
+        _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
     factor, definite = _cholesky_one(cov, _SINGULAR) if cov.ndim == 2 else _cholesky_batch(cov, _SINGULAR)
     if not definite.all():
         singular = ~definite
@@ -242,16 +247,6 @@ def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
     # Beside a variance that is rounding itself, correlations exceed one: there the plain one is nearer.
     sound = values[..., :1, None] >= -_NEGATIVE * values[..., -1:, None]
     return np.where(sound, scaled, plain), negative
-
-
-def _require_symmetric(cov: Array) -> None:
-    finite, swapped = np.isfinite(cov), np.swapaxes(cov, -1, -2)
-    # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
-    if finite.all() and (cov == swapped).all():
-        return
-    _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
-    skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
-    _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
 
 
 def _require(good: NDArray[np.bool_] | np.bool_, complaint: str) -> None:

@@ -213,3 +213,7 @@ class MonoConfig(Ranged):
     #: where particles are sampled.
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
+
+    def start_cov(self) -> np.ndarray:
+        """Covariance (6, 6) of where the camera may be at the start, [ω, v]."""
+        return np.diag(np.repeat([self.start_std_rad, self.start_std_m], 3) ** 2)

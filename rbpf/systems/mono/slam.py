@@ -231,7 +231,13 @@ class MonoSlam(System):
         if not self.filter.steps:
             self.loss.stamp_ns = stamp_ns
             if is_empty and isinstance(self.known, KnownPixels):
-                return self._waiting(stamp_ns, messages)
+                # Before the first image that can be used the camera is somewhere around the place that they say.
+                assert self._start is not None
+                pose, cov = self._start.world_from_camera, self.config.start_cov()
+                values = {column.name: column.kind(0) for column in self.columns}
+                messages.append("the run starts with the first image that shows the known points")
+                waiting = TrackingState.INITIALISING, values | {"ess": float(self.config.particles)}
+                return Tracked(stamp_ns, pose, cov, *waiting, self._nothing(), tuple(messages))
             measured, prior = self._begin(measured)
 
         # 3. Where may the camera be? As it moved, unless nothing has been seen yet or it is lost.
@@ -499,16 +505,15 @@ class MonoSlam(System):
                 raise InputError("known points with pixels are those of an image: named features need KnownPoints")
             start = KnownStart.from_frame(self.camera, known, measured)
 
-        std = np.repeat([config.start_std_rad, config.start_std_m], 3)
         if self.features.group is None:
             # Separate landmarks, in a world whose place each particle samples in the first frame: the prior is wide, the
             # measurements of the frame, not the resection, say where in it the camera is.
             self._add_points(start.points)
-            return measured, PosePrior(start.world_from_camera, np.diag(std**2))
+            return measured, PosePrior(start.world_from_camera, config.start_cov())
 
         # One landmark, placed by what the frame shows of it: the frame is not used again.
         landmark_map, group = self.filter.belief().map, constellation(start.points)
-        records = constellation_records(self.camera, start, group, self.filter.n, np.diag(std**2))
+        records = constellation_records(self.camera, start, group, self.filter.n, config.start_cov())
         landmark_map.add_records(records, group, ids=start.points.names[:1])
         if isinstance(measured, FeatureFrame):
             measured = measured.take(~np.isin(measured.landmarks, start.points.names))
@@ -578,12 +583,3 @@ class MonoSlam(System):
 
     def _nothing(self) -> dict[str, np.ndarray]:
         return {each.name: np.zeros((0, *each.shape), dtype=each.kind) for each in self.observed}
-
-    def _waiting(self, stamp_ns: int, messages: list[str]) -> Tracked:
-        """Before the first image that can be used: the camera is somewhere around the place that the known points say."""
-        assert self._start is not None
-        std = np.repeat([self.config.start_std_rad, self.config.start_std_m], 3)
-        values = {column.name: column.kind(0) for column in self.columns} | {"ess": float(self.config.particles)}
-        messages = [*messages, "the run starts with the first image that shows the known points"]
-        pose, cov = self._start.world_from_camera, np.diag(std**2)
-        return Tracked(stamp_ns, pose, cov, TrackingState.INITIALISING, values, self._nothing(), tuple(messages))

@@ -185,8 +185,18 @@ class StereoSlam(System):
     def take(self, frame: Any) -> Tracked:
         """`track` with a frame of a recording, an `ImageFrame`, or with pixels that have names, a `FeatureFrame`."""
         started, messages = time.perf_counter(), list[str]()
-        front_end = self._front_end_of(frame)
-        landmarks, config = front_end.landmarks, self.config
+        # The first frame chooses the front end that takes frames of its kind, and is refused if it is not the cameras'.
+        if not self.frames:
+            for one in self._front_ends:
+                if isinstance(frame, one.frames):
+                    self._choose(one)
+        front_end, config = self.front_end, self.config
+        if not isinstance(frame, front_end.frames):
+            kinds = " or ".join(kind.__name__ for kind in front_end.frames)
+            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {kinds} here")
+        if not self.frames and (refusal := front_end.refusal(frame)):
+            raise InputError(refusal)
+        landmarks = front_end.landmarks
 
         # 1. Measure the pair: features that both cameras see.
         pair, problem = front_end.measure(frame)
@@ -359,20 +369,6 @@ class StereoSlam(System):
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
-
-    def _front_end_of(self, frame: Any) -> FrontEnd[Any]:
-        """That which takes frames of this kind; the first frame chooses it, and is refused if it is not the cameras'."""
-        if not self.frames:
-            for front_end in self._front_ends:
-                if isinstance(frame, front_end.frames):
-                    self._choose(front_end)
-        if not isinstance(frame, self.front_end.frames):
-            kinds = " or ".join(kind.__name__ for kind in self.front_end.frames)
-            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {kinds} here")
-        refusal = "" if self.frames else self.front_end.refusal(frame)
-        if refusal:
-            raise InputError(refusal)
-        return self.front_end
 
     def _choose(self, front_end: FrontEnd[Any]) -> None:
         self.front_end = front_end
