@@ -107,7 +107,6 @@ class RangeBearingSlam(System):
         self.hypotheses: Hypotheses | None = None
         if joint is not None and config.association == "ml":
             self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
-        self._names: set[int] = set()
         self._odometry = space.identity()
         self._associations = _Associations(self.filter) if keep_associations and not self.hypotheses else None
         d, e, p = space.dim, space.size, self.model.dim
@@ -162,12 +161,11 @@ class RangeBearingSlam(System):
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
             if self.config.association == "known":
-                # One that comes a second time in its first frame is not used.
+                # One that comes a second time in the frame that starts its landmark is not used.
                 again = np.ones(names.size, dtype=bool)
                 again[np.unique(names, return_index=True)[1]] = False
-                new = np.array([name not in self._names for name in names.tolist()], dtype=bool)
-                self._names |= set(names.tolist())
-                used = np.where(new & again, NULL, names)
+                held = [np.ravel(group.ids) for group in report.groups if group.ids is not None]
+                used = np.where(again & ~np.isin(names, np.concatenate([names[:0], *held])), NULL, names)
             else:  # the best particle's
                 ids = _ids_with_new(report, len(names))
                 used = ids[self.filter.belief().mode if len(ids) > 1 else 0]
@@ -272,7 +270,7 @@ class RangeBearingSlam(System):
         return [log.observed(t)["landmarks"] for t in range(len(log))]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        kept = {"names": np.array(sorted(self._names), dtype=np.int64), "odometry": self._odometry}
+        kept = {"odometry": self._odometry}
         if isinstance(self.sensor, NamedLandmarkSensor):
             kept["observed_once"] = np.array(sorted(self.sensor.observed_once), dtype=np.int64)
         if self._associations is not None:
@@ -282,7 +280,6 @@ class RangeBearingSlam(System):
         return kept
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._names = set(read_one(arrays, "names", integers("names")).tolist())
         if isinstance(self.sensor, NamedLandmarkSensor):
             self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
