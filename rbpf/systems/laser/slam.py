@@ -39,8 +39,7 @@ _STATE = {
     "odometry": elements(SE2),
     "measured": numbers(3, values="any"),
     "twist": numbers(3),
-    "stamps": integers(2),
-    "counts": integers(1, least=0),
+    "stamp_ns": integers(),
     "ess": numbers(),
 }
 
@@ -96,8 +95,10 @@ class LaserSlam(System):
         # Odometry composed, its last reading (NaN where there is none), the speed between the last two steps.
         self._odometry, self._measured = SE2.identity(), np.full(3, np.nan)
         self._twist = np.zeros(3)
-        # Times of the last scan and of the last step, −1 before the first; scans that were used.
-        self._stamps, self._used, self._ess = [-1, -1], 0, float(config.particles)
+        self._stamp_ns, self._ess = (
+            -1,
+            float(config.particles),
+        )  # of the last scan, −1 before the first; of the last step
 
     def track(self, ranges: np.ndarray, odometry: np.ndarray | None = None, stamp_ns: int | None = None) -> Tracked:
         """A scan, and what it says of where the robot is.
@@ -109,7 +110,7 @@ class LaserSlam(System):
 
         Raises InputError: time runs backwards, there are not as many readings as beams, or the map outgrows the memory.
         """
-        previous = self._stamps[0]
+        previous, last_ns = self._stamp_ns, self.filter.stamp_ns
         stamp_ns = previous + 1_000_000_000 if stamp_ns is None else int(stamp_ns)
         begun = previous >= 0
         if begun and stamp_ns < previous:
@@ -117,7 +118,7 @@ class LaserSlam(System):
         beams, messages = self.scanner.beams(ranges, self.config.correlation_m), list[str]()
         seconds = (stamp_ns - previous) * 1e-9 if begun else 0.0
         self._move(odometry, seconds, messages)
-        self._stamps[0] = stamp_ns
+        self._stamp_ns = stamp_ns
 
         # Use the scan if there is something in it, and if the robot has moved.
         state, fit, resampled = TrackingState.PREDICTED, float("nan"), False
@@ -125,8 +126,8 @@ class LaserSlam(System):
         far = way >= self.config.distance_m or turned >= self.config.angle_rad
         if len(beams) < self.config.least_beams:
             messages.append(f"{len(beams)} of {len(ranges)} readings came back: the pose is predicted")
-        elif not self._used or far or without > 0.0 or (stamp_ns - self._stamps[1]) * 1e-9 >= self.config.seconds:
-            proposal = ScanMatching(self.grid, beams) if self._used else None
+        elif last_ns is None or far or without > 0.0 or (stamp_ns - last_ns) * 1e-9 >= self.config.seconds:
+            proposal = None if last_ns is None else ScanMatching(self.grid, beams)
             resampled, state = self._step(beams, stamp_ns, proposal), TrackingState.TRACKED
             if proposal is not None:
                 fit = proposal.fit
@@ -160,7 +161,7 @@ class LaserSlam(System):
     def summary(self, log: FrameLog) -> dict[str, Any]:
         picture, fits = self.picture(), log["fit"][np.isfinite(log["fit"])]
         return {
-            "scans_used": self._used,
+            "scans_used": self.filter.steps,
             "fit_mean": float(fits.mean()) if fits.size else None,
             "map_known_m2": round(float((picture.log_odds != 0.0).sum()) * picture.cell_m**2, 2),
             "map_tiles": self.grid.tiles,
@@ -186,16 +187,14 @@ class LaserSlam(System):
         return {"posterior.npz": paths, "grid.npz": grid}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        values = (
-            self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist,
-            np.array(self._stamps), np.array([self._used]), np.array(self._ess),
-        )  # fmt: skip
+        poses = self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist
+        values = *poses, np.array(self._stamp_ns), np.array(self._ess)
         return {f"laser/{name}": value for name, value in zip(_STATE, values, strict=True)}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        found = list(read(arrays, _STATE, "laser/").values())
-        self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist = found[:7]
-        self._stamps, self._used, self._ess = found[7].tolist(), int(found[8][0]), float(found[9])
+        *poses, stamp_ns, ess = read(arrays, _STATE, "laser/").values()
+        self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist = poses
+        self._stamp_ns, self._ess = int(stamp_ns), float(ess)
 
     def _move(self, odometry: np.ndarray | None, seconds: float, messages: list[str]) -> None:
         """Takes in the motion since the last scan, as the odometry says it, or as it was between the last two steps."""
@@ -216,7 +215,7 @@ class LaserSlam(System):
                 messages.append(f"the odometry jumps by {told}: the motion is assumed to go on as before")
         if has_delta:
             self._moved += [way, turned, 0.0]
-        elif self._used:  # before, the world begins where the first scan is taken
+        elif self.filter.steps:  # before, the world begins where the first scan is taken
             delta = SE2.exp(self._twist * seconds)
             self._moved[2] += seconds
         self._measured = now
@@ -233,14 +232,13 @@ class LaserSlam(System):
 
     def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
         """A step of the filter; whether it resampled."""
-        moved = self._moved_since() if self._moved.any() or self._used else None
+        last_ns, before = self.filter.stamp_ns, self._pose
+        moved = None if last_ns is None and not self._moved.any() else self._moved_since()
         if proposal is None or not self._moved.any():  # nothing has moved: nothing is to be found
             proposal = PriorProposal()
         report = self.filter.step(beams, moved, stamp_ns, proposal)
-        seconds, before = (stamp_ns - self._stamps[1]) * 1e-9, self._pose
         self._pose, self._cov, self._ess = report.estimate.mean, report.estimate.cov, report.ess
-        if self._used and seconds > 0.0:
-            self._twist = SE2.log(SE2.between(before, self._pose)) / seconds
-        self._since, self._moved, self._stamps[1] = SE2.identity(), np.zeros(3), stamp_ns
-        self._used += 1
+        if last_ns is not None and stamp_ns > last_ns:
+            self._twist = SE2.log(SE2.between(before, self._pose)) / ((stamp_ns - last_ns) * 1e-9)
+        self._since, self._moved = SE2.identity(), np.zeros(3)
         return report.resampled
