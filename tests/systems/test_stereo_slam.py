@@ -51,7 +51,7 @@ class TestPath:
         assert manager.confirmed.sum() > 15
         assert plain.log["observed"][3:].mean() > 10
         assert (~manager.confirmed).sum() <= CONFIG.new_landmarks.max_candidates
-        for ids in (manager.names, landmarks.store.ids, landmarks.places._ids):
+        for ids in (manager.names, landmarks.store.ids):
             np.testing.assert_array_equal(ids, found.ids)
         np.testing.assert_array_equal(found.columns["landmark"], manager.confirmed)
 

@@ -267,29 +267,23 @@ class ParticleSubsample:
 
 
 class Places:
-    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by."""
+    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
+
+    Landmarks go by their rows in the store of descriptors.
+    """
 
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
         self.rig, self.config = rig, config
-        self._ids = np.zeros(0, dtype=np.int64)
         self._place, self._seen_from = np.zeros((2, 0, 3))
 
-    def put(self, ids: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
-        """Landmarks (k,) are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,).
-
-        Those that are new have higher numbers than those held, and ascend.
-        """
-        new = ids[ids > self._ids.max(initial=-1)]
-        room = np.zeros((new.size, 3))
-        self._ids = np.concatenate([self._ids, new])
+    def put(self, rows: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
+        """Landmarks (k,), held or new, are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,)."""
+        room = np.zeros((int((rows >= len(self._place)).sum()), 3))
         self._place, self._seen_from = (np.concatenate([one, room]) for one in (self._place, self._seen_from))
-        rows = np.searchsorted(self._ids, ids)
         self._place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
 
-    def remove(self, ids: np.ndarray) -> None:
-        kept = np.ones(self._ids.size, dtype=bool)
-        kept[np.searchsorted(self._ids, ids)] = False
-        self._ids, self._place, self._seen_from = self._ids[kept], self._place[kept], self._seen_from[kept]
+    def remove(self, rows: np.ndarray) -> None:
+        self._place, self._seen_from = (np.delete(one, rows, axis=0) for one in (self._place, self._seen_from))
 
     def in_view(self, world_from_camera: np.ndarray, std_direction_rad: float = 0.0) -> np.ndarray:
         """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""
@@ -308,15 +302,14 @@ class Places:
         cosine = (then * now).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
         ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
         alike = cosine >= np.cos(np.deg2rad(self.config.max_turn_deg))
-        return self._ids[rows[alike & (ratio <= np.log(self.config.max_scale_change))]]
+        return np.asarray(rows[alike & (ratio <= np.log(self.config.max_scale_change))])
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"places/place": self._place, "places/seen_from": self._seen_from}
 
-    def restore(self, arrays: dict[str, np.ndarray], ids: np.ndarray) -> None:
-        """The inverse of `arrays`, of landmarks (M,); errors as `rbpf.core.checkpoint.read`."""
-        found = read(arrays, _PLACES, "places/", landmarks=ids.size)
-        self._ids, self._place, self._seen_from = ids.copy(), found["place"], found["seen_from"]
+    def restore(self, arrays: dict[str, np.ndarray], count: int) -> None:
+        """The inverse of `arrays`, of so many landmarks; errors as `rbpf.core.checkpoint.read`."""
+        self._place, self._seen_from = read(arrays, _PLACES, "places/", landmarks=count).values()
 
 
 class AssociationGate(ABC):
@@ -426,8 +419,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             dropped = np.concatenate([dropped, more])
         if dropped.size:
             belief.map.remove(dropped)
+            self.places.remove(self.store.rows(dropped))
             self.store.remove(dropped)
-            self.places.remove(dropped)
             if self.noise is not None:
                 self.noise.remove(dropped)
         # Places are in the world, the particles' states and landmarks perhaps not.
@@ -437,7 +430,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             records = belief.read_mode(seen)
             place = self.landmark.homogeneous(records.mean, records.const)[0]
             place = place[:, :3] / place[:, 3:]
-            self.places.put(seen, SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
+            self.places.put(self.store.rows(seen), SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
         if frame.uncertain:
             return []
         # Those whose depth is known well enough for a Gaussian in space, and which the manager chooses.
@@ -454,7 +447,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         # The manager counts as the map does: its numbers are the map's.
         ids = self.manager.add(rows.size)
         self.store.add(ids, features.descriptors)
-        self.places.put(ids, SE3.transform(pose, features.points), pose)
+        self.places.put(self.store.rows(ids), SE3.transform(pose, features.points), pose)
         self.ids[rows] = ids
         cov = features.cov
         if self.noise is not None:
@@ -467,13 +460,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         rows = np.flatnonzero(pair.for_map)
         features = pair.features.take(rows)
         subsample = ParticleSubsample.of(belief, self.config.subsample)
-        ids = self.places.in_view(subsample.middle, subsample.std_direction_rad)
+        near = self.places.in_view(subsample.middle, subsample.std_direction_rad)
         store, limits = self.store, self.config.limits
-        if ids.size and rows.size:
+        if near.size and rows.size:
             # Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
             most = limits.largest(store.length) / limits.ratio
-            products = features.descriptors @ store.descriptors[store.rows(ids)].T
-            ids = ids[products.max(axis=0) >= 1.0 - 0.5 * most**2]
+            products = features.descriptors @ store.descriptors[near].T
+            near = near[products.max(axis=0) >= 1.0 - 0.5 * most**2]
+        ids = store.ids[near]
         if pair.uncertain:
             ids = ids[np.isin(ids, self.seen_again())]
         if not (ids.size and rows.size):
@@ -535,7 +529,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.manager.restore(arrays)
         if not np.array_equal(self.store.ids, self.manager.names):
             raise InputError("the landmarks that have descriptors are not those that are counted")
-        self.places.restore(arrays, self.store.ids)
+        self.places.restore(arrays, len(self.store))
         if self.noise is not None:
             self.noise.restore(arrays)
 
