@@ -272,7 +272,14 @@ class StereoSlam(System):
         state = TrackingState.PREDICTED
         if measured and not (updated and assumed):
             state = TrackingState.LOST if assumed else TrackingState.TRACKED
-        figures = {"observed": 0, "resampled": False, "nis_dof": 0, "ess": 0.0, "log_evidence": 0.0, "nis": 0.0}
+        figures: dict[str, Any] = {
+            "observed": 0,
+            "resampled": False,
+            "nis_dof": 0,
+            "ess": 0.0,
+            "log_evidence": 0.0,
+            "nis": 0.0,
+        }
         if report is not None:
             weighed = [group.ids for group in report.groups if Part.STATE in group.updates and group.ids is not None]
             figures = filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed)}
