@@ -272,17 +272,10 @@ class StereoSlam(System):
         state = TrackingState.PREDICTED
         if measured and not (updated and assumed):
             state = TrackingState.LOST if assumed else TrackingState.TRACKED
-        figures: dict[str, Any] = {
-            "observed": 0,
-            "resampled": False,
-            "nis_dof": 0,
-            "ess": 0.0,
-            "log_evidence": 0.0,
-            "nis": 0.0,
-        }
+        figures: dict[str, Any] = {column.name: column.kind(0) for column in self.columns if not column.shape}
         if report is not None:
             weighed = [group.ids for group in report.groups if Part.STATE in group.updates and group.ids is not None]
-            figures = filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed)}
+            figures |= filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed)}
         ids, kinds = front_end.landmarks_of(pair, updated)
         previous = np.full(len(pair), NULL, dtype=np.int64)
         previous[motion.rows[1][motion.inliers]] = motion.rows[0][motion.inliers]
@@ -292,11 +285,11 @@ class StereoSlam(System):
             cov,
             state,
             {
+                **figures,
                 "features": len(pair),
                 "agreeing": int(motion.inliers.sum()),
                 "assumed": assumed,
                 "updated": updated,
-                **figures,
                 "seconds_features": seconds_features,
                 "seconds_odometry": seconds_odometry,
                 "seconds_matching": landmarks.seconds if updated else 0.0,
