@@ -191,9 +191,10 @@ class StereoSlam(System):
                 if isinstance(frame, one.frames):
                     self._choose(one)
         front_end, config = self.front_end, self.config
-        if not isinstance(frame, front_end.frames):
-            kinds = " or ".join(kind.__name__ for kind in front_end.frames)
-            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {kinds} here")
+        fits = isinstance(frame, front_end.frames)
+        if not fits:
+            taken = " or ".join(kind.__name__ for kind in front_end.frames)
+            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {taken} here")
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
         landmarks = front_end.landmarks
