@@ -1,11 +1,8 @@
-"""Sensors of landmarks: numbered by the recording, or associated by maximum likelihood in each particle.
-
-Of a frame they need `landmarks` (K,) numbers, `z` (K, p) and `cov_z` (K, p, p).
-"""
+"""Sensors of landmarks: numbered by the recording, or associated by maximum likelihood in each particle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 
@@ -22,7 +19,17 @@ from rbpf.core.models import (
     Sensor,
 )
 from rbpf.errors import InputError
-from rbpf.sensors.feature_log import FeatureFrame
+
+
+class LandmarkFrame(Protocol):
+    """What these sensors need of a frame: `landmarks` (K,) numbers, `z` (K, p), `cov_z` (K, p, p)."""
+
+    @property
+    def landmarks(self) -> np.ndarray: ...
+    @property
+    def z(self) -> np.ndarray: ...
+    @property
+    def cov_z(self) -> np.ndarray: ...
 
 
 @final
@@ -43,7 +50,7 @@ class NamedLandmarkSensor(Sensor):
     observed_once: set[int] = field(default_factory=set, init=False)
     _contradicted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), init=False)
 
-    def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
+    def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
         """The observations of landmarks that the map holds."""
         if frame.landmarks.size and frame.landmarks.dtype.kind not in "iu":
             first = frame.landmarks[0]
@@ -64,7 +71,7 @@ class NamedLandmarkSensor(Sensor):
         return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids)]
 
     def new_landmarks(
-        self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
+        self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """The first observation of each new landmark; a second one in the same frame is left to the next frame."""
         if self._contradicted.size:
@@ -96,7 +103,7 @@ class AnonymousLandmarkSensor(Sensor):
     likelihood: Likelihood | None = None
     part: Part = Part.LANDMARK
 
-    def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
+    def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
         """Every measurement, with each particle's own association."""
         if not frame.z.shape[0]:
             return []
@@ -114,7 +121,7 @@ class AnonymousLandmarkSensor(Sensor):
         ]
 
     def new_landmarks(
-        self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
+        self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """Updates the evidence of what should have been seen; starts what some particle takes as new."""
         chosen = np.zeros((belief.log_weights.size, 0), dtype=np.int64)
