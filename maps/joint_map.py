@@ -584,7 +584,8 @@ class JointMap(Map):
         """Landmarks (K,) may have moved by as much, covariance (K, D, D), in the frame: each by itself."""
         columns = self.held.of_one_kind(ids).columns
         self.cov = self.cov.copy()
-        self.cov[columns[:, :, None], columns[:, None, :]] += cov
+        for held in [self.cov] if self._gain is None else [self.cov, self._rest]:
+            held[columns[:, :, None], columns[:, None, :]] += cov
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         return np.zeros((self.n, ids.size))

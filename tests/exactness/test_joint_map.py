@@ -105,11 +105,19 @@ class Doppler(Relative):
         return landmark - state - 0.5 * substate
 
 
-def test_a_velocity_a_fix_and_what_reads_velocity_and_landmark_together():
+class Restless(Scripted):
+    """The landmark may have moved by as much as its noise since it was seen."""
+
+    def observe(self, frame, belief):
+        belief.map.loosen(belief.map.ids, NOISE)
+        return super().observe(frame, belief)
+
+
+def test_a_velocity_a_fix_what_reads_velocity_and_landmark_together_and_a_landmark_that_moves():
     (F, noise, drift), kalman = DRIFTING.joint(), velocity()
     joint = JointMap(DRIFTING.space, (kalman.mean[2:], kalman.cov[2:, 2:]))
     options = {"n": 12, "lag": 1, "consolidation": Consolidation(1), "rng": np.random.default_rng(1)}
-    filter_ = Filter(DRIFTING, Scripted(), joint, **options)
+    filter_ = Filter(DRIFTING, Restless(), joint, **options)
     rng, unit, fix = np.random.default_rng(5), np.eye(2), LinearObservation(np.eye(2))
     covs = NOISE[None]
     for t in range(6):
@@ -118,6 +126,7 @@ def test_a_velocity_a_fix_and_what_reads_velocity_and_landmark_together():
         kalman.predict(
             block_diag(F, np.eye(len(still))), block_diag(noise, still), np.append(drift, np.zeros(len(still)))
         )
+        kalman.cov[4:, 4:] += NOISE if len(still) else still
         groups = [Observations(z[2:], covs, fix)] if t % 3 == 2 else []
         if groups:
             kalman.update(z[2], np.eye(2, kalman.mean.size), NOISE)
