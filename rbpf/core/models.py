@@ -258,8 +258,8 @@ class ObservationModel(ABC):
         """∂z/∂substate (…, p, m) of a model with `about`, Mathematics (sensor-constants); to be overridden with it."""
         raise InputError(f"{type(self).__name__} has an `about`: override by_substate")
 
-    def new_by_substate(self, z: Z) -> np.ndarray | None:
-        """How the landmarks of `initialise` move with the substate (K, D, m), from measurements (K, p); None: not at all."""
+    def new_by_substate(self, z: Z) -> Float[np.ndarray, "K D m"] | None:
+        """From measurements (K, p) how the landmarks of `initialise` move with the substate (K, D, m); None: not at all."""
         return None
 
     def kernel(self) -> FusedKernel | None:
