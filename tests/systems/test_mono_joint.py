@@ -107,7 +107,8 @@ def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     off = [np.linalg.norm(errors(run)[:, 3:], axis=1) for run in (whole, submaps)]
     assert off[1][-40:].mean() < 1.5 * off[0][-40:].mean() + 0.01
     assert nees(submaps).mean() < 1.2 * nees(whole).mean()
-    assert set(submaps.system.map().ids) == set(whole.system.map().ids)
+    mapped = whole.system.map()  # rays that are out of view when a sub-map is left are dropped
+    assert set(mapped.ids[~mapped.is_ray()]) <= set(submaps.system.map().ids)
 
 
 def test_what_is_refused():
