@@ -207,7 +207,7 @@ class MonoConfig(Ranged):
     start: StartConfig = field(default_factory=StartConfig)  #: without known points.
     search: SearchConfig = field(default_factory=SearchConfig)  #: of features in images.
     #: what is known of a camera that calibrates itself.
-    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     #: when the camera is lost.
     relocalisation: Annotated[RelocalisationConfig, Formerly("recovery")] = field(default_factory=RelocalisationConfig)
     #: where particles are sampled.

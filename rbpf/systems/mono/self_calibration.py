@@ -66,7 +66,7 @@ def adjusted(
     ordered[which] = position
     path = np.array(first.path)[steps]
     start = replace(structure_of(SE3.between(path[:1], path), ordered), tuned=np.zeros(len(NUMBERS)))
-    seen = replace(seen, tuning=np.linalg.inv(config.calibration.cov()))
+    seen = replace(seen, tuning=np.linalg.inv(config.self_calibration.cov()))
     world, is_known = world_of(filter_), np.zeros(names.size, dtype=bool)
     if world is not None and given is not None:
         _, at, row = np.intersect1d(names, given.names, return_indices=True)

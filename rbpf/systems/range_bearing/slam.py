@@ -265,9 +265,15 @@ class RangeBearingSlam(System):
 
     def _final(self, log: FrameLog) -> list[np.ndarray]:
         """The landmark of every observation, one array (K,) per step, as known now."""
-        if self._associations is not None or (self.hypotheses is not None and self.hypotheses.keep):
-            return self.associations()
-        return [log.observed(t)["landmarks"] for t in range(len(log))]
+        found = [log.observed(t)["landmarks"] for t in range(len(log))]
+        if self._associations is None and (self.hypotheses is None or not self.hypotheses.keep):
+            return found
+        known = self.associations()
+        if [ids.size for ids in known] != [ids.size for ids in found]:
+            raise InputError(
+                "the associations are not of as many observations as its frames have: the checkpoint is damaged"
+            )
+        return known
 
     def arrays(self) -> dict[str, np.ndarray]:
         kept = {"odometry": self._odometry}
