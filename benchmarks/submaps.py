@@ -6,7 +6,8 @@ import numpy as np
 
 from benchmarks.rows import Row, Settings, Timing
 from rbpf.lie import SE2
-from rbpf.maps.submaps import SubMap, SubMaps
+from rbpf.maps.joint.solution import SubMap
+from rbpf.maps.joint.submaps import SubMaps
 
 EACH, LENGTH_M, REACH_M = 50, 10.0, 2.0
 STD = {"heading": 0.002, "place": 0.02, "landmark": 0.03}

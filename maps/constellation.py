@@ -8,7 +8,6 @@ from rbpf import gaussian
 from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.joint_columns import by_frame
 
 #: Points that may each have an error of their own; a record's covariance grows with the square of their number.
 MOST = 12
@@ -56,8 +55,8 @@ class Constellation(Landmark):
     def jointly(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         """world_from_group (N, 7), covariance (N, 6 + 3M, …) of it, in the right chart, and of the points in the world."""
         frame, factor = self.frame(records)
-        # T k moves by R by_frame(k) dξ.
-        moved = SE3.rotation(frame)[:, None] @ by_frame(SE3, np.asarray(self.points)) @ factor[:, None]
+        # T k moves by R transform_jacobian(k) dξ.
+        moved = SE3.rotation(frame)[:, None] @ SE3.transform_jacobian(np.asarray(self.points)) @ factor[:, None]
         both = np.concatenate([factor, moved.reshape(len(frame), -1, factor.shape[-1])], axis=1)
         return frame, gaussian.gram(both)
 
@@ -122,7 +121,7 @@ class UncertainConstellation(Landmark):
     def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         frame, slope, cov_fit, _ = self._fit(records)
         local = SE3.inverse_transform(frame[:, None], self.in_world(records))
-        of_frame = -by_frame(SE3, local)
+        of_frame = -SE3.transform_jacobian(local)
         by_points = of_frame @ slope[:, None]
         back = np.swapaxes(SE3.rotation(frame), -1, -2)
         for m in range(len(self.points)):

@@ -41,8 +41,8 @@ from rbpf.core.models import (
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
-from rbpf.maps.joint_columns import JointColumns, by_frame
-from rbpf.maps.joint_rows import (
+from rbpf.maps.joint.columns import JointColumns
+from rbpf.maps.joint.rows import (
     Group,
     Reading,
     Rows,
@@ -54,9 +54,10 @@ from rbpf.maps.joint_rows import (
     spread_of,
     turned,
 )
+from rbpf.maps.joint.solution import SubMap
+from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
 from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations, projected
-from rbpf.maps.submaps import SubMap, SubMaps
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
@@ -339,7 +340,7 @@ class JointMap(Map):
             # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
             columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
             blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
-            by_all = turn @ np.concatenate([by_frame(self.space, points), slope], axis=-1)
+            by_all = turn @ np.concatenate([self.space.transform_jacobian(points), slope], axis=-1)
             means[kind.rows] = self.space.transform(origin, points)
             covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
         if self.old.maps:

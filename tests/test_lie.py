@@ -200,6 +200,13 @@ def test_mean_survives_the_seam_of_the_angle():
     assert abs(mean[0]) == pytest.approx(np.pi, abs=1e-14)
 
 
+@pytest.mark.parametrize(("group", "n"), [(SE2, 2), (SE3, 3), (Euclidean(2), 2)], ids=["SE2", "SE3", "Euclidean"])
+def test_how_points_move_matches_a_numeric_derivative(group, n, rng):
+    points, step = rng.normal(size=(4, n)), 1e-6 * np.eye(group.dim)
+    ahead, back = (group.transform(group.exp(sign * step)[:, None], points) for sign in (1.0, -1.0))
+    np.testing.assert_allclose(group.transform_jacobian(points), np.moveaxis(ahead - back, 0, -1) / 2e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize(("group", "n"), [(SE2, 2), (SE3, 3)], ids=["SE2", "SE3"])
 def test_points_and_matrices(group, n, rng):
     a = group.exp(rng.normal(size=(6, 1, group.dim)))

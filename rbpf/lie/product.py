@@ -65,6 +65,10 @@ class Euclidean(LieGroup):
         """The inverse of `inverse_transform`."""
         return self.compose(a, p)
 
+    def transform_jacobian(self, p: States) -> TangentMatrix:
+        """∂(Exp(ε) p)/∂ε (…, D, d) at ε = 0: I."""
+        return np.broadcast_to(np.eye(self.dim), (*np.shape(p), self.dim))
+
 
 @final
 class Finite(LieGroup):

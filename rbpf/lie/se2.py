@@ -94,6 +94,12 @@ class SE2Group(LieGroup):
         a, p = _contiguous(a), np.asarray(p, dtype=float)
         return _pair(_phasor(-a[..., 0]) * (p[..., 0] + 1j * p[..., 1] - _planar(a)))
 
+    def transform_jacobian(self, p: Like[ArrayLike, "*batch 2"]) -> Float[np.ndarray, "*batch 2 3"]:
+        """∂(Exp(ε) p)/∂ε at ε = 0, of points p [m]: a quarter turn of p, then I."""
+        p = np.asarray(p, dtype=float)
+        turned = np.stack([-p[..., 1:2], p[..., :1]], axis=-2)
+        return np.concatenate([turned, np.broadcast_to(np.eye(2), (*p.shape, 2))], axis=-1)
+
     def translation(self, a: States) -> Float[np.ndarray, "*batch 2"]:
         """View of the translation, (..., 3) -> (..., 2)."""
         return np.asarray(a, dtype=float)[..., 1:]

@@ -66,6 +66,11 @@ class SE3Group(LieGroup):
     def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         return _two(kernels.inverse_transform, a, p, 3, 3)
 
+    def transform_jacobian(self, p: Like[ArrayLike, "*batch 3"]) -> Float[np.ndarray, "*batch 3 6"]:
+        """∂(Exp(ε) p)/∂ε at ε = 0, of points p [m]: −[p]×, then I."""
+        p = np.asarray(p, dtype=float)
+        return np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
+
     def translation(self, a: States) -> Float[np.ndarray, "*batch 3"]:
         """View of the translation, (..., 7) -> (..., 3)."""
         return np.asarray(a, dtype=float)[..., 4:]

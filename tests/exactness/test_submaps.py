@@ -12,9 +12,10 @@ from rbpf.core.models import Part
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.maps.joint.solution import Given, SubMap
+from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
-from rbpf.maps.submaps import Given, SubMap, SubMaps
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.exactness.models import Relative

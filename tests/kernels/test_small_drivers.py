@@ -9,7 +9,6 @@ from rbpf.kernels.increment import are_sound, conditioned
 from rbpf.kernels.rigid_fit import rigid_fit
 from rbpf.kernels.robust_fit import robust_fit
 from rbpf.lie import SE3
-from rbpf.maps.joint_columns import by_frame
 
 
 @pytest.fixture
@@ -128,7 +127,7 @@ def twin(world, cov, shape, weight, start):
     frame = np.repeat(start, len(world), axis=0)
     for _ in range(ROUNDS):
         local = SE3.inverse_transform(frame[:, None], world)
-        moved = -by_frame(SE3, local)
+        moved = -SE3.transform_jacobian(local)
         weighed = np.swapaxes(moved, -1, -2) @ weight
         info = (weighed @ moved).sum(axis=1)
         vector = (weighed @ (local - shape)[..., None]).sum(axis=1)

@@ -13,7 +13,6 @@ from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation
-from rbpf.maps.joint_columns import by_frame
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraPoint
 from rbpf.sensors.camera.resection import resect
@@ -141,7 +140,7 @@ def constellation_records(
     half[:6] = -SE3.adjoint(pose) @ SE3.right_jacobian(x[:6]) @ half[:6]  # in the frame's own right chart
     if isinstance(group, Constellation):
         return group.started(n, frame, gaussian.symmetrise(half @ half.T))
-    moved = half[6:].reshape(*local.shape, -1) + by_frame(SE3, local) @ half[:6]
+    moved = half[6:].reshape(*local.shape, -1) + SE3.transform_jacobian(local) @ half[:6]
     turned = (SE3.rotation(frame) @ moved).reshape(-1, half.shape[1])
     return group.started(n, SE3.transform(frame, local), gaussian.symmetrise(turned @ turned.T))
 

@@ -32,7 +32,6 @@ from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.joint_columns import by_frame
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import clamp_depth
@@ -566,7 +565,7 @@ class Linearised:
             place = np.concatenate([tangents(at.direction)[seen.known.feature], -self._places[..., None]], axis=2)
             for m, feature in enumerate(seen.known.feature.tolist()):
                 rows[m, :, free + 3 * feature : free + 3 * feature + 3] = back @ place[m] / q[m]
-            rows[:, :, frame:] = -by_frame(SE3, self._local)
+            rows[:, :, frame:] = -SE3.transform_jacobian(self._local)
             by_all = (seen.known.whitener @ rows).reshape(-1, size)
             h += by_all.T @ by_all
             b -= by_all.T @ self.known.ravel()

@@ -7,7 +7,7 @@ import numpy as np
 from rbpf.core import checkpoint
 from rbpf.core.models import Landmark
 from rbpf.errors import InputError
-from rbpf.lie import Euclidean, SE2Group, SE3Group, skew
+from rbpf.lie import Euclidean, SE2Group, SE3Group
 
 
 class Table(NamedTuple):
@@ -27,15 +27,6 @@ class Kind(NamedTuple):
     columns: np.ndarray  #: (K, D) of their means.
     clones: np.ndarray  #: (K, d) columns of what they are anchored at; (K, 0) where they are not.
     origins: np.ndarray  #: (K, E) K of these clones; (0, E) where there are none.
-
-
-def by_frame(space: SE2Group | SE3Group | Euclidean, points: np.ndarray) -> np.ndarray:
-    """∂(Exp(ε) l)/∂ε (…, D, d) at ε = 0 and points (…, D): of a turn a column in the plane, −[l]× in space; then I."""
-    moved = np.broadcast_to(np.eye(points.shape[-1]), (*points.shape, points.shape[-1]))
-    if isinstance(space, Euclidean):
-        return moved
-    turned = -skew(points) if isinstance(space, SE3Group) else np.stack([-points[..., 1:2], points[..., :1]], axis=-2)
-    return np.concatenate([turned, moved], axis=-1)
 
 
 class JointColumns:
@@ -135,7 +126,7 @@ class JointColumns:
         points, slope = kind.landmark.point(mean[..., kind.columns], anchor)
         # p = K Exp(δ) l: ∂p/∂δ = R [l's turn | I] J_r.
         near = self.space.inverse_transform(anchor, points)
-        by_clone = self.space.rotation(anchor) @ by_frame(self.space, near)
+        by_clone = self.space.rotation(anchor) @ self.space.transform_jacobian(near)
         return points, np.concatenate([slope, by_clone @ self.space.right_jacobian(mean[..., kind.clones])], axis=-1)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -13,49 +13,20 @@ from copy import copy
 from typing import NamedTuple, final
 
 import numpy as np
-from scipy import sparse
 from scipy.linalg import solve_triangular
-from scipy.sparse.linalg import SuperLU, splu
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
-from rbpf.kernels.sparse import filled, selected_inverse
 from rbpf.lie import Euclidean, SE2Group, SE3Group
-from rbpf.maps.joint_columns import JointColumns, by_frame
+from rbpf.maps.joint.columns import JointColumns
+from rbpf.maps.joint.solution import CLOSE_ENOUGH, EXACT, ITERATIONS, Given, Solution, SubMap, fused, inverse_of, solve
 
-CLOSE_ENOUGH = 1e-6
-"""Largest step [m, rad] at which a solution is taken, and iterations until it is."""
-ITERATIONS = 20
-EXACT = 1e-5
-"""Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
 ROUNDING = 1e-12
 """Variance [m²] below which nothing is told apart."""
 FIRM = 6
 """Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
-
-
-class Given(NamedTuple):
-    """What was known of landmarks (K,) before a sub-map: at `points` (K, D) as seen from its start, with `cov` (KD, KD)."""
-
-    ids: np.ndarray
-    points: np.ndarray
-    cov: np.ndarray
-
-
-class SubMap(NamedTuple):
-    """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
-
-    `cov` is that of the end, in its right chart, and the points, (d + MD, d + MD).
-    """
-
-    end: np.ndarray
-    ids: np.ndarray
-    points: np.ndarray
-    cov: np.ndarray
-    tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
-    given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
 
 
 class Beside(NamedTuple):
@@ -83,62 +54,6 @@ class _Tied(NamedTuple):
     cov: np.ndarray
     half: np.ndarray
     mine: np.ndarray
-
-
-def _inverse(cov: np.ndarray) -> np.ndarray:
-    """As `gaussian.inverse`, of one large matrix, by LAPACK."""
-    half = solve_triangular(gaussian.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False)
-    return np.asarray(half.T @ half)
-
-
-def _information(cov: np.ndarray, d: int) -> np.ndarray:
-    """The inverse; the first d of what it is of may be known exactly."""
-    if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
-        cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
-    return _inverse(cov)
-
-
-class _Factor(NamedTuple):
-    """What a sub-map says of starts and landmarks in `columns` (c,): a residual (r,), its information and slope (r, c).
-
-    `own` (r,) are the columns of the sub-map's Gaussian that it is of.
-    """
-
-    own: np.ndarray
-    columns: np.ndarray
-    info: np.ndarray
-    residual: np.ndarray
-    slope: np.ndarray
-
-
-class _Solution(NamedTuple):
-    """Landmarks (M,) in the world (M, D) and all starts, the information (n, n) of both, and what solves with it."""
-
-    ids: np.ndarray
-    world: np.ndarray
-    starts: np.ndarray
-    factors: list[_Factor]
-    information: sparse.csc_matrix
-    solver: SuperLU
-    is_whole: bool  #: is a minimum of all that is known, and nothing counts twice.
-
-    def covariance(self) -> sparse.csr_matrix:
-        """The entries of the inverse that belong together in a factor, and more, at the work of factoring."""
-        n, turned = self.solver.shape[0], self.solver.perm_c
-        if not np.array_equal(turned, self.solver.perm_r):
-            raise InputError("the sub-maps leave a start or a landmark undetermined")
-        entries = self.information.tocoo()
-        above = sparse.coo_matrix((np.ones(entries.nnz), (turned[entries.row], turned[entries.col])), (n, n))
-        starts, rows = filled(*(lambda low: (low.indptr, low.indices))(sparse.tril(above, format="csc")))
-        columns = np.repeat(np.arange(n), np.diff(starts))
-        pattern = sparse.csc_matrix((np.arange(1.0, rows.size + 1.0), rows, starts), (n, n))
-        lower = np.zeros(rows.size)
-        held = self.solver.L.tocoo()
-        lower[np.asarray(pattern[held.row, held.col], dtype=np.int64).ravel() - 1] = held.data
-        found = selected_inverse(starts, rows, lower, self.solver.U.diagonal())
-        back = np.argsort(turned)
-        half = sparse.csr_matrix((found, (back[rows], back[columns])), (n, n))
-        return half + half.T - sparse.diags_array(half.diagonal(), format="csr")
 
 
 @final
@@ -271,7 +186,7 @@ class SubMaps:
         held = self._inverse_of_given
         if held is None or held[0] is not self.cov or not np.array_equal(held[1], columns):
             own = self.cov[np.ix_(columns, columns)] + ROUNDING * np.eye(columns.size)
-            self._inverse_of_given = held = self.cov, columns, _inverse(own)
+            self._inverse_of_given = held = self.cov, columns, inverse_of(own)
         gain = self.cov[np.ix_(rows, columns)] @ held[2]
         row_of = {landmark: row for row, landmark in enumerate(new.ids.tolist())}
         theirs = np.array([row_of[landmark] for landmark in new.given.ids[its].tolist()])
@@ -279,7 +194,7 @@ class SubMaps:
         by_points = gain.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)
         by_new = np.zeros((rows.size, len(new.cov)))
         by_new[:, (d + dim * theirs[:, None] + np.arange(dim)).ravel()] = by_points.reshape(rows.size, -1)
-        by_new[:, :d] = by_points.reshape(rows.size, -1) @ by_frame(space, seen).reshape(-1, d)
+        by_new[:, :d] = by_points.reshape(rows.size, -1) @ space.transform_jacobian(seen).reshape(-1, d)
         moved = gain @ (space.transform(new.end, seen) - self.points[mine]).ravel()
         return moved, by_new, self.cov[np.ix_(rows, rows)] - gain @ self.cov[np.ix_(columns, rows)]
 
@@ -295,7 +210,7 @@ class SubMaps:
         seen = space.inverse_transform(present.end, self.points[at] + moved.reshape(-1, dim))
         turn = np.kron(np.eye(at.size), space.rotation(present.end).T)
         slope = turn @ by_new
-        slope[:, :d] -= by_frame(space, seen).reshape(-1, d)
+        slope[:, :d] -= space.transform_jacobian(seen).reshape(-1, d)
         return seen, slope, turn @ gaussian.symmetrise(rest) @ turn.T
 
     def _about(self, present: SubMap) -> Beside:
@@ -308,7 +223,7 @@ class SubMaps:
         others = np.setdiff1d(np.arange(self.near.size), mine)
         seen = space.inverse_transform(end, x[d:first].reshape(-1, dim)[others])
         theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
-        by_end = (-by_frame(space, seen) @ space.right_jacobian(x[turned])).reshape(-1, d)
+        by_end = (-space.transform_jacobian(seen) @ space.right_jacobian(x[turned])).reshape(-1, d)
 
         def of_others(columns: np.ndarray) -> np.ndarray:
             back = columns[theirs].reshape(others.size, dim, -1)
@@ -319,7 +234,7 @@ class SubMaps:
         within = of_others(rows.T) - halves @ halves.T
         cross = rows[:, own] - halves @ half[:, own]
         spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(len(x) - first - d)
-        slope = cross @ _inverse(gaussian.symmetrise(spread)) if present.ids.size else cross
+        slope = cross @ inverse_of(gaussian.symmetrise(spread)) if present.ids.size else cross
         rest = gaussian.symmetrise(within - slope @ cross.T)
         return Beside(self.near[others], seen, present.ids, present.points, slope, rest)
 
@@ -374,7 +289,7 @@ class SubMaps:
             rest = rest - np.einsum("mik,kmj->mij", gain.reshape(mine.size, dim, -1), cross.reshape(-1, mine.size, dim))
             seen = each.points[mine] + (gain @ factor.residual).reshape(-1, dim)
             by_all = (gain @ factor.slope).reshape(mine.size, dim, -1)
-            by_all[:, :, d : 2 * d] += by_frame(space, seen)
+            by_all[:, :, d : 2 * d] += space.transform_jacobian(seen)
             free = factor.columns >= 0
             columns, by_all = factor.columns[free], by_all[:, :, free]
             within = joint[columns[:, None], columns].toarray()
@@ -408,7 +323,7 @@ class SubMaps:
             # 0 = l − E Exp(ε) l′ for each landmark l that is l′ in the new one, which ends at E Exp(ε).
             end, seen = space.retract(new.end, x[turned]), x[of_its]
             rotation = space.rotation(end)
-            by_turned = rotation @ by_frame(space, seen) @ space.right_jacobian(x[turned])
+            by_turned = rotation @ space.transform_jacobian(seen) @ space.right_jacobian(x[turned])
 
             def moved_by(
                 columns: np.ndarray, rotation: np.ndarray = rotation, by: np.ndarray = by_turned
@@ -446,7 +361,7 @@ class SubMaps:
         turn[d:second, first + d :] = np.eye(second - d)
         theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
         turn[second:, theirs] = np.kron(np.eye(others.size), space.rotation(end).T)
-        turn[second:, turned] = (-by_frame(space, seen) @ by_end).reshape(-1, d)
+        turn[second:, turned] = (-space.transform_jacobian(seen) @ by_end).reshape(-1, d)
         self.near = np.append(new.ids, self.near[others])
         self.points = np.concatenate([x[first + d :].reshape(-1, dim), seen])
         self.cov = gaussian.symmetrise(turn @ (cov - half.T @ half) @ turn.T)
@@ -478,48 +393,12 @@ class SubMaps:
             both = np.union1d(old.ids, new.ids)
             if any(np.isin(each.ids, both).sum() < FIRM for each in beside):
                 continue
-            self.maps[-1] = self._fused(new, old, self.space.between(self.start, self.starts[number + 1]))
+            self.maps[-1] = fused(self.space, new, old, self.space.between(self.start, self.starts[number + 1]))
             del self.maps[number], self.starts[number + 1]
             self.maps[number] = self.maps[number]._replace(tied=False)
             held, self.maps, self._last = self.maps, [], {}
             for each in held:
                 self._hold(each)
-
-    def _fused(self, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
-        """What two say of their landmarks, as seen from the end of the new one; the old one ends `between` from there.
-
-        Gauss-Newton over how the old one lies, and the new one's end and all landmarks. Where the old one began is left out.
-        """
-        space, d, dim = self.space, self.space.dim, self.dim
-        ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
-        row_of = {landmark: row for row, landmark in enumerate(ids.tolist())}
-        rows = np.array([row_of[landmark] for landmark in old.ids.tolist()])
-        points = np.empty((ids.size, dim))
-        points[rows] = space.transform(between, old.points)
-        points[: new.ids.size] = new.points
-        moved, prior = np.zeros(d), np.append(np.zeros(d), new.points)
-        infos = _information(new.cov, d), _inverse(old.cov[d:, d:])
-        own, theirs = slice(d, d + prior.size), (2 * d + dim * rows[:, None] + np.arange(dim)).ravel()
-        for _ in range(ITERATIONS):
-            seen = space.inverse_transform(between, points[rows])
-            slope = np.zeros((seen.size, 2 * d + points.size))
-            slope[:, :d] = -by_frame(space, seen).reshape(-1, d)
-            slope[:, theirs] = np.kron(np.eye(rows.size), space.rotation(between).T)
-            half = slope.T @ infos[1]
-            info, gradient = half @ slope, half @ (seen - old.points).ravel()
-            info[own, own] += infos[0]
-            gradient[own] += infos[0] @ (np.append(moved, points[: new.ids.size]) - prior)
-            cov = _inverse(gaussian.symmetrise(info))
-            step = -cov @ gradient
-            between, moved = space.retract(between, step[:d]), moved + step[d : 2 * d]
-            points += step[2 * d :].reshape(-1, dim)
-            if np.abs(step).max() < CLOSE_ENOUGH:
-                break
-        cov = cov[d:, d:]
-        turn = space.right_jacobian(moved)
-        cov[:d] = turn @ cov[:d]
-        cov[:, :d] = cov[:, :d] @ turn.T
-        return SubMap(space.retract(new.end, moved), ids, points, gaussian.symmetrise(cov))
 
     def _shared(self, alone: bool = False) -> np.ndarray:
         """Landmarks that several sub-maps hold; if not they `alone`, those of the last one and nearest to its end, too."""
@@ -544,85 +423,8 @@ class SubMaps:
             self._places = self.ids, self._guess(self.ids)
         return self._places
 
-    def _solve(self, ids: np.ndarray, is_whole: bool = True) -> _Solution:
-        """Gauss-Newton over all starts and some landmarks; the others of a sub-map are left out of its factor.
-
-        What sub-maps were given is taken off. Where that leaves no minimum, as when a filter has diverged, it is not.
-        """
-        space, d, dim = self.space, self.space.dim, self.dim
-        world, starts = self._guess(ids), np.array(self.starts)
-        place = {landmark: row for row, landmark in enumerate(ids.tolist())}
-        first = d * len(self.maps)
-        size = first + dim * ids.size
-        parts = []
-        for number, each in enumerate(self.maps):
-            rows = np.array(
-                [row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64
-            )
-            own = np.append(np.arange(d), d + dim * rows[:, None] + np.arange(dim))
-            at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
-            columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
-            cov = each.cov[np.ix_(own, own)]
-            if each.given is not None:
-                cov = cov + EXACT**2 * np.eye(
-                    len(cov)
-                )  # a short one may know what drives the motion exactly from its start
-            if each.tied:
-                info = _information(cov, d)
-            else:
-                info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
-                info[d:, d:] = _inverse(cov[d:, d:])
-            parts.append((rows, at, own, columns, info))
-        # What a sub-map was given is not its own: others say it.
-        taken = []
-        for number, each in enumerate(self.maps):
-            if each.given is not None and is_whole:
-                at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
-                columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
-                taken.append((number, each.given.points, at, columns, _inverse(each.given.cov)))
-        blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
-        where = np.concatenate([np.repeat(columns, columns.size) for columns in blocks])
-        across = np.concatenate([np.tile(columns, columns.size) for columns in blocks])
-        free = (where >= 0) & (across >= 0)  # the first start is where the world is
-        for _ in range(ITERATIONS):
-            factors, entries, gradient = list[_Factor](), list[np.ndarray](), np.zeros(size + d)
-            for number, (rows, at, own, columns, info) in enumerate(parts):
-                each = self.maps[number]
-                begin, end = starts[number], starts[number + 1]
-                between = space.between(begin, end)
-                error, seen = space.local(each.end, between), space.inverse_transform(end, world[at])
-                residual = np.append(error, seen - each.points[rows])
-                slope = np.zeros((residual.size, columns.size))
-                back = space.right_jacobian_inverse(error)
-                slope[:d, :d] = -back @ space.adjoint(space.inverse(between))
-                slope[:d, d : 2 * d] = back
-                slope[d:, d : 2 * d] = -by_frame(space, seen).reshape(-1, d)
-                slope[d:, 2 * d :] = np.kron(np.eye(rows.size), space.rotation(end).T)
-                half = slope.T @ info
-                entries.append((half @ slope).ravel())
-                gradient[columns] += half @ residual  # columns below zero fall behind the end
-                factors.append(_Factor(own, columns, info, residual, slope))
-            for number, points, at, columns, info in taken:
-                seen = space.inverse_transform(starts[number], world[at])
-                slope = np.concatenate(
-                    [-by_frame(space, seen).reshape(-1, d), np.kron(np.eye(at.size), space.rotation(starts[number]).T)],
-                    1,
-                )
-                half = -slope.T @ info
-                entries.append((half @ slope).ravel())
-                gradient[columns] += half @ (seen - points).ravel()
-            information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
-            solver = splu(
-                information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
-            )
-            if taken and not solver.U.diagonal().min() > 0.0:
-                return self._solve(ids, is_whole=False)
-            step = -solver.solve(gradient[:size])
-            starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
-            world += step[first:].reshape(-1, dim)
-            if np.abs(step).max() < CLOSE_ENOUGH:
-                break
-        return _Solution(ids, world, starts, factors, information, solver, is_whole)
+    def _solve(self, ids: np.ndarray) -> Solution:
+        return solve(self.space, self.maps, ids, np.array(self.starts), self._guess(ids))
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
@@ -644,7 +446,7 @@ class SubMaps:
         cov = solver.solve(unit)[columns]
         turn = np.zeros(cov.shape)
         turn[:d, :d] = np.eye(d)
-        turn[d:, :d] = -by_frame(space, seen[kept]).reshape(-1, d)
+        turn[d:, :d] = -space.transform_jacobian(seen[kept]).reshape(-1, d)
         turn[d:, d:] = np.kron(np.eye(kept.size), space.rotation(self.start).T)
         self.near, self.points = ids[kept], seen[kept]
         self.cov = gaussian.symmetrise(turn @ cov @ turn.T)

@@ -15,7 +15,7 @@ from rbpf.core.models import NEW, NULL, Jacobians, Likelihood, Observations, Par
 from rbpf.core.particles import Information, weighted_mean
 from rbpf.errors import InputError
 from rbpf.kernels.dense import add_gram, add_inner, congruent, gather, mirror, product
-from rbpf.maps.joint_columns import JointColumns, Kind
+from rbpf.maps.joint.columns import JointColumns, Kind
 from rbpf.maps.rows import GAUSSIAN, linearised
 
 QUICK = 30_000_000

@@ -1,0 +1,221 @@
+"""What finished sub-maps say together: all their starts and landmarks by Gauss-Newton, sparse, Mathematics (submaps)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import solve_triangular
+from scipy.sparse.linalg import SuperLU, splu
+
+from rbpf import gaussian
+from rbpf.errors import InputError
+from rbpf.kernels.sparse import filled, selected_inverse
+from rbpf.lie import Euclidean, SE2Group, SE3Group
+
+CLOSE_ENOUGH = 1e-6
+"""Largest step [m, rad] at which a solution is taken, and iterations until it is."""
+ITERATIONS = 20
+EXACT = 1e-5
+"""Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
+
+
+class Given(NamedTuple):
+    """What was known of landmarks (K,) before a sub-map: at `points` (K, D) as seen from its start, with `cov` (KD, KD)."""
+
+    ids: np.ndarray
+    points: np.ndarray
+    cov: np.ndarray
+
+
+class SubMap(NamedTuple):
+    """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
+
+    `cov` is that of the end, in its right chart, and the points, (d + MD, d + MD).
+    """
+
+    end: np.ndarray
+    ids: np.ndarray
+    points: np.ndarray
+    cov: np.ndarray
+    tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
+    given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
+
+
+def inverse_of(cov: np.ndarray) -> np.ndarray:
+    """As `gaussian.inverse`, of one large matrix, by LAPACK."""
+    half = solve_triangular(gaussian.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False)
+    return np.asarray(half.T @ half)
+
+
+def information_of(cov: np.ndarray, d: int) -> np.ndarray:
+    """The inverse; the first d of what it is of may be known exactly."""
+    if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
+        cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
+    return inverse_of(cov)
+
+
+class Factor(NamedTuple):
+    """What a sub-map says of starts and landmarks in `columns` (c,): a residual (r,), its information and slope (r, c).
+
+    `own` (r,) are the columns of the sub-map's Gaussian that it is of.
+    """
+
+    own: np.ndarray
+    columns: np.ndarray
+    info: np.ndarray
+    residual: np.ndarray
+    slope: np.ndarray
+
+
+class Solution(NamedTuple):
+    """Landmarks (M,) in the world (M, D) and all starts, the information (n, n) of both, and what solves with it."""
+
+    ids: np.ndarray
+    world: np.ndarray
+    starts: np.ndarray
+    factors: list[Factor]
+    information: sparse.csc_matrix
+    solver: SuperLU
+    is_whole: bool  #: is a minimum of all that is known, and nothing counts twice.
+
+    def covariance(self) -> sparse.csr_matrix:
+        """The entries of the inverse that belong together in a factor, and more, at the work of factoring."""
+        n, turned = self.solver.shape[0], self.solver.perm_c
+        if not np.array_equal(turned, self.solver.perm_r):
+            raise InputError("the sub-maps leave a start or a landmark undetermined")
+        entries = self.information.tocoo()
+        above = sparse.coo_matrix((np.ones(entries.nnz), (turned[entries.row], turned[entries.col])), (n, n))
+        starts, rows = filled(*(lambda low: (low.indptr, low.indices))(sparse.tril(above, format="csc")))
+        columns = np.repeat(np.arange(n), np.diff(starts))
+        pattern = sparse.csc_matrix((np.arange(1.0, rows.size + 1.0), rows, starts), (n, n))
+        lower = np.zeros(rows.size)
+        held = self.solver.L.tocoo()
+        lower[np.asarray(pattern[held.row, held.col], dtype=np.int64).ravel() - 1] = held.data
+        found = selected_inverse(starts, rows, lower, self.solver.U.diagonal())
+        back = np.argsort(turned)
+        half = sparse.csr_matrix((found, (back[rows], back[columns])), (n, n))
+        return half + half.T - sparse.diags_array(half.diagonal(), format="csr")
+
+
+def solve(
+    space: SE2Group | SE3Group | Euclidean,
+    maps: list[SubMap],
+    ids: np.ndarray,
+    starts: np.ndarray,
+    world: np.ndarray,
+    is_whole: bool = True,
+) -> Solution:
+    """Gauss-Newton over all starts and some landmarks (M,); the others of a sub-map are left out of its factor.
+
+    It begins at `starts` (T + 1, E), of T sub-maps and of the next one, and at landmarks in the `world` (M, D). What
+    sub-maps were given is taken off. Where that leaves no minimum, as when a filter has diverged, it is not.
+    """
+    d, dim, first_guess = space.dim, world.shape[1], (starts, world)
+    starts, world = starts.copy(), world.copy()
+    place = {landmark: row for row, landmark in enumerate(ids.tolist())}
+    first = d * len(maps)
+    size = first + dim * ids.size
+    parts = []
+    for number, each in enumerate(maps):
+        rows = np.array([row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64)
+        own = np.append(np.arange(d), d + dim * rows[:, None] + np.arange(dim))
+        at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
+        columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
+        cov = each.cov[np.ix_(own, own)]
+        if each.given is not None:
+            # A short one may know what drives the motion exactly from its start.
+            cov = cov + EXACT**2 * np.eye(len(cov))
+        if each.tied:
+            info = information_of(cov, d)
+        else:
+            info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
+            info[d:, d:] = inverse_of(cov[d:, d:])
+        parts.append((rows, at, own, columns, info))
+    # What a sub-map was given is not its own: others say it.
+    taken = []
+    for number, each in enumerate(maps):
+        if each.given is not None and is_whole:
+            at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
+            columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
+            taken.append((number, each.given.points, at, columns, inverse_of(each.given.cov)))
+    blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
+    where = np.concatenate([np.repeat(columns, columns.size) for columns in blocks])
+    across = np.concatenate([np.tile(columns, columns.size) for columns in blocks])
+    free = (where >= 0) & (across >= 0)  # the first start is where the world is
+    for _ in range(ITERATIONS):
+        factors, entries, gradient = list[Factor](), list[np.ndarray](), np.zeros(size + d)
+        for number, (rows, at, own, columns, info) in enumerate(parts):
+            each = maps[number]
+            begin, end = starts[number], starts[number + 1]
+            between = space.between(begin, end)
+            error, seen = space.local(each.end, between), space.inverse_transform(end, world[at])
+            residual = np.append(error, seen - each.points[rows])
+            slope = np.zeros((residual.size, columns.size))
+            back = space.right_jacobian_inverse(error)
+            slope[:d, :d] = -back @ space.adjoint(space.inverse(between))
+            slope[:d, d : 2 * d] = back
+            slope[d:, d : 2 * d] = -space.transform_jacobian(seen).reshape(-1, d)
+            slope[d:, 2 * d :] = np.kron(np.eye(rows.size), space.rotation(end).T)
+            half = slope.T @ info
+            entries.append((half @ slope).ravel())
+            gradient[columns] += half @ residual  # columns below zero fall behind the end
+            factors.append(Factor(own, columns, info, residual, slope))
+        for number, points, at, columns, info in taken:
+            seen = space.inverse_transform(starts[number], world[at])
+            slope = np.concatenate(
+                [
+                    -space.transform_jacobian(seen).reshape(-1, d),
+                    np.kron(np.eye(at.size), space.rotation(starts[number]).T),
+                ],
+                1,
+            )
+            half = -slope.T @ info
+            entries.append((half @ slope).ravel())
+            gradient[columns] += half @ (seen - points).ravel()
+        information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
+        solver = splu(information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+        if taken and not solver.U.diagonal().min() > 0.0:
+            return solve(space, maps, ids, *first_guess, is_whole=False)
+        step = -solver.solve(gradient[:size])
+        starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
+        world += step[first:].reshape(-1, dim)
+        if np.abs(step).max() < CLOSE_ENOUGH:
+            break
+    return Solution(ids, world, starts, factors, information, solver, is_whole)
+
+
+def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
+    """What two say of their landmarks, as seen from the end of the new one; the old one ends `between` from there.
+
+    Gauss-Newton over how the old one lies, and the new one's end and all landmarks. Where the old one began is left out.
+    """
+    d, dim = space.dim, new.points.shape[1]
+    ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
+    row_of = {landmark: row for row, landmark in enumerate(ids.tolist())}
+    rows = np.array([row_of[landmark] for landmark in old.ids.tolist()])
+    points = np.empty((ids.size, dim))
+    points[rows] = space.transform(between, old.points)
+    points[: new.ids.size] = new.points
+    moved, prior = np.zeros(d), np.append(np.zeros(d), new.points)
+    infos = information_of(new.cov, d), inverse_of(old.cov[d:, d:])
+    own, theirs = slice(d, d + prior.size), (2 * d + dim * rows[:, None] + np.arange(dim)).ravel()
+    for _ in range(ITERATIONS):
+        seen = space.inverse_transform(between, points[rows])
+        slope = np.zeros((seen.size, 2 * d + points.size))
+        slope[:, :d] = -space.transform_jacobian(seen).reshape(-1, d)
+        slope[:, theirs] = np.kron(np.eye(rows.size), space.rotation(between).T)
+        half = slope.T @ infos[1]
+        info, gradient = half @ slope, half @ (seen - old.points).ravel()
+        info[own, own] += infos[0]
+        gradient[own] += infos[0] @ (np.append(moved, points[: new.ids.size]) - prior)
+        cov = inverse_of(gaussian.symmetrise(info))
+        step = -cov @ gradient
+        between, moved = space.retract(between, step[:d]), moved + step[d : 2 * d]
+        points += step[2 * d :].reshape(-1, dim)
+        if np.abs(step).max() < CLOSE_ENOUGH:
+            break
+    cov = cov[d:, d:]
+    turn = space.right_jacobian(moved)
+    cov[:d] = turn @ cov[:d]
+    cov[:, :d] = cov[:, :d] @ turn.T
+    return SubMap(space.retract(new.end, moved), ids, points, gaussian.symmetrise(cov))
