@@ -1,5 +1,6 @@
 """Commands about finished runs: compare them with something, build their page, export them, sweep over settings."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,7 +10,7 @@ import tyro
 from rbpf.cli.options import Printed, Text, Where
 from rbpf.cli.showing import CONSOLE, answer, progress
 from rbpf.errors import InputError
-from rbpf.ranges import Count, Range
+from rbpf.ranges import Count, NotNegative, Range
 
 if TYPE_CHECKING:
     from rbpf.validation.consistency.comparison import Verdict
@@ -27,9 +28,12 @@ class Validate(Printed):
     #: in their place, a file of relations between poses (t1 t2 x y z roll pitch yaw) that are known; by default none.
     relations: Where = None
     path: Where = None  #: in their place, another path of the same recording, in TUM format; by default none.
+    truth_std_m: NotNegative = 0.0  #: standard deviation per axis of the ground truth's own positions, m.
+    truth_std_deg: NotNegative = 0.0  #: of its rotations, degrees.
     out: Where = None  #: a further folder for the JSON, which is always written into the run's own; by default none.
 
     def __call__(self) -> None:
+        from rbpf.runs.truth import Precision
         from rbpf.validation.consistency.comparison import read_comparisons
         from rbpf.validation.report.validate import validate as compare
 
@@ -37,8 +41,11 @@ class Validate(Printed):
             raise InputError("a run is compared with one thing at a time: leave out --relations or --path")
         file = self.relations or self.path
         against = self.against if file is None else "path" if self.relations is None else "relations"
+        truth = Precision(self.truth_std_m, math.radians(self.truth_std_deg))
+        if any(truth) and against != "groundtruth":
+            raise InputError(f"--truth-std-m and --truth-std-deg are of the ground truth, not of {file or against}")
         with CONSOLE.status(f"comparing with {file or against} …"):
-            verdict = compare(self.run, against, self.out, file)
+            verdict = compare(self.run, against, self.out, file, truth)
         # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
         asked = [c.accuracy for c in read_comparisons(self.run) if c.against == against]
         _answer(verdict, self.run, self.json, *(found for found in asked if found not in verdict.path.sentence))

@@ -6,6 +6,7 @@ truth.npz    rows (R,) of the frames with a true pose, poses (R, E); ids (M,) an
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,16 @@ _TRUTH = {
     "landmarks": numbers("landmarks", ""),
 }
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
+
+
+class Precision(NamedTuple):
+    """Standard deviations, per axis, of the poses that are taken for the truth: of positions [m] and rotations [rad]."""
+
+    std_m: float = 0.0
+    std_rad: float = 0.0
+
+
+EXACT = Precision()
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
 from rbpf.runs.results import load
 from rbpf.runs.trajectory import Similarity, read_tum, write_tum
-from rbpf.runs.truth import RunTruth, write_truth
+from rbpf.runs.truth import Precision, RunTruth, write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -33,7 +33,7 @@ from rbpf.validation.consistency.against_batch import (
     compare_with_batch,
 )
 from rbpf.validation.consistency.against_groundtruth import LANDMARKS as IN_TRUTH
-from rbpf.validation.consistency.against_groundtruth import NEES, compare_with_truth, truth_errors
+from rbpf.validation.consistency.against_groundtruth import NEES, compare_with_truth, pose_statistics, truth_errors
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
@@ -237,6 +237,27 @@ def test_nees_is_told_of_a_run_in_a_world_and_scale_of_its_own(moved_run, alignm
     assert inside > 0.9 if claimed == 1.0 else inside < 0.3
     assert errors.landmarks.truth == pytest.approx(there.transform(points))
     assert np.abs(errors.landmarks.map.mean - errors.landmarks.truth).max() < 0.1 * there.scale
+
+
+@pytest.mark.parametrize("alignment", ["none", "rigid", "similarity"])
+def test_a_truth_with_an_error_of_its_own_contradicts_nobody_once_that_is_stated(moved_run, alignment):
+    """Motion capture that is good to a centimetre made a filter that is good to a millimetre look over-confident."""
+    rng = np.random.default_rng(5)
+    truth, mean, cov = drawn(rng, 0.002)
+    there = {"none": Similarity(1.0, np.eye(3), np.zeros(3)), "rigid": replace(AWAY, scale=1.0), "similarity": AWAY}[
+        alignment
+    ]
+    seen, own = there.transform_poses(truth), Precision(0.02, 0.01)
+    measured = SE3.retract(seen, rng.normal(size=(STEPS, 6)) * np.repeat([own.std_rad, own.std_m], 3))
+    write_truth(moved_run, RunTruth(np.arange(STEPS), measured, {}, alignment))
+    write_trajectory(moved_run, np.arange(STEPS), mean, cov)
+    record = load(moved_run)
+    exact, known = (pose_statistics(e.whitened, e.fitted)[0] for e in (truth_errors(record), truth_errors(record, own)))
+    assert exact.outcome == "contradicts"
+    assert known.outcome == "supports"
+    assert known.value == pytest.approx(1.0, rel=0.2)
+    figures = compare_with_truth(record, truth_errors(record, own)).figures
+    assert (figures["truth_std_m"], figures["truth_std_deg"]) == (own.std_m, pytest.approx(np.degrees(own.std_rad)))
 
 
 def in_another_world(moved_run):

@@ -126,6 +126,11 @@ def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(run_f
             lambda folder: (folder / "config.yaml").unlink(),
             "no config.yaml: expected the folder",
         ),
+        (
+            ["validate", "--against", "gtsam", "--truth-std-m", "0.01"],
+            lambda folder: None,
+            "are of the ground truth, not",
+        ),
     ],
 )
 def test_a_folder_that_is_no_run_is_refused(run_folder, command, spoil, message, capsys):

@@ -19,7 +19,7 @@ from rbpf.lie import SE2
 from rbpf.runs.plots import moved_map
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
-from rbpf.runs.truth import LEAST, RunTruth
+from rbpf.runs.truth import EXACT, LEAST, Precision, RunTruth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency import statistic
 from rbpf.validation.consistency.comparison import Comparison
@@ -44,6 +44,7 @@ class TruthErrors:
     whitened: statistic.WhitenedErrors  #: errors of the poses in units of the filter's own.
     fitted: int  #: parameters of the motion that brought the truth into the run's world; 0 where it is there.
     landmarks: "LandmarkErrors | None"  #: the map's points whose true places are known; None without any.
+    stated: Precision  #: the truth's own.
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,8 @@ class LandmarkErrors:
         return np.square(self.white).sum(axis=1)
 
 
-def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
-    """Errors of a run; the truth's own standard deviations per axis are `std_m` and `std_rad`.
+def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
+    """Errors of a run beside a truth whose poses have the stated precision, landmarks are exact.
 
     Raises InputError: the run has no truth, or too little.
     """
@@ -70,17 +71,22 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
         raise InputError(f"{record.folder}: {truth.rows.size} steps have a true pose, a comparison needs {LEAST}")
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     positions = ate(path.at(truth.rows).trajectory, reference, truth.alignment)
-    turns = 1 if path.space.dim == SE2.dim else 3
-    own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
-    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows] + np.diag(own)
+    mean, cov = path.world_from_body[truth.rows], path.cov_poses[truth.rows]
     anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
-    if truth.alignment == "none":
+    turns = 1 if space.dim == SE2.dim else 3
+    own = np.repeat([stated.std_rad**2, stated.std_m**2], [turns, space.dim - turns])
+    # A truth that was moved so that both begin alike errs everywhere by what its first pose errs.
+    moved_by_first = any(stated) and np.array_equal(truth.poses[0], space.identity())
+    if truth.alignment == "none" and not moved_by_first:
+        cov = cov + np.diag(own)
         whitened = statistic.whitened_errors(space, mean, cov, truth.poses)
         landmarks = None if anonymous else _landmark_errors(record, truth, positions.alignment)
-        return TruthErrors(positions, whitened, 0, landmarks)
+        return TruthErrors(positions, whitened, 0, landmarks, stated)
     # The truth brought into the run's world.
     true, ours = (in_space(path.stamps_ns[truth.rows], poses) for poses in (truth.poses, mean))
     start = align(true.positions, ours.positions, with_scale=across)
+    own[turns:] *= start.scale**2
+    cov = cov + np.diag(own)
     if space.dim == SE2.dim:
         plane = start.in_dimension(2)
         turned = np.array([np.arctan2(plane.rotation[1, 0], plane.rotation[0, 0]), *plane.translation])
@@ -101,7 +107,8 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
     points = {name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()}
     there = RunTruth(truth.rows, space.compose(turn, moved), points, truth.alignment)
     landmarks = None if anonymous else _landmark_errors(record, there, positions.alignment)
-    return TruthErrors(positions, statistic.WhitenedErrors(errors(motion), ranks), space.dim, landmarks)
+    whitened = statistic.WhitenedErrors(errors(motion), ranks)
+    return TruthErrors(positions, whitened, space.dim, landmarks, stated)
 
 
 def pose_statistics(errors: statistic.WhitenedErrors, fitted: int = 0) -> list[statistic.Statistic]:
@@ -140,6 +147,10 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
         "motion_translation_rmse_m": relative.translation_rmse,
         "motion_rotation_rmse_deg": relative.rotation_rmse_deg,
     }
+    if any(errors.stated):
+        std_m, std_deg = errors.stated.std_m, float(np.degrees(errors.stated.std_rad))
+        accuracy += f"; the truth itself is taken to be good to {_metres(std_m)} and {std_deg:.2g}°"
+        figures |= {"truth_std_m": std_m, "truth_std_deg": std_deg}
     known, white = errors.whitened.ranks > 0, errors.whitened
     nees, ranks = (values[known] if known.any() else np.zeros(1) for values in (white.nees, white.ranks))
     statistics = pose_statistics(white, errors.fitted)

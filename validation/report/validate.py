@@ -19,6 +19,7 @@ from rbpf.runs.folder import write_summary
 from rbpf.runs.plots import World
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import associate, read_tum
+from rbpf.runs.truth import EXACT, Precision
 from rbpf.validation.consistency import comparison as verdicts
 from rbpf.validation.consistency.comparison import Comparison, Verdict
 from rbpf.validation.metrics.accuracy import ate, rpe
@@ -35,11 +36,11 @@ KEY_FRAMES = 60
 Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folder.
 
 
-def _groundtruth(record: RunFolder) -> Comparison:
+def _groundtruth(record: RunFolder, precision: Precision = EXACT) -> Comparison:
     from rbpf.validation.consistency.against_groundtruth import compare_with_truth, truth_errors
     from rbpf.validation.report.comparison_pictures import draw_truth
 
-    errors = truth_errors(record)
+    errors = truth_errors(record, precision)
     return replace(compare_with_truth(record, errors), pictures=draw_truth(record, errors))
 
 
@@ -109,11 +110,14 @@ COMPARISONS: dict[str, dict[str, Compare]] = {
 WITH_A_FILE: dict[str, Callable[[RunFolder, Path], Comparison]] = {"relations": _relations, "path": _path}
 
 
-def validate(folder: Path, against: str, out: Path | None = None, file: Path | None = None) -> Verdict:
+def validate(
+    folder: Path, against: str, out: Path | None = None, file: Path | None = None, truth: Precision = EXACT
+) -> Verdict:
     """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again; returns the verdict.
 
-    `against` is a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`; `out` is a further folder for the JSON. An
-    InputError says that it is not possible; the report is written all the same, and says why.
+    `against` is a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`; `out` is a further folder for the JSON;
+    `truth` is how precise the ground truth is, by default exact. An InputError says that it is not possible; the report is
+    written all the same, and says why.
     """
     record = RunFolder.open(folder)
     try:
@@ -127,7 +131,7 @@ def validate(folder: Path, against: str, out: Path | None = None, file: Path | N
             if compare is None:
                 able = f"(possible: {', '.join(sorted(known))})"
                 raise InputError(f"a run of the system {record.system!r} cannot be compared with {against} {able}")
-            comparison = compare(record)
+            comparison = _groundtruth(record, truth) if compare is _groundtruth else compare(record)
     except InputError as error:
         write_report(folder, [f"Not compared with {against}: {error}."])
         raise
