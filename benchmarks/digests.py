@@ -25,7 +25,7 @@ import numpy as np
 
 DATA = Path(os.environ.get("RBPF_DATA", "../shared/data")).resolve()
 RBPF = [sys.executable, "-m", "rbpf"]
-TIMES = ("ms_per_", "peak_memory", "seconds", "_ms", "milliseconds")
+TIMES = ("finished", "ms_per_", "peak_memory", "seconds", "_ms", "milliseconds")
 
 
 def rbpf(*words: Any) -> None:

@@ -12,7 +12,7 @@ import tyro
 from PIL import Image
 
 from rbpf.runs.folder import write_run
-from rbpf.runs.plots import map_figure, save_figures
+from rbpf.runs.plots import plot_map, save_figures
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import MonoRecording, filter_recording
 from rbpf.runs.run import Run
@@ -64,7 +64,7 @@ def main(images: Path | None = None, out: Path = Path(__file__).parent / "pictur
         run = filter_recording(MonoRecording(images, images / "known_points.csv"), MonoConfig())
         animate(run, out / "desk.webp")
         write_run(run, scratch / "run", {"recording": str(images)})
-        save_figures({"map.png": map_figure(RunFolder.open(scratch / "run"))}, scratch)
+        save_figures({"map.png": plot_map(RunFolder.open(scratch / "run"))}, scratch)
         shrink(scratch / "map.png", out / "map.png")
     for path in (out / "desk.webp", out / "map.png"):
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

@@ -53,6 +53,9 @@ from .maps.point import ring as ring
 from .maps.point import ring_components as ring_components
 from .motion.odometry import Odometry as Odometry
 from .motion.odometry import OdometryMotion as OdometryMotion
+from .runs.plots import plot_error as plot_error
+from .runs.plots import plot_map as plot_map
+from .runs.plots import plot_trajectory as plot_trajectory
 from .runs.results import Results as Results
 from .runs.results import load as load
 from .sensors.camera import Pinhole as Pinhole
@@ -77,5 +80,6 @@ from .systems.stereo.slam import StereoSlam as StereoSlam
 from .systems.system import System as System
 from .systems.system import Tracked as Tracked
 from .systems.system import TrackingState as TrackingState
+from .validation.report.comparison_pictures import plot_consistency as plot_consistency
 
 __version__: str

@@ -33,7 +33,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.colmap.model import OVER_IMAGES, Names, build_model, lay_out, recorded_images
 from rbpf.validation.gtsam.batch_problem import Problem
 from rbpf.validation.gtsam.observations import ObservationTable, observation_table
-from rbpf.validation.report.video import AXIS_M, ellipsoids, log_pose, log_time, recording
+from rbpf.validation.report.live import AXIS_M, ellipsoids, log_pose, log_time, recording
 
 _log = logging.getLogger(__name__)
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"

@@ -20,8 +20,10 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.consistency.comparison import COMPARISON
 from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
-from rbpf.validation.report.validate import COMPARISONS, VIDEO, compare_gtsam, validate, write_report
-from rbpf.validation.report.video import PICTURES, annotated_frames, write_rerun, write_video
+from rbpf.validation.report.live import write_rerun
+from rbpf.validation.report.page import VIDEO, write_report
+from rbpf.validation.report.validate import COMPARISONS, compare_gtsam, validate
+from rbpf.validation.report.video import PICTURES, annotated_frames, write_video
 
 #: Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
 #: who asks for it.

@@ -37,11 +37,7 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
-from rbpf.systems.laser.config import LaserConfig
-from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
-from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate
 
@@ -58,17 +54,16 @@ Named = tuple[tuple[str, str], ...]
 class SweepSystem:
     """A system that a sweep can run."""
 
-    config: type  #: of its settings.
     recording: Callable[..., recordings.Recording]  #: opens a sequence, from the paths of its fields.
     fields: tuple[str, ...] = ("recording",)  #: of a sequence, each a path; the first is the recording itself.
 
 
 #: By their names.
 SYSTEMS = {
-    "range-bearing": SweepSystem(RangeBearingConfig, recordings.RobotRecording),
-    "laser": SweepSystem(LaserConfig, recordings.LaserRecording),
-    "mono": SweepSystem(MonoConfig, recordings.MonoRecording, ("recording", "known_points", "calibration")),
-    "stereo": SweepSystem(StereoConfig, recordings.StereoRecording, ("recording", "calibration")),
+    "range-bearing": SweepSystem(recordings.RobotRecording),
+    "laser": SweepSystem(recordings.LaserRecording),
+    "mono": SweepSystem(recordings.MonoRecording, ("recording", "known_points", "calibration")),
+    "stereo": SweepSystem(recordings.StereoRecording, ("recording", "calibration")),
 }
 
 
@@ -109,7 +104,7 @@ class Job:
 
     def config(self) -> Any:
         """All settings of the run. An InputError says which one is wrong."""
-        return load_settings(SYSTEMS[self.system].config, self.system, None, self.settings, self.given)
+        return load_settings(recordings.CONFIGS[self.system], self.system, None, self.settings, self.given)
 
     def facts(self) -> dict[str, Any]:
         """The first columns of its row in the table."""

@@ -27,8 +27,8 @@ def patient(report: OnProgress) -> Iterator[OnProgress]:
         asked.set()
         say("stopping after this frame; Ctrl-C again stops at once …")
 
-    def listening(done: int, total: int | None) -> None:
-        report(done, total)
+    def listening(done: int, total: int | None, words: str = "") -> None:
+        report(done, total, words)
         if asked.is_set():
             raise StoppedError(
                 f"stopped after {done} of {total or 'an unknown number'}; the same command with --resume goes on from there"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rbpf.cli.options import Printed, Text, Where
-from rbpf.cli.showing import CONSOLE, answer, progress
+from rbpf.cli.showing import CONSOLE, answer, progress, table
 from rbpf.errors import InputError
 from rbpf.ranges import Count, NotNegative, Range
 
@@ -58,9 +58,44 @@ class Report(Printed):
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
 
     def __call__(self) -> None:
-        from rbpf.validation.report.validate import write_report
+        from rbpf.validation.report.page import write_report
 
         _answer(write_report(self.run), self.run, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot(Printed):
+    """Draw the pictures of a run, or paths, errors and consistency of several runs together, with a table of figures."""
+
+    #: folders that `rbpf run` left; several of one recording.
+    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN")]
+    out: Path = Path("plots")  #: folder for the pictures.
+    format: tuple[Literal["png", "pdf", "svg"], ...] = ("png",)  #: one or several; pdf and svg are vectors.
+
+    def __call__(self) -> None:
+        from rbpf.runs.files import prepare_folder
+        from rbpf.runs.plots import draw_run
+        from rbpf.runs.reading import RunFolder
+        from rbpf.validation.report.comparison_pictures import draw_beside
+
+        if not self.runs:
+            raise InputError("name one run to draw, or several to draw together: rbpf plot RUN_A RUN_B")
+        found = [RunFolder.open(run) for run in self.runs]
+        prepare_folder(self.out)
+        one = len(found) == 1
+        names = draw_run(found[0], self.out, self.format) if one else draw_beside(found, self.out, self.format)
+        entries = {
+            str(run.folder): {name: run.summary[name] for name in _BESIDE if name in run.summary} for run in found
+        }
+        lines = [line for run, figures in entries.items() for line in (run, *table(figures, 28))]
+        answer({"runs": entries, "files": names}, self.json, *lines, f"wrote {', '.join(names)} into {self.out}")
+
+
+#: Entries of summary.json by which runs are compared.
+_BESIDE = (
+    "frames", "particles", "position_rmse_m", "ate_rmse_m", "ate_sim3_rmse_m", "filter_minus_batch_rmse_m", "lost_frames",
+    "nis_per_dof", "log_evidence", "ms_per_frame",
+)  # fmt: skip
 
 
 def _answer(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:

@@ -1,6 +1,9 @@
 """`rbpf run`: one class per system, and the same run again."""
 
+import time
+from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +14,7 @@ from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
 from rbpf.cli.interrupts import StoppedError, patient
 from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
-from rbpf.cli.showing import answer, progress, say
+from rbpf.cli.showing import OnProgress, answer, progress, say
 from rbpf.errors import InputError
 from rbpf.ranges import Count, NotNegative, Range
 
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from rbpf.runs.run import Run
     from rbpf.sensors.readers.part import Part
     from rbpf.systems.settings import Config
+    from rbpf.systems.system import Tracked
+    from rbpf.validation.report.live import RunView
 
 RUN = Commands(
     """Filter a recording; `rbpf run SYSTEM --help` says more.
@@ -46,6 +51,7 @@ class RunOptions(Printed):
     resume: Flag = False  #: go on from the checkpoint in the results' folder, if there is one.
     overwrite: Flag = False  #: write over the run that lies in the results' folder.
     threads: Annotated[Whole, Range(ge=1, le=4096)] = None  #: threads of the kernels; by default all.
+    view: Flag = False  #: show the run in the Rerun viewer while it is made.
 
     def settings(self, kind: "type[Config]", system: str, *own: str) -> "Config":
         """The system's settings by --config, --set and options that are settings, of which the system has some of its own."""
@@ -91,10 +97,6 @@ class ImageRunOptions(PartOptions):
 
     def over_images(self, recording: "Recording", config: Any, video: bool) -> None:
         """Filters images, with what can be left out as it is asked for."""
-        from rbpf.validation.report.video import require_rerun
-
-        if self.rerun is not None:
-            require_rerun()
         more: dict[str, Any] = {"rerun": self.rerun, "batch": self.batch, "most_iterations": self.batch_limit}
         _run(self, recording, config, video=video, **more)
 
@@ -242,6 +244,26 @@ def repeated(arguments: list[str]) -> list[str]:
     return ["run", *words, *out, *arguments[3:]]
 
 
+#: Columns of a system that say how much was found, and of how much.
+_FOUND = ("found", "searched"), ("observed", "features")
+_RECENT = 50  #: Frames over which their number per second is taken.
+
+
+def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
+    """A listener that reports each frame: whether it was tracked or lost, found of searched, frames per second of late."""
+    times: deque[float] = deque(maxlen=_RECENT)
+
+    def tell(run: "Run", tracked: "Tracked") -> None:
+        said: list[str] = [tracked.state]
+        said += [f"found {tracked.values[a]} of {tracked.values[b]}" for a, b in _FOUND if b in tracked.values]
+        times.append(time.monotonic())
+        if times[-1] > times[0]:
+            said.append(f"{(len(times) - 1) / (times[-1] - times[0]):.3g} {run.system.frame_word}s per second")
+        report(len(run.log), run.expected or 0, ", ".join(said))
+
+    return tell
+
+
 def _run(
     options: RunOptions,
     recording: "Recording",
@@ -256,7 +278,10 @@ def _run(
     from rbpf.runs.files import holds_run, numbered, own_folder
     from rbpf.runs.recordings import filter_recording
     from rbpf.validation.finish import finish_run
+    from rbpf.validation.report.live import require_rerun, viewer
 
+    if options.view or made.get("rerun") is not None:
+        require_rerun()
     # Threads as asked for, and the folder for the results, which nobody else writes to.
     if options.resume and options.overwrite:
         raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
@@ -273,9 +298,13 @@ def _run(
             raise InputError(
                 f"{out} holds a run already: name another with --out, go on by --resume, or write over it by --overwrite"
             )
-        with patient(bar("filtering")) as report:
-            listeners = [lambda run, _: report(len(run.log), run.expected or 0)]
+        shown: AbstractContextManager[RunView | None] = viewer(out.name) if options.view else nullcontext()
+        with patient(bar("filtering")) as report, shown as view:
+            listeners: list[Callable[[Run, Tracked], None]] = [_telling(report)]
+            listeners += [] if view is None else [view]
             run = filter_recording(recording, config, out, options.resume, listeners)
+            if view is not None:
+                view.finish(run)
         filtered(run)
         solving = bar("batch")
         made |= {"on_frame": bar("drawing"), "on_iteration": lambda count, _error: solving(count, None)}

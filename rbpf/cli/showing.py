@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -12,23 +12,28 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rbpf.errors import printable
 
 CONSOLE = Console(stderr=True)
-#: Called with how many are done, and of how many; None where that is not known.
-OnProgress = Callable[[int, int | None], None]
+
+
+class OnProgress(Protocol):
+    """Called with how many are done, of how many, None where that is not known, and what is to be said of it."""
+
+    def __call__(self, done: int, total: int | None, words: str = "") -> None: ...
 
 
 @contextmanager
 def progress() -> Iterator[Callable[[str], OnProgress]]:
     """Makes bars by name: each a callback for what is done, shown from its first call."""
     done, left = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()), (TextColumn("left:"), TimeRemainingColumn())
-    bars = Progress(TextColumn("{task.description}"), *done, *left, console=CONSOLE)
+    said = TextColumn("{task.fields[words]}", markup=False)
+    bars = Progress(TextColumn("{task.description}"), *done, *left, said, console=CONSOLE)
 
     def bar(what: str) -> OnProgress:
-        task = bars.add_task(what, start=False, visible=False)
+        task = bars.add_task(what, start=False, visible=False, words="")
 
-        def report(done: int, total: int | None) -> None:
+        def report(done: int, total: int | None, words: str = "") -> None:
             bars.start()
             bars.start_task(task)
-            bars.update(task, completed=done, total=total or None, visible=True)
+            bars.update(task, completed=done, total=total or None, visible=True, words=words)
 
         return report
 

@@ -36,6 +36,7 @@ import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
         if name == files.GRID:
             write_grid(out, arrays)
     write_config(out, system.name, sources, asdict(system.config))
-    entries = summarise(run)
+    entries = {"finished": datetime.now(UTC).isoformat(timespec="seconds")} | summarise(run)
     write_summary(out, entries)
     return entries
 

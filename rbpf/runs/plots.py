@@ -11,7 +11,7 @@ All are drawn in one world, the truth's where the recording has one (`World`).
 A further figure of every run is one function from `RunFolder` to a matplotlib figure, entered into `FIGURES`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -49,58 +49,94 @@ _NOT_COUNTS = {
 }  # fmt: skip
 
 
-def draw_run(found: RunFolder) -> list[str]:
-    """Draws all figures of a run into its folder; returns their file names."""
+def draw_run(found: RunFolder, out: Path | None = None, formats: Sequence[str] = ("png",)) -> list[str]:
+    """Draws all figures of a run into a folder, by default its own; returns their file names."""
     drawn = {name: draw(found) for name, draw in FIGURES.items()}
     if found.system == "range-bearing":
         drawn["ess.png"] = drawn.pop("tracking.png")
-    return save_figures({name: figure for name, figure in drawn.items() if figure is not None}, found.folder)
+    there = {Path(name).stem: figure for name, figure in drawn.items() if figure is not None}
+    names = {f"{name}.{ending}": figure for ending in formats for name, figure in there.items()}
+    return save_figures(names, out or found.folder)
 
 
-def path_figure(found: RunFolder) -> Any:
-    """The path, beside what there is to compare it with."""
-    world = World.of(found)
-    path = world.brought(found.trajectory)
-    figure, shown = Views.of(found.system, path).axes(f"{found.name}: path in {world.name}")
-    curves = [] if world.truth is None else [("truth", world.truth.positions, "truth", "--")]
-    for name, label_ in (("odometry", "odometry alone"), ("batch", "batch optimum")):
-        if (found.folder / f"{name}.tum").is_file():
-            moved = world.brought(read_tum(found.folder / f"{name}.tum"))
-            curves.append((name, moved.positions, label_, "-"))
-    lost = lost_frames(found)
+def plot_trajectory(*runs: RunFolder, ax: Any = None) -> Any:
+    """The path, beside the truth, the odometry and the batch optimum.
+
+    Of several runs it is their paths, in one world. Returns the figure: seen from above and, in space, from the side. Into
+    the axes `ax`, if they are given, only the view from above is drawn.
+    """
+    first, world = runs[0], World.of(*runs)
+    paths = [world.brought(run.trajectory) for run in runs]
+    names = [run.folder.name for run in runs] if len(runs) > 1 else ["filter"]
+    colours = [f"C{k}" for k in range(len(runs))] if len(runs) > 1 else [COLOURS["filter"]]
+    figure, shown = Views.of(first.system, paths[0]).axes(f"{first.name}: path in {world.name}", ax)
     for axes, (right, up) in shown:
-        for name, at, label_, style in (*curves, ("filter", path.positions, "filter", "-")):
-            axes.plot(at[:, right], at[:, up], style, color=COLOURS[name], lw=1.2, label=label_)
-        at = path.positions
-        axes.plot(at[0, right], at[0, up], "o", color=COLOURS["filter"], ms=5, label="first frame")
-        if lost.any():
-            axes.plot(at[lost, right], at[lost, up], ".", color=COLOURS["map"], ms=4, label="lost")
+        for name, label_, at in other_paths(first, world) if len(runs) == 1 else truth_path(first, world):
+            axes.plot(
+                at[:, right], at[:, up], "--" if name == "truth" else "-", color=COLOURS[name], lw=1.2, label=label_
+            )
+        for run, path, name, colour in zip(runs, paths, names, colours, strict=True):
+            at, lost = path.positions, lost_frames(run)
+            axes.plot(at[:, right], at[:, up], "-", color=colour, lw=1.2, label=name)
+            axes.plot(at[0, right], at[0, up], "o", color=colour, ms=5, label="first frame" if run is first else None)
+            if lost.any():
+                axes.plot(at[lost, right], at[lost, up], ".", color=COLOURS["map"], ms=4, label="lost")
     shown[0][0].legend(loc="best", fontsize="small")
     return figure
 
 
-def map_figure(found: RunFolder) -> Any:
-    """Path and map: points with 3σ ellipses, rays, known points."""
+def truth_path(found: RunFolder, world: "World") -> list[tuple[str, str, np.ndarray]]:
+    """The true positions (T, 3) with a name in `COLOURS` and a label; nothing where there is no truth."""
+    if world.truth is None or not (found.folder / TRUTH).is_file():
+        return []
+    return [("truth", "truth", world.truth.positions)]
+
+
+def other_paths(found: RunFolder, world: "World") -> list[tuple[str, str, np.ndarray]]:
+    """What the path of a run is drawn beside: truth, odometry and batch optimum, as `truth_path` has them."""
+    others = truth_path(found, world)
+    for name, label_ in (("odometry", "odometry alone"), ("batch", "batch optimum")):
+        if (found.folder / f"{name}.tum").is_file():
+            others.append((name, label_, world.brought(read_tum(found.folder / f"{name}.tum")).positions))
+    return others
+
+
+def plot_map(found: RunFolder, ax: Any = None) -> Any:
+    """Path and map: points with 3σ ellipses, rays, known points; of a laser scanner the occupancy grid.
+
+    Returns the figure, and takes axes, as `plot_trajectory`.
+    """
     world = World.of(found)
     path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
     if (found.folder / GRID).is_file():
-        return _grid_figure(found, world, path, motion)
+        return _grid_figure(found, world, path, motion, ax)
     title, measured = f"{found.name}: {SIGMAS:g}σ map in {world.name}", found.measurements
     known = measured.known if isinstance(measured, FeatureLog) else None
     others = {} if known is None else {"known points": ("known", motion.transform(known.positions))}
-    return draw_map(title, Views.of(found.system, path), path.positions, moved_map(found.map, motion), others)
+    return draw_map(title, Views.of(found.system, path), path.positions, moved_map(found.map, motion), others, ax)
+
+
+def near_box(mean: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which of the points (M, 3) are near, and lowest and highest corner of a box that holds these and the path (T, 3)."""
+    far = np.linalg.norm(mean - np.median(np.concatenate([mean, at]), axis=0), axis=1)
+    near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
+    held = np.concatenate([mean[near], at])
+    return near, held.min(axis=0), held.max(axis=0)
 
 
 def draw_map(
-    title: str, views: "Views", at: np.ndarray, landmarks: MapEstimate, others: Mapping[str, tuple[str, np.ndarray]]
+    title: str,
+    views: "Views",
+    at: np.ndarray,
+    landmarks: MapEstimate,
+    others: Mapping[str, tuple[str, np.ndarray]],
+    ax: Any = None,
 ) -> Any:
     """A path (T, 3) and a map of its world: points with 3σ ellipses, rays; others' points (K, 3), with a name in `COLOURS`."""
-    figure, shown = views.axes(title)
+    figure, shown = views.axes(title, ax)
     mean, cov = landmarks.points().in_space()
-    far = np.linalg.norm(mean - np.median(np.concatenate([mean, at]), axis=0), axis=1)
-    near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
-    # Limits that hold these with a margin; what is far away (rays) runs out of the picture.
-    low, high = (extreme(np.concatenate([mean[near], at]), axis=0) for extreme in (np.min, np.max))
+    # Limits that hold what is near with a margin; what is far away (rays) runs out of the picture.
+    near, low, high = near_box(mean, at)
     middle, half = 0.5 * (low + high), 0.55 * max(float((high - low).max()), 1e-3)
     for axes, plane in shown:
         right, up = plane
@@ -121,11 +157,12 @@ def draw_map(
     return figure
 
 
-def _grid_figure(found: RunFolder, world: "World", path: Trajectory, motion: Similarity) -> Any:
+def _grid_figure(found: RunFolder, world: "World", path: Trajectory, motion: Similarity, ax: Any) -> Any:
     """Path and occupancy grid: black where something is, white where beams have passed, grey where none has."""
     from matplotlib.transforms import Affine2D
 
-    grid, figure, axes = found.grid, *new_axes(f"{found.name}: map in {world.name}")
+    grid, (figure, shown) = found.grid, Views((0, 1), None).axes(f"{found.name}: map in {world.name}", ax)
+    axes = shown[0][0]
     # An image, moved as the path is: a mesh of as many cells takes minutes and gigabytes in a large place.
     extent = grid.cell_m * np.array(grid.log_odds.shape[::-1])
     corners = grid.corner + extent * [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
@@ -168,7 +205,10 @@ def particles_figure(found: RunFolder) -> Any:
 
 
 def error_figure(found: RunFolder) -> Any | None:
-    """Error of the position along the truth's axes, beside what the filter believes (3σ); None without truth."""
+    """Error of the position along the truth's axes, beside what the filter believes (3σ).
+
+    None without truth.
+    """
     if not (found.folder / TRUTH).is_file():
         return None
     truth, path = found.truth, found.path
@@ -201,6 +241,26 @@ def error_figure(found: RunFolder) -> Any | None:
         shade(axes, lost)
     panels[0].legend(loc="best", fontsize="small")
     panels[-1].set_xlabel("frame")
+    return figure
+
+
+def plot_error(*runs: RunFolder, ax: Any = None) -> Any:
+    """Distance of each position from the truth, frame by frame, of one or several runs; into the axes `ax`, if given.
+
+    Raises InputError: the first has no truth.
+    """
+    if not (runs[0].folder / TRUTH).is_file():
+        raise InputError(f"{runs[0].folder} has no ground truth to draw errors from")
+    world = World.of(*runs)
+    assert world.truth is not None
+    figure, axes = new_axes(f"{runs[0].name}: error in {world.name}", "error [m]", "frame", False, 4.0, ax)
+    for run in runs:
+        moved = world.brought(run.trajectory)
+        at, true = associate(moved, world.truth, 0)
+        error = np.linalg.norm(at.positions - true.positions, axis=1)
+        axes.plot(np.searchsorted(moved.stamps_ns, at.stamps_ns), error, lw=1.0, label=run.folder.name)
+    axes.set_ylim(bottom=0.0)
+    axes.legend(loc="best", fontsize="small")
     return figure
 
 
@@ -257,8 +317,8 @@ def timings_figure(found: RunFolder) -> Any:
 
 
 FIGURES: Mapping[str, Callable[[RunFolder], Any | None]] = {
-    "path.png": path_figure,
-    "map.png": map_figure,
+    "path.png": plot_trajectory,
+    "map.png": plot_map,
     "particles.png": particles_figure,
     "error.png": error_figure,
     "tracking.png": tracking_figure,
@@ -278,13 +338,19 @@ class World:
     truth: Trajectory | None = None
 
     @classmethod
-    def of(cls, found: RunFolder) -> "World":
+    def of(cls, found: RunFolder, *others: RunFolder) -> "World":
+        """The world of a run, into which further runs are brought as freely as one of them needs."""
         if not (found.folder / TRUTH).is_file():
-            return cls()
+            if not others:
+                return cls()
+            free: Alignment = "similarity" if found.system == "mono" else "rigid"
+            return cls(f"the world of {found.folder.name}, {free} alignment", free, found.trajectory)
         truth = found.truth
-        how = "" if truth.alignment == "none" else f", {truth.alignment} alignment"
+        alignments = [truth.alignment, *(run.truth.alignment for run in others if (run.folder / TRUTH).is_file())]
+        free = max(alignments, key=("none", "rigid", "similarity").index)
+        how = "" if free == "none" else f", {free} alignment"
         reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
-        return cls(f"the truth's world{how}", truth.alignment, reference)
+        return cls(f"the truth's world{how}", free, reference)
 
     def motion(self, estimate: Trajectory) -> Similarity:
         """What brings an estimate here; nothing moves one that has too few frames with a true pose."""
@@ -355,11 +421,14 @@ class Views:
         top = (second, first) if down else (first, second)
         return cls(top, (top[0], vertical), down)
 
-    def axes(self, title: str) -> tuple[Any, list[tuple[Any, list[int]]]]:
-        """A figure, and its pairs of axes with the world's axes that they show."""
+    def axes(self, title: str, ax: Any = None) -> tuple[Any, list[tuple[Any, list[int]]]]:
+        """A figure, and its pairs of axes with the world's axes that they show; of axes that are given the view from above."""
         from matplotlib.figure import Figure
 
         planes = [plane for plane in (self.top, self.side) if plane is not None]
+        if ax is not None:
+            label(ax, title, f"{'xyz'[self.top[0]]} [m]", f"{'xyz'[self.top[1]]} [m]", equal=True)
+            return ax.figure, [(ax, list(self.top))]
         figure = Figure(figsize=(6.5 * len(planes), 6.0), layout="constrained")
         figure.suptitle(title)
         panels = figure.subplots(1, len(planes), squeeze=False)[0]
@@ -381,7 +450,7 @@ def shade(axes: Any, lost: np.ndarray) -> None:
 
 
 def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
-    """Saves figures by file name, each whole or not at all; returns the names."""
+    """Saves figures by file name, whose ending is the format, each whole or not at all; returns the names."""
     for name, figure in figures.items():
         # A name with dollars in it is no formula; the numbers at logarithmic axes are.
         for axes in figure.axes:
@@ -389,20 +458,19 @@ def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
             for text in (axes.title, *(() if legend is None else legend.get_texts())):
                 text.set_parse_math(False)
         with whole(out / name) as temporary:
-            figure.savefig(temporary, format="png", dpi=110, bbox_inches="tight")
+            figure.savefig(temporary, format=Path(name).suffix[1:], dpi=110, bbox_inches="tight")
     return list(figures)
 
 
 def new_axes(
-    title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, height: float = 6.0
+    title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, height: float = 6.0, ax: Any = None
 ) -> tuple[Any, Any]:
-    """A figure of one pair of axes, by default of equal scale."""
+    """A figure of one pair of axes, by default of equal scale; that of `ax`, if it is given."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, height), layout="constrained")
-    axes = figure.subplots()
+    axes = Figure(figsize=(7.0, height), layout="constrained").subplots() if ax is None else ax
     label(axes, title, xlabel, ylabel, equal)
-    return figure, axes
+    return axes.figure, axes
 
 
 def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:

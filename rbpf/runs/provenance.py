@@ -163,14 +163,30 @@ def read_origin(config: Path) -> list[str]:
         raise InputError(
             f"{entries['recording']} has changed since the run of {config}; to use its settings alone give --config"
         )
-    # What else a run was started with: an entry has its option's name, and perhaps a unit behind it.
-    words = [str(entries["system"]), str(entries["recording"]), "--config", str(config)]
+    return [str(entries["system"]), str(entries["recording"]), "--config", str(config), *_options(entries)]
+
+
+def _options(entries: Mapping[str, Any]) -> list[str]:
+    """What else a run was started with: an entry of config.yaml has its option's name, and perhaps a unit behind it."""
+    words = list[str]()
     for name in HEADER:
         if name in entries and name not in (*_HEAD, *_FLAGS, *_MADE):
             option = "map" if name == "known_map" else re.sub(r"_(m|s|px)$", "", name).replace("_", "-")
             words += [f"--{option}", str(entries[name])]
     words += [f"--{name}" for name in _FLAGS if entries.get(name)]
     return words + [f"--no-{name}" for name in _MADE if entries.get(name) is False]
+
+
+def command_of(entries: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
+    """The command of such a run, by its config.yaml: every setting that is not the default is named."""
+    words = ["rbpf", "run", str(entries["system"]), str(entries.get("recording", "RECORDING")), *_options(entries)]
+    own = decisive_settings({name: value for name, value in entries.items() if name in defaults})
+    usual = decisive_settings(defaults)
+    for name, value in own.items():
+        if value != usual.get(name):
+            value = value.strip('"')
+            words += [f"--{name}", value] if name in ("particles", "seed") else ["--set", f"{name}={value}"]
+    return words
 
 
 def _files(path: Path, without: Path | None) -> list[Path]:

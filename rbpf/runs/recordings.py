@@ -267,6 +267,10 @@ def first_image(sequence: readers.ImageSequence | LiveCamera) -> np.ndarray:
     return first.image
 
 
+#: Of each system's settings, by its name.
+CONFIGS: Mapping[str, type[Any]] = {
+    "range-bearing": RangeBearingConfig, "laser": LaserConfig, "mono": MonoConfig, "stereo": StereoConfig,
+}  # fmt: skip
 #: What the command line filters: it can be opened as often as one likes, and says what it is made of, for config.yaml.
 Recording = RobotRecording | MonoRecording | StereoRecording | LaserRecording
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, final
 
 from rbpf.errors import InputError
-from rbpf.runs.plots import map_figure
+from rbpf.runs.plots import plot_map
 from rbpf.runs.reading import RunFolder
 
 #: Entries of summary.json that stand for a run in a notebook.
@@ -35,7 +35,7 @@ class Results(RunFolder):
 
     def plot(self) -> Any:
         """A matplotlib figure of the path and the map with 3σ ellipses."""
-        return map_figure(self)
+        return plot_map(self)
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{name} {value}" for name, value in self._figures())

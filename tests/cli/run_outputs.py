@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 TIMED_FILES = {"timings.csv", "timings.png", "report.html", "checkpoint.npz"}
-TIMED_ENTRIES = {"ms_per_frame", "ms_per_update", "peak_memory_mb"}
+TIMED_ENTRIES = {"ms_per_frame", "ms_per_update", "peak_memory_mb", "finished"}
 
 
 def untimed_summary(folder: Path) -> dict[str, Any]:

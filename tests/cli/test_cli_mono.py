@@ -1,6 +1,7 @@
 """`rbpf run mono` from end to end, on a few small rendered frames."""
 
 import importlib
+import re
 import sys
 
 import cv2
@@ -198,3 +199,33 @@ def test_what_a_camera_cannot_do(options, words, desk, tmp_path, monkeypatch, ca
     monkeypatch.chdir(desk)
     assert main(["run", "mono", "0", *options, "--out", str(tmp_path / "run")]) == 2
     assert words in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_run_is_shown_while_it_is_made(desk, tmp_path, monkeypatch):
+    """The viewer's window is replaced by a file."""
+    stream, shown = pytest.importorskip("rerun").RecordingStream, []
+    log = stream.log
+    monkeypatch.setattr(stream, "spawn", lambda stream: stream.save(str(tmp_path / "shown.rrd")))
+    monkeypatch.setattr(stream, "log", lambda *given, **how: (shown.append(given[1]), log(*given, **how)))
+    assert run(desk, tmp_path / "run", "--view") == 0
+    assert shown.count("world/camera/image") == shown.count("plots/filter/ess") == FRAMES
+    wanted = {"world/camera/image/found/ellipses", "world/path", "world/truth", "world/uncertainty"}
+    assert wanted | {"world/map/points", "plots/filter/nis_per_dof", "plots/tracking/found"} <= set(shown)
+    assert shown.count("world/map/points") > 1 and shown.count("world/truth") == 1
+
+
+def test_a_viewer_that_cannot_be_opened_is_said(desk, tmp_path, monkeypatch, capsys):
+    def refused(_stream):
+        raise RuntimeError("no screen")
+
+    monkeypatch.setattr(pytest.importorskip("rerun").RecordingStream, "spawn", refused)
+    assert run(desk, tmp_path / "run", "--view") == 2
+    assert "cannot be opened (no screen): leave out --view" in sentence(capsys)
+
+
+def test_the_terminal_tells_of_tracking(desk, tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr("rich.progress.Progress.update", lambda _bars, _task, **given: said.append(given["words"]))
+    assert run(desk, tmp_path / "run") == 0
+    last = [words for words in said if words][-1]
+    assert re.fullmatch(r"tracked, found \d+ of \d+, [\d.e+]+ frames per second", last)

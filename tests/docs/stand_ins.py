@@ -70,6 +70,10 @@ NAMES_OF_PAGE = {
 
 BEFORE = {
     "docs/how_to/after_the_run.md": [["run", "range-bearing", "log", "--out", "run", "--no-batch"]],
+    "docs/how_to/report.md": [
+        ["run", "range-bearing", "log", "--out", "RUN", "--no-batch"],
+        ["run", "range-bearing", "log", "--out", "OTHER", "--no-batch", "--seed", "1"],
+    ],
     "docs/how_to/compare.md": [
         ["run", "mono", "desk", "--known-points", "desk/known_points.csv", "--out", "out/mono", "--no-video"]
     ],

@@ -10,7 +10,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.runs.plots import map_figure
+from rbpf.runs.plots import plot_map
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Trajectory, read_tum
 from rbpf.sensors.laser import Scan, Scanner
@@ -137,7 +137,7 @@ def test_a_run_leaves_a_map_that_map_server_reads(tmp_path: Path):
     assert summary["system"] == "laser" and summary["fit_mean"] > 0.5 and (out / "map.png").stat().st_size > 10_000
     assert "report.html" in {path.name for path in out.iterdir()}
     # One image with the grid's corners, not a polygon for each of its cells.
-    axes = map_figure(RunFolder.open(out)).axes[0]
+    axes = plot_map(RunFolder.open(out)).axes[0]
     (image,) = axes.images
     ends = (image.get_transform() - axes.transData).transform([[0.0, 0.0], [1.0, 1.0]])
     assert not axes.collections

@@ -24,7 +24,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name, lay_out
 from rbpf.validation.exports import MAP, PATH, export_colmap, export_ply, write_ply
 from rbpf.validation.gtsam.observations import observation_table, reprojection
-from rbpf.validation.report.video import recording
+from rbpf.validation.report.live import recording
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 

@@ -11,15 +11,8 @@ from rbpf.runs.run import Run
 from rbpf.sensors.readers.images.video import opened
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
-from rbpf.validation.report.video import (
-    FEATURES,
-    annotated_frames,
-    drawn_size,
-    frame_rate,
-    is_complete,
-    recording,
-    write_video,
-)
+from rbpf.validation.report.live import recording
+from rbpf.validation.report.video import FEATURES, annotated_frames, drawn_size, frame_rate, is_complete, write_video
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 

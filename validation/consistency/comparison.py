@@ -179,7 +179,9 @@ def grade_path(
         grade = next((name for name, least, most in GRADES if fraction <= least and gone <= most), "poor")
         said.append(f"That is {100 * fraction:.2g} % of its spread about its centre: {grade}.")
     if lost is not None:
-        said.append(f"{lost or 'None'} of {frames} frames {'was' if lost == 1 else 'were'} lost.")
+        # What was lost comes first: the error of a path that was lost says little.
+        gone_frames = f"{lost or 'None'} of {frames} frames {'was' if lost == 1 else 'were'} lost."
+        said.insert(0 if lost else len(said), gone_frames)
     return PathGrade(grade, " ".join(said))
 
 

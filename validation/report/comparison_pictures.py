@@ -1,7 +1,8 @@
 """Pictures of a run beside the truth, its batch optimum and COLMAP's reconstruction, and the figures that they share."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -9,24 +10,25 @@ from rbpf.core.diagnostics import chi_square_band, chi_square_quantile
 from rbpf.runs import plots
 from rbpf.runs.plots import COLOURS, Views, World, draw_map, moved_map, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap, RunFolder
+from rbpf.runs.truth import TRUTH
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.colmap.compare import ColmapComparison
-from rbpf.validation.consistency.against_batch import AgainstBatch
-from rbpf.validation.consistency.against_groundtruth import TruthErrors
+from rbpf.validation.consistency.against_groundtruth import TruthErrors, truth_errors
 from rbpf.validation.consistency.statistic import inverse_roots
+
+if TYPE_CHECKING:
+    from rbpf.validation.colmap.compare import ColmapComparison
+    from rbpf.validation.consistency.against_batch import AgainstBatch
 
 _LOWEST = 0.01  #: NEES below this fraction of the band are drawn there.
 
 
 def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
     """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
-    rows, name, white = record.truth.rows, record.name, errors.whitened
-    world = World.of(record)
-    known, dim = white.ranks > 0, white.errors.shape[1]
+    name, world = record.name, World.of(record)
     figures = {
-        "groundtruth_path.png": plots.path_figure(record),
+        "groundtruth_path.png": plots.plot_trajectory(record),
         "groundtruth_error.png": plots.error_figure(record),
-        "groundtruth_nees.png": nees_figure(f"{name}: NEES", rows[known], white.nees[known], dim),
+        "groundtruth_nees.png": plot_consistency(record),
     }
     if errors.landmarks is not None:
         found = errors.landmarks
@@ -39,7 +41,15 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
     return save_figures(figures, record.folder)
 
 
-def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = None) -> list[str]:
+def draw_beside(runs: Sequence[RunFolder], out: Path, formats: Sequence[str]) -> list[str]:
+    """Draws runs of one recording together into a folder: paths, errors if there is truth, consistency; returns the names."""
+    figures = {"path": plots.plot_trajectory(*runs), "consistency": plot_consistency(*runs)}
+    if (runs[0].folder / TRUTH).is_file():
+        figures["error"] = plots.plot_error(*runs)
+    return save_figures({f"{name}.{ending}": figure for ending in formats for name, figure in figures.items()}, out)
+
+
+def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = None) -> list[str]:
     """Paths, expected NEES, landmarks and map beside the batch posterior, drawn in a world, by default the filter's own.
 
     Writes PNG files into the folder and returns their names.
@@ -61,7 +71,8 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
         roots, ranks = inverse_roots(cov)
         nees = np.einsum("tab,tbc,tca->t", roots, cov_batch + delta[:, :, None] * delta[:, None], roots)
         title, known = f"{name}: expected NEES under the batch posterior", ranks == cov.shape[-1]
-        figures["gtsam_nees.png"] = nees_figure(title, found.optimum.steps[known], nees[known], cov.shape[-1])
+        curve = {"filter": (found.optimum.steps[known], nees[known])}
+        figures["gtsam_nees.png"] = consistency_figure(title, "NEES of the pose", curve, cov.shape[-1], banded=True)
     if len(found.landmarks):
         title = f"{name}: landmarks against the batch optimum"
         figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), found.landmarks.dims)
@@ -75,7 +86,7 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
     return save_figures(figures, out)
 
 
-def plot_against_colmap(found: ColmapComparison, reference: PathAndMap, out: Path) -> list[str]:
+def plot_against_colmap(found: "ColmapComparison", reference: PathAndMap, out: Path) -> list[str]:
     """Both maps and paths in the reference's world, and the landmarks' nearest distances; returns the file names."""
     views = Views.of_camera(reference.trajectory.world_from_body)
     figure, shown = views.axes(f"{found.reconstruction.name}: COLMAP brought onto the run")
@@ -104,15 +115,44 @@ def plot_against_colmap(found: ColmapComparison, reference: PathAndMap, out: Pat
     return save_figures(figures, out)
 
 
-def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any:
-    """Normalised squared errors (R,) of one run over the steps, with the band of an honest filter."""
-    (figure, axes), band = new_axes(title, "NEES", "step", equal=False, height=4.0), chi_square_band(dim)
-    axes.axhspan(band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
-    axes.axhline(band.expected, color="tab:green", lw=0.8, label=f"its mean, {dim}")
-    shown = np.maximum(nees, _LOWEST * band.low)
-    axes.plot(rows, shown, color=COLOURS["filter"], lw=1.0, label="NEES of the pose")
+def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
+    """Whether the uncertainty of one or several runs can be believed, frame by frame: NEES of the pose, see `truth_errors`.
+
+    Without ground truth it is NIS of the measurements per degree of freedom. Returns the figure; draws into the axes `ax`, if
+    they are given.
+    """
+    known = [(run.folder / TRUTH).is_file() for run in runs]
+    curves, dim = {}, 1
+    for run in runs:
+        name = run.folder.name if len(runs) > 1 else "filter"
+        if all(known):
+            white = truth_errors(run).whitened
+            curves[name] = run.truth.rows[white.ranks > 0], white.nees[white.ranks > 0]
+            dim = white.errors.shape[1]
+        else:
+            table = run.table("diagnostics.csv")
+            rows = np.flatnonzero((table["nis_dof"] > 0) & np.isfinite(table["nis"]))
+            curves[name] = rows, table["nis"][rows] / table["nis_dof"][rows]
+    words = "NEES of the pose" if all(known) else "NIS per degree of freedom"
+    return consistency_figure(f"{runs[0].name}: {words}", words, curves, dim, banded=all(known), ax=ax)
+
+
+def consistency_figure(
+    title: str, words: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], dim: int, banded: bool, ax: Any = None
+) -> Any:
+    """Normalised squared errors (R,) over the steps (R,) by name, their mean, and where an honest filter's would lie."""
+    (figure, axes), band = new_axes(title, words, "step", equal=False, height=4.0, ax=ax), chi_square_band(dim)
+    low = band.low if banded else 0.1
+    if banded:
+        axes.axhspan(low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
+    axes.axhline(dim, color="tab:green", lw=0.8, label=f"its mean, {dim}")
+    least = 0.5 * low
+    for name, (rows, values) in curves.items():
+        shown = np.maximum(values, _LOWEST * low)
+        least = min(float(shown.min(initial=least)), least)
+        axes.plot(rows, shown, lw=1.0, label=name)
     axes.set_yscale("log")
-    axes.set_ylim(bottom=0.8 * min(float(shown.min(initial=band.low)), 0.5 * band.low))
+    axes.set_ylim(bottom=0.8 * least)
     axes.legend(fontsize="small")
     return figure
 

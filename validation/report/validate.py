@@ -2,19 +2,15 @@
 
 A new comparison is one function from a run to a `Comparison`, entered into `COMPARISONS`; one that needs a file besides
 takes its path, too, and is entered into `WITH_A_FILE`.
-
-The page is made from the files in the run's folder: verdict, comparisons with their pictures, the run's own figures; a video
-stays a file beside it.
 """
 
-import base64
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rbpf.errors import InputError
-from rbpf.runs.files import prepare_folder, write_text
+from rbpf.runs.files import prepare_folder
 from rbpf.runs.folder import write_summary
 from rbpf.runs.plots import World
 from rbpf.runs.reading import RunFolder
@@ -23,14 +19,11 @@ from rbpf.runs.truth import EXACT, Precision
 from rbpf.validation.consistency import comparison as verdicts
 from rbpf.validation.consistency.comparison import Comparison, Verdict
 from rbpf.validation.metrics.accuracy import ate, rpe
+from rbpf.validation.report.page import write_report
 
 if TYPE_CHECKING:
     from rbpf.validation.gtsam.batch_problem import Optimum
 
-PAGE = "report.html"
-VIDEO = "annotated.mp4"
-#: Pictures of a comparison that show what one of the run's own does.
-_SAME = {"groundtruth_path.png": "path.png", "groundtruth_error.png": "error.png"}
 #: Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do.
 KEY_FRAMES = 60
 Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folder.
@@ -140,56 +133,3 @@ def validate(
         prepare_folder(out)
         verdicts.write_comparison(out, comparison)
     return write_report(folder)
-
-
-def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
-    """Builds `report.html` of a run from the files in its folder; returns the verdict that stands on top.
-
-    `problems` are what else has to be said, one sentence each.
-    """
-    from jinja2 import Environment, PackageLoader, select_autoescape
-
-    record, problems = RunFolder.open(folder), list(problems or ())
-    # Comparisons in the folder, the truth's first, and the run's own statistics.
-    comparisons: list[Comparison] = []
-    try:
-        comparisons = sorted(verdicts.read_comparisons(folder), key=lambda c: (c.against != "groundtruth", c.against))
-    except InputError as error:
-        problems.append(f"{error}.")
-    try:
-        comparisons.append(verdicts.compare_with_itself(record))
-    except InputError as error:
-        problems.append(f"{error}.")
-    verdict = verdicts.verdict_of(record, comparisons)
-    drawn = {name for comparison in comparisons for name in comparison.pictures}
-    drawn |= {own for name, own in _SAME.items() if name in drawn}
-    own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
-    try:
-        world = World.of(record)
-    except InputError:
-        world = World()  # the truth is damaged, which is said among the problems
-    titles = {"groundtruth": "Against the ground truth", "itself": "Innovations"}
-    sections = [
-        {
-            "title": titles.get(comparison.against, f"Against {comparison.against}"),
-            "accuracy": comparison.accuracy,
-            "statistics": comparison.statistics,
-            "figures": {} if comparison.against == "itself" else comparison.figures,
-            "images": _images(folder, comparison.pictures),
-        }
-        for comparison in comparisons
-    ]
-    sections.append({"title": "The run", "figures": record.summary, "images": _images(folder, own)})
-    video = VIDEO if (folder / VIDEO).is_file() else None
-    loader = PackageLoader("rbpf.validation.report", "templates")
-    template = Environment(loader=loader, autoescape=select_autoescape()).get_template(PAGE)
-    told = {"verdict": verdict, "world": world, "problems": problems, "sections": sections, "video": video}
-    write_text(folder / PAGE, template.render(title=record.name, **told))
-    return verdict
-
-
-def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
-    # A link may show what its maker must not see of the disk of whoever opens the run.
-    inside = folder.resolve()
-    there = [name for name in names if (folder / name).is_file() and (folder / name).resolve().is_relative_to(inside)]
-    return [(Path(name).stem, base64.b64encode((folder / name).read_bytes()).decode()) for name in there]

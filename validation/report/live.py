@@ -1,0 +1,273 @@
+"""A run in the Rerun viewer (https://rerun.io), while it is made or from a file that is written without a screen.
+
+world/camera                   the camera's pose; of a robot world/body
+world/camera/image             the frames, with what was looked for and seen in them
+world/uncertainty              3σ ellipsoid of the position
+world/seen                     points that were seen in the frame
+world/path, world/odometry     the path, and that of the odometry alone; in the end the truth beside it
+world/map                      the map: points with 3σ ellipsoids, rays as lines, walls; known points
+plots/…                        figures over the frames
+
+A further system is one function that logs what a frame showed, entered into `DRAWN`; others have path, map and figures.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.runs.files import prepare_folder, whole
+from rbpf.runs.plots import SIGMAS, outline
+from rbpf.runs.run import Run
+from rbpf.runs.trajectory import fit, in_space
+from rbpf.systems.laser.slam import LaserSlam
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.stereo.landmarks import FeatureKind
+from rbpf.systems.system import Tracked
+from rbpf.validation.report.video import FEATURES, FOUND, MISSED, RAY, STARTED
+
+JPEG_QUALITY = 75  #: Of the JPEG images in the recording, in per cent.
+AXIS_M = 0.1  #: Length of the camera's drawn image plane from its centre.
+NEAREST = 0.02  #: Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m.
+PATH, ODOMETRY, TRUE = (31, 119, 180), (127, 127, 127), (255, 255, 255)
+#: Path and map are logged again once the run is longer by this fraction and so many frames.
+GROWTH, LEAST_FRAMES = 0.05, 10
+
+
+def require_rerun() -> Any:
+    """The package; an InputError where it is not installed."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise InputError(
+            "--view and --rerun need the package rerun-sdk, which is not installed: pip install 'rbpf[viewing]', or leave "
+            "them out"
+        ) from error
+    return rerun
+
+
+class RunView:
+    """Shows a run in a stream of Rerun's: a listener of `rbpf.runs.run.drive`, called after each frame."""
+
+    def __init__(self, rr: Any, stream: Any) -> None:
+        self.rr, self.stream = rr, stream
+        self._next = 0  # frame at which path and map are logged again
+        self._start_ns = 0
+
+    def __call__(self, run: Run, tracked: Tracked) -> None:
+        self.show(run, len(run.log) - 1, tracked, getattr(run.frame, "image", None))
+        if len(run.log) > self._next:
+            self._next = len(run.log) + max(LEAST_FRAMES, int(GROWTH * len(run.log)))
+            self.map(run)
+
+    def show(self, run: Run, t: int, tracked: Tracked, image: np.ndarray | None) -> None:
+        """Frame t of a run, what the system said of it, and its image, if there is one."""
+        rr, stream, system = self.rr, self.stream, run.system
+        if not self._next:
+            self._begin(run)
+            self._start_ns = tracked.stamp_ns
+        pose, cov, values = _pose_in_space(tracked), tracked.cov, tracked.values
+        log_time(stream, t, tracked.stamp_ns - self._start_ns)
+        body = "camera" if _lens(system) is not None else "body"
+        log_pose(rr, stream, body, pose)
+        if body == "body":
+            stream.log("world/body", rr.TransformAxes3D(1.0))
+        if image is not None:
+            stream.log("world/camera/image", rr.Image(image).compress(jpeg_quality=JPEG_QUALITY))
+        local = cov[-3:, -3:] if cov.shape[0] == 6 else np.pad(cov[1:, 1:], ((0, 1), (0, 1)))
+        turn = SE3.rotation(pose)
+        at = MapEstimate(np.zeros(1, dtype=int), pose[None, 4:], (turn @ local @ turn.T)[None])
+        stream.log("world/uncertainty", ellipsoids(rr, at))
+        drawn, plotted = DRAWN.get(system.name, (None, ()))
+        if drawn is not None:
+            drawn(rr, stream, run, tracked.observed, pose)
+        figures = {"filter/ess": values["ess"]} | {f"tracking/{name}": values[name] for name in plotted}
+        if values["nis_dof"] > 0:
+            figures["filter/nis_per_dof"] = values["nis"] / values["nis_dof"]
+        for name, value in figures.items():
+            stream.log(f"plots/{name}", rr.Scalars(float(value)))
+
+    def map(self, run: Run, static: bool = False) -> None:
+        """Path and map as they are now; `static` for all frames."""
+        rr, stream, log = self.rr, self.stream, run.log
+        stamps = log.stamps_ns
+        paths = {"path": (log.poses, PATH)} | ({"odometry": (log["odometry"], ODOMETRY)} if "odometry" in log else {})
+        for name, (poses, colour) in paths.items():
+            positions = in_space(stamps, poses).positions
+            stream.log(f"world/{name}", rr.LineStrips3D([positions], colors=[colour]), static=static)
+        if isinstance(run.system, LaserSlam):
+            picture = run.system.picture()
+            walls = picture.corner + picture.cell_m * (np.argwhere(picture.log_odds > 0.0)[:, ::-1] + 0.5)
+            places = rr.Points3D(np.pad(walls, ((0, 0), (0, 1))), radii=0.5 * picture.cell_m)
+            stream.log("world/map/walls", places, static=static)
+            return
+        found = run.system.map()
+        stream.log("world/map/points", ellipsoids(rr, found.points()), static=static)
+        if found.ray_ends is not None:
+            rays = rr.LineStrips3D(found.ray_ends[found.is_ray()], colors=[RAY])
+            stream.log("world/map/rays", rays, static=static)
+
+    def finish(self, run: Run) -> None:
+        """The whole path and the last map; and the truth, in the run's own world."""
+        self.map(run, static=True)
+        if run.truth is not None:
+            stamps = run.log.stamps_ns[run.truth.rows]
+            true, ours = (in_space(stamps, poses) for poses in (run.truth.poses, run.log.poses[run.truth.rows]))
+            moved = fit(run.truth.alignment, true.positions, ours.positions)
+            line = self.rr.LineStrips3D([moved.transform(true.positions)], colors=[TRUE])
+            self.stream.log("world/truth", line, static=True)
+
+    def _begin(self, run: Run) -> None:
+        rr, stream = self.rr, self.stream
+        stream.send_blueprint(blueprint(run))
+        camera = _lens(run.system)
+        if camera is not None:
+            # Rerun's pixels start at a corner, not at a centre.
+            lens = rr.Pinhole(
+                focal_length=[camera.fx, camera.fy],
+                principal_point=[camera.cx + 0.5, camera.cy + 0.5],
+                resolution=[camera.width, camera.height],
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=AXIS_M,
+            )
+            stream.log("world/camera", lens, static=True)
+        known = getattr(run.system, "known_points", None)
+        if known is not None:
+            stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
+        self._next = 1
+
+
+def blueprint(run: Run) -> Any:
+    """What the viewer shows where: the world, beside it the image if there is one, and the figures."""
+    import rerun.blueprint as rrb
+
+    beside = [rrb.TimeSeriesView(origin="plots/filter", name="filter")]
+    if run.system.name in DRAWN:
+        beside.insert(0, rrb.Spatial2DView(origin="world/camera/image", name="image"))
+        beside.append(rrb.TimeSeriesView(origin="plots/tracking", name="tracking"))
+    world = rrb.Spatial3DView(origin="world", name="path and map")
+    return rrb.Blueprint(rrb.Horizontal(world, rrb.Vertical(*beside), column_shares=[3, 2]), collapse_panels=True)
+
+
+def _pose_in_space(tracked: Tracked) -> np.ndarray:
+    """(7,) of a pose in the plane or in space."""
+    pose: np.ndarray = in_space(np.zeros(1, dtype=np.int64), tracked.pose[None]).world_from_body[0]
+    return pose
+
+
+def _lens(system: Any) -> Any:
+    """The camera that looks at the images, or None."""
+    return system.rig.camera if hasattr(system, "rig") else getattr(system, "camera", None)
+
+
+@contextmanager
+def viewer(name: str) -> Iterator[RunView]:
+    """Opens the viewer's window, for a run of this name. Raises InputError: it is not installed, or cannot be opened."""
+    rr = require_rerun()
+    with rr.RecordingStream("rbpf", recording_id=_readable(name)) as stream:
+        try:
+            stream.spawn()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"the Rerun viewer cannot be opened ({error}): leave out --view") from error
+        yield RunView(rr, stream)
+        stream.flush()
+
+
+def write_rerun(run: Run, path: Path) -> None:
+    """Writes the recording (.rrd) of a run, whose source is read once more.
+
+    Raises InputError: Rerun is not installed, or the file cannot be written.
+    """
+    with recording(path, run.name) as (rr, stream):
+        view, log = RunView(rr, stream), run.log
+        arrays, states = (log.stamps_ns.tolist(), log.poses, log.covs), log.states
+        columns = {column.name: log[column.name] for column in run.system.columns}
+        for t, frame in zip(range(len(log)), run.source.frames(), strict=False):
+            stamp_ns, pose, cov = (each[t] for each in arrays)
+            values = {name: column[t] for name, column in columns.items()}
+            tracked = Tracked(stamp_ns, pose, cov, states[t], values, log.observed(t))
+            view.show(run, t, tracked, getattr(frame, "image", None))
+        view.finish(run)
+
+
+def _readable(name: str) -> str:
+    """A name without bytes that are no UTF-8, which a file's name may have."""
+    return name.encode(errors="replace").decode()
+
+
+@contextmanager
+def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
+    """The package and a stream into a file (.rrd); the file appears when it is complete. Errors as of `write_rerun`."""
+    rr = require_rerun()
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: Rerun writes to no path that is not UTF-8: choose another name") from error
+    prepare_folder(path.parent)
+    with whole(path) as partial, rr.RecordingStream("rbpf", recording_id=_readable(name)) as stream:
+        stream.save(str(partial))
+        yield rr, stream
+        stream.flush()
+
+
+def log_time(stream: Any, t: int, after_ns: int) -> None:
+    """Number of a frame and time since the first one [ns]; what is logged next belongs to it."""
+    stream.set_time("frame", sequence=t)
+    stream.set_time("time", duration=1e-9 * float(after_ns))
+
+
+def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
+    """Where a camera or a robot is in the world, (7,)."""
+    turned = rr.Quaternion(xyzw=pose[:4])
+    stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
+
+
+def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
+    """A map's 3σ ellipsoids, with the landmarks' names; those of the plane lie at z = 0."""
+    mean, cov = landmarks.in_space()
+    values, vectors = np.linalg.eigh(cov)
+    turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
+    poses = np.concatenate([turned, mean[..., None]], axis=-1)
+    return rr.Ellipsoids3D(
+        centers=mean,
+        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
+        quaternions=SE3.from_matrix(poses)[:, :4],
+        labels=[str(name) for name in landmarks.ids],
+        show_labels=False,
+    )
+
+
+def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
+    """Features that were looked for; Rerun's pixels start at a corner, not at a centre."""
+    found = np.isfinite(seen["px"]).all(axis=1)
+    ellipses = outline(seen["mean"], seen["cov"]) + 0.5
+    for name, chosen, colour in (("found", found, FOUND), ("missed", ~found, MISSED)):
+        stream.log(f"world/camera/image/{name}/ellipses", rr.LineStrips2D(ellipses[chosen], colors=[colour]))
+    stream.log("world/camera/image/found/places", rr.Points2D(seen["px"][found] + 0.5, colors=[FOUND]))
+    stream.log("world/camera/image/new", rr.Points2D(seen["started_px"] + 0.5, colors=[STARTED]))
+    lines = seen["line"][np.isfinite(seen["line"]).all(axis=(1, 2))] + 0.5
+    stream.log("world/camera/image/epipolar_lines", rr.LineStrips2D(lines, colors=[RAY]))
+    near = found & (seen["position"][:, 3] >= NEAREST)
+    places = seen["position"][near, :3] / seen["position"][near, 3:]
+    stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
+
+
+def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
+    """Features of the left image by what they were to the map, and where the pair itself has its landmarks."""
+    for kind, (name, colour) in FEATURES.items():
+        pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour])
+        stream.log(f"world/camera/image/{name}", pixels)
+    rig = run.system.rig
+    places = SE3.transform(pose, rig.triangulate(seen["z"][seen["kind"] == FeatureKind.LANDMARK]))
+    stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
+
+
+#: By the system's name, what logs what a frame showed, and which figures are plotted besides those of every filter.
+DRAWN: Mapping[str, tuple[Callable[..., None], tuple[str, ...]]] = {
+    "mono": (_log_search, ("searched", "found", "lost")),
+    "stereo": (_log_pair, ("features", "agreeing", "observed")),
+}
