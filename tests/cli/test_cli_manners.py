@@ -77,7 +77,7 @@ def test_bad_input_is_exit_code_2_and_a_fault_is_1(tmp_path):
 
     refused = code("report", str(tmp_path / "nothing"))
     assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and "Traceback" not in refused.stderr
-    prelude = "import rbpf.validation.report.validate as r; r.write_report = lambda folder: 1 / 0"
+    prelude = "import rbpf.validation.report.page as r; r.write_report = lambda folder: 1 / 0"
     broken = code("report", "x", prelude=prelude)
     assert broken.returncode == 1 and "ZeroDivisionError" in broken.stderr
 
