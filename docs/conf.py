@@ -16,8 +16,8 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
     "from_code",
+    "mathml",
     "plain_docstrings",
     "short_signatures",
 ]
@@ -36,6 +36,7 @@ napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 python_maximum_signature_line_length = 90
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"rbpf {version}"
 html_static_path = ["_static"]

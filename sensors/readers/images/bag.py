@@ -193,14 +193,20 @@ def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | N
 
     Raises InputError: it is damaged, of an encoding that is not known, or of another size.
     """
-    import cv2
-
     try:
         message = bag.message(raw)
     except InputError:
         raise InputError(f"{where}: a message is damaged.") from None
-    if raw.type == COMPRESSED:
-        return decode(where, np.asarray(message.data, np.uint8), shape)
+    return image_of(message, where, shape)
+
+
+def image_of(message: Any, where: str, shape: tuple[int, int] | None = None) -> Grey:
+    """Image (H, W) of an Image or a CompressedImage; arguments and errors as `read_image`."""
+    import cv2
+
+    data = np.asarray(message.data, np.uint8)
+    if not hasattr(message, "encoding"):
+        return decode(where, data, shape)
     if message.encoding not in _LAYOUTS:
         known = ", ".join(_LAYOUTS)
         raise InputError(f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it.")
@@ -208,10 +214,10 @@ def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | N
     width = message.width * channels * np.dtype(kind).itemsize
     if not (message.height > 0 and 0 < width <= message.step):
         raise InputError(f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes.")
-    if message.height * message.step != len(message.data):
+    if message.height * message.step != len(data):
         expected = f"expected {message.height} rows of {message.step} bytes"
-        raise InputError(f"{where}: {expected}, found {len(message.data)} bytes.")
-    rows = np.ascontiguousarray(message.data.reshape(message.height, message.step)[:, :width])
+        raise InputError(f"{where}: {expected}, found {len(data)} bytes.")
+    rows = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :width])
     pixels = rows.view(np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
     if channels > 1:
         pixels = pixels.reshape(message.height, message.width, channels)
@@ -244,13 +250,16 @@ class CameraInfo:
         raw = next(bag.messages(topic), None)
         if raw is None:
             raise InputError(f"{where}: no message can be read.")
-        message = bag.message(raw)
+        return cls.of(bag.message(raw), where, named.rpartition("/")[2].startswith("image_rect"))
+
+    @classmethod
+    def of(cls, message: Any, where: str, is_rectified: bool) -> "CameraInfo":
+        """The camera of a message, which `where` names in messages, of images that are rectified or not."""
         roi = message.roi
         if max(message.binning_x, message.binning_y) > 1 or roi.x_offset or roi.y_offset:
             problem = "the images are binned or a part of the sensor's, which K does not describe"
             raise InputError(f"{where}: {problem}; give --calibration with the camera of these images.")
         rotation, projection = _field(message, "R").reshape(3, 3), _field(message, "P").reshape(3, 4)
-        is_rectified = named.rpartition("/")[2].startswith("image_rect")
         intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
         fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         if not (np.isfinite(intrinsics).all() and fx > 0.0 and fy > 0.0):
