@@ -37,18 +37,9 @@ class Settings(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """A table for the run and one for each group."""
-        from rbpf.systems.laser.config import LaserConfig
-        from rbpf.systems.mono.config import MonoConfig
-        from rbpf.systems.range_bearing.config import RangeBearingConfig
-        from rbpf.systems.stereo.config import StereoConfig
+        from rbpf.runs.recordings import CONFIGS
 
-        configs = {
-            "laser": LaserConfig,
-            "mono": MonoConfig,
-            "range-bearing": RangeBearingConfig,
-            "stereo": StereoConfig,
-        }
-        config = configs[self.arguments[0]]()
+        config = CONFIGS[self.arguments[0]]()
         return [node for name, part in _groups("", config) for node in _table(name, part)]
 
 

@@ -27,6 +27,14 @@ BAD_INPUT, STOPPED = 2, 130  #: Exit codes; 0 is success, 1 a fault of the progr
 APP = Commands()
 _DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
 
+  try it:    rbpf demo
+  record:    rbpf simulate desk --out desk
+  camera:    rbpf calibrate board.mp4 --board 9x6 --square 0.024; rbpf recalibrate RUN
+  run:       rbpf run mono desk --known-points desk/known_points.csv --out RUN --view
+  look:      rbpf report RUN; rbpf plot RUN OTHER; rbpf export RUN --format tum ply
+  check:     rbpf validate RUN --against gtsam; rbpf compare RUN OTHER; rbpf sweep plan.yaml
+  machine:   rbpf doctor; eval "$(rbpf completion bash)"
+
 Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C."""
 
 
@@ -46,16 +54,16 @@ class Demo(Printed):
         RunMono(sequence=images, known_points=known, out=self.out / "run", overwrite=True, json=self.json)()
 
 
-APP.add_group("run", RUN)
 APP.add_group("simulate", SIMULATE)
 APP.add("calibrate")(cameras.Calibrate)
 APP.add("recalibrate")(cameras.Recalibrate)
-APP.add("validate")(judging.Validate)
+APP.add_group("run", RUN)
 APP.add("report")(judging.Report)
 APP.add("plot")(judging.Plot)
 APP.add("export")(judging.Export)
-APP.add("sweep")(judging.Sweep)
+APP.add("validate")(judging.Validate)
 APP.add("compare")(judging.Compare)
+APP.add("sweep")(judging.Sweep)
 APP.add("doctor")(installed.Doctor)
 APP.add("completion")(installed.Completion)
 

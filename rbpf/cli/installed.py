@@ -45,9 +45,15 @@ class Doctor(Printed):
         lines = {part.name: f"{'works' if part.works else fails[part.needed]}: {part.says}" for part in tried}
         known = {name: number or "missing" for name, number in libraries.items()}
         kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"
-        answer(entries, self.json, *table({**found, **known, **lines, "kernels": kernels}, 26))
+        # The result first, and what to do.
+        names = ", ".join(part.name for part in broken)
+        absent = ", ".join(part.name for part in tried if not part.works)
+        optional = f"; not installed, and only needed for what its name says: {absent}" if absent else ""
+        result = f"{names}: needed, and broken here" if broken else f"all that every run needs works{optional}"
+        todo = "what to do stands in its line" if broken else "to begin: rbpf demo"
+        answer(entries, self.json, result, *table({**found, **known, **lines, "kernels": kernels}, 26), todo)
         if broken:
-            raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
+            raise InputError(f"{result}; see above")
 
 
 #: The last line for zsh is one for a file in its `fpath`; evaluated, it would complete nothing.

@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 RUN = Commands(
     """Filter a recording; `rbpf run SYSTEM --help` says more.
 
+  rbpf run mono walk.mp4 --calibration camera.yaml --out RUN
+  rbpf run stereo PAIRS --out RUN
+  rbpf run range-bearing LOG --out RUN
+  rbpf run laser robot.clf --out RUN
+
 `rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
 It is refused when the recording has changed. Further options are those of the run's system.""",
     compile_kernels,

@@ -13,6 +13,7 @@ A further figure of every run is one function from `RunFolder` to a matplotlib f
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -423,13 +424,11 @@ class Views:
 
     def axes(self, title: str, ax: Any = None) -> tuple[Any, list[tuple[Any, list[int]]]]:
         """A figure, and its pairs of axes with the world's axes that they show; of axes that are given the view from above."""
-        from matplotlib.figure import Figure
-
         planes = [plane for plane in (self.top, self.side) if plane is not None]
         if ax is not None:
             label(ax, title, f"{'xyz'[self.top[0]]} [m]", f"{'xyz'[self.top[1]]} [m]", equal=True)
             return ax.figure, [(ax, list(self.top))]
-        figure = Figure(figsize=(6.5 * len(planes), 6.0), layout="constrained")
+        figure = blank(6.5 * len(planes), 6.0)
         figure.suptitle(title)
         panels = figure.subplots(1, len(planes), squeeze=False)[0]
         shown = [(axes, list(plane)) for axes, plane in zip(panels, planes, strict=True)]
@@ -462,22 +461,31 @@ def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
     return list(figures)
 
 
+def blank(width: float, height: float) -> Any:
+    """An empty figure of a size [inches], which a notebook shows by itself."""
+    from matplotlib.figure import Figure
+
+    class ShownFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            buffer = BytesIO()
+            self.savefig(buffer, format="png", dpi=80)
+            return buffer.getvalue()
+
+    return ShownFigure(figsize=(width, height), layout="constrained")
+
+
 def new_axes(
     title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, height: float = 6.0, ax: Any = None
 ) -> tuple[Any, Any]:
     """A figure of one pair of axes, by default of equal scale; that of `ax`, if it is given."""
-    from matplotlib.figure import Figure
-
-    axes = Figure(figsize=(7.0, height), layout="constrained").subplots() if ax is None else ax
+    axes = blank(7.0, height).subplots() if ax is None else ax
     label(axes, title, xlabel, ylabel, equal)
     return axes.figure, axes
 
 
 def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:
     """A figure of pairs of axes one above the other that share what is along them."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 2.0 + 2.0 * count), layout="constrained")
+    figure = blank(9.0, 2.0 + 2.0 * count)
     rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     rows[0].set_title(title)
     for axes in rows:

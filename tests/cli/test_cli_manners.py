@@ -120,6 +120,9 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
     assert entries["python"] == sys.version.split()[0] and entries["libraries"]["numpy"] == np.__version__
     assert all(cached(module) for module in kernel_modules())
     assert compile_kernels() == []
+    assert main(["doctor", "--no-compile"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("all that every run needs works") and said[-1] == "to begin: rbpf demo"
     monkeypatch.setitem(sys.modules, "gtsam", None)
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["doctor", "--no-compile", "--json"]) == 2

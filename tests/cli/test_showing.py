@@ -120,6 +120,15 @@ def test_every_command_is_named(capsys, monkeypatch):
     assert "0 success" in text and "130 stopped" in text
 
 
+def test_the_examples_of_the_help_are_commands(capsys, monkeypatch):
+    lines = (help_of("", capsys, monkeypatch) + help_of("run", capsys, monkeypatch)).replace("│", " ").splitlines()
+    shown = [re.sub(r"^ *\w+( it)?: +", "", line) for line in lines if re.match(r" +(\w+( it)?: +)?rbpf [a-z]", line)]
+    examples = [words.split() for line in shown for words in line.split(";") if words.split()[0] == "rbpf"]
+    assert len(examples) >= 20
+    for _, *words in examples:
+        APP.require_known(words, "rbpf")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_says_what_each_option_is(command, capsys, monkeypatch):
     text = " ".join(help_of(command, capsys, monkeypatch).replace("│", " ").split())

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import inspect
+import json
 import re
 from pathlib import Path
 
@@ -30,6 +31,27 @@ def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path, pla
         assert low <= figures[name] <= high, f"{name}: {figures[name]}"
     if path.stem not in claims.BOUNDS:
         getattr(claims, path.stem)(figures)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_shows_what_its_cells_end_with(monkeypatch, tmp_path, plain_pictures):
+    """Cells are code with a last expression that is shown: no more of a notebook is needed to run one."""
+    cells = json.loads((ROOT / "examples" / "look_at_a_run.ipynb").read_text(encoding="utf-8"))["cells"]
+    monkeypatch.chdir(tmp_path)
+    names, shown = {}, []
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == [] and cell["execution_count"] is None
+            *statements, last = ast.parse("".join(cell["source"])).body
+            exec(compile(ast.Module(statements, []), "notebook", "exec"), names)
+            if isinstance(last, ast.Expr):
+                shown.append(eval(compile(ast.Expression(last.value), "notebook", "eval"), names))
+            else:
+                exec(compile(ast.Module([last], []), "notebook", "exec"), names)
+    run, *figures = [value for value in shown if value is not None]
+    assert "ate_rmse_m" in run._repr_html_()
+    assert len(figures) == 3 and all(figure._repr_png_().startswith(b"\x89PNG") for figure in figures)
+    assert (tmp_path / "two.pdf").is_file()
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
