@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow check lowest bench coverage docs clean
+.PHONY: help setup demo test slow check lowest bench coverage dist docs clean
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -54,6 +54,13 @@ bench: $(STAMP) ## run the benchmarks against their baselines
 
 coverage: $(STAMP) ## all tests, with the fraction of lines that they run
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-report=html:coverage
+
+dist: $(STAMP) ## wheel and source distribution into dist/: of one commit always the same bytes (GNU tar)
+	rm -rf dist build
+	export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && $(BIN)/python -m build --no-isolation && cd dist && \
+	  tar -xzf rbpf-*.tar.gz && rm rbpf-*.tar.gz && for folder in rbpf-*/; do name=$${folder%/}; \
+	  tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner --mode=u+rwX,go+rX,go-w -cf - $$name \
+	  | gzip -n9 > $$name.tar.gz && rm -r $$name; done
 
 docs: $(STAMP) ## build the documentation into docs/_build
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
