@@ -33,8 +33,6 @@ class CornerDetector(Detector):
     def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         import cv2
 
-        from rbpf.sensors.features.kernels import peaks
-
         eigenvalues = _least_eigenvalues(image)
         # All of FAST's corners: of equal neighbours, which ideal and saturated images have, its own suppression keeps none.
         first = margin_px - _FAST_RADIUS_PX
@@ -43,9 +41,11 @@ class CornerDetector(Detector):
         px = np.rint(cv2.KeyPoint.convert(found)).astype(np.int64).reshape(-1, 2) + first
         if mask is not None:
             px = px[mask[px[:, 1], px[:, 0]]]
-        kept = np.empty(px.shape[0], np.bool_)
-        peaks(eigenvalues, px, float(self.min_score) ** 2, kept)
-        px = px[kept]
+        # A corner's score is good enough, and the highest among its neighbours that FAST found.
+        rated, score = np.full(image.shape, -np.inf, np.float32), eigenvalues[px[:, 1], px[:, 0]]
+        rated[px[:, 1], px[:, 0]] = np.where(score >= float(self.min_score) ** 2, score, -np.inf)
+        highest = cv2.dilate(rated, np.ones((3, 3), np.uint8))[px[:, 1], px[:, 0]]
+        px = px[(rated[px[:, 1], px[:, 0]] == highest) & np.isfinite(highest)]
         return px, np.sqrt(eigenvalues[px[:, 1], px[:, 0]].astype(float))
 
 
