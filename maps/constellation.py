@@ -138,13 +138,20 @@ class UncertainConstellation(Landmark):
 
         Further its derivative by all points (N, 6, 3M), and its covariances (N, 6, 6): given the points, and of all.
         """
-        from rbpf.kernels.rigid_fit import rigid_fit
-
-        world, given = self.in_world(records), np.asarray(self.points)
-        n, start = world.shape[0], SE3.closest(given, world.mean(axis=0)[None])
-        frame, slope = np.empty((n, 7)), np.empty((n, 6, self.dim))
-        cov_fit, cov = np.empty((n, 6, 6)), np.empty((n, 6, 6))
-        held = (np.ascontiguousarray(part) for part in (world, records.cov[:, 0]))
-        shape = (given, np.asarray(self._info_points), start)
-        rigid_fit(*held, *shape, ROUNDS, SETTLED, frame, slope, cov_fit, cov)
+        world, given, weight = self.in_world(records), np.asarray(self.points), np.asarray(self._info_points)
+        frame = np.repeat(SE3.closest(given, world.mean(axis=0)[None]), len(world), axis=0)
+        for _ in range(ROUNDS):
+            local = SE3.inverse_transform(frame[:, None], world)
+            moved = -SE3.transform_jacobian(local)
+            weighed = np.swapaxes(moved, -1, -2) @ weight
+            info, pull = (weighed @ moved).sum(axis=1), (weighed @ (local - given)[..., None]).sum(axis=1)
+            step = -np.linalg.solve(info, pull)[..., 0]
+            frame = SE3.retract(frame, step)
+            if np.abs(step).max() <= SETTLED:
+                break
+        # −Λ⁻¹ JᵀW Rᵀ, point by point.
+        back = np.swapaxes(SE3.rotation(frame), -1, -2)[:, None]
+        slope = np.moveaxis(-np.linalg.solve(info[:, None], weighed @ back), 1, 2).reshape(len(frame), 6, self.dim)
+        cov_fit = gaussian.inverse(info)
+        cov = gaussian.symmetrise(slope @ records.cov[:, 0] @ np.swapaxes(slope, -1, -2) + cov_fit)
         return frame, slope, cov_fit, cov

@@ -25,7 +25,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Information, Particles, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import gather, project
+from rbpf.kernels.landmarks import project
 from rbpf.lie import LieGroup
 from rbpf.maps import rows
 from rbpf.maps.point import Point
@@ -133,17 +133,7 @@ class LandmarkMap(Map):
         if kinds[0] < 0 or (kinds != kinds[0]).any():
             self._known(ids)
             raise InputError("read() takes landmarks of one parametrisation at a time: see `landmark_of`")
-        layout = self.layouts[kinds[0]]
-        landmark = layout.landmark
-        if landmark.components > 1 or not self.store.is_warm(ids):
-            return layout.unpack(self.store.read_all(ids, particles))
-        access = self.store.access(ids)
-        maps = access.maps if particles is ALL else np.ascontiguousarray(access.maps[:, particles])
-        n, k, dim = maps.shape[1], ids.size, landmark.dim
-        mean, cov = np.empty((n, k, dim)), np.empty((n, k, dim, dim))
-        const = np.empty((n, k, landmark.constants))
-        gather(access.pool, access.slabs, access.which, maps, mean, cov, const)
-        return Records(mean, cov, const if landmark.constants else None)
+        return self.layouts[kinds[0]].unpack(self.store.read_all(ids, particles))
 
     def moments(self, particles: Particles, of: Part | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `Belief.moments`, of the particles in which a landmark exists; one that exists in none, of all that hold it."""

@@ -47,7 +47,6 @@ from rbpf.core.particles import (
 from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import Consolidation, EssTriggered, Systematic
 from rbpf.errors import InputError
-from rbpf.kernels.increment import are_sound
 from rbpf.lie import Array, LieGroup
 from rbpf.ranges import require_memory
 
@@ -524,9 +523,6 @@ def checked_observations(group: Observations) -> Observations:
         raise InputError(f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both: {updates}")
     if Part.STATE not in updates and Part.LANDMARK not in group.model.reads:
         raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
-    # The usual case, found out quickly: all is finite and the covariances are positive definite.
-    if are_sound(group.z, group.cov):
-        return group
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")
     try:

@@ -15,7 +15,6 @@ from rbpf.core.linearisation import EVERYTHING, information, linearise, stacked
 from rbpf.core.models import NEW, NULL, Belief, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
 from rbpf.core.particles import Information, Particles, Prior, mixture_estimate, take
 from rbpf.errors import InputError
-from rbpf.kernels.increment import conditioned
 from rbpf.lie import Array, LieGroup
 
 GAUSSIAN = Gaussian()
@@ -144,24 +143,20 @@ class KalmanSubstate(Conditional):
                 f"the substate has {m} numbers: expected coupling (·, {d}, {m}), dynamics (·, {m}, {m}) and "
                 f"drift (·, {m}), the motion model gives (·, …) {sizes}"
             )
-        blocks = [transition.coupling, transition.dynamics]
-        if blocks[0].shape[0] != blocks[1].shape[0]:
-            shared = max(block.shape[0] for block in blocks)
-            blocks = [np.broadcast_to(block, (shared, *block.shape[1:])) for block in blocks]
-        stack = np.concatenate(blocks, axis=1)
+        shared = max(len(transition.coupling), len(transition.dynamics))
+        blocks = [
+            np.broadcast_to(part, (shared, *part.shape[1:])) for part in (transition.coupling, transition.dynamics)
+        ]
+        stack, noise = np.concatenate(blocks, axis=1), transition.noise_factor
         means = (stack @ self.mean[..., None])[..., 0]
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
-        # Joint covariance of (ε, s), then s | ε by its gain and rest; compiled where cov(ε) is definite.
-        parts = stack, self.cov, transition.noise_factor
-        n = max(part.shape[0] for part in parts)
-        joint, factor = np.empty((n, d + m, d + m)), np.empty((n, d, d))
-        self._gain, self._rest = np.empty((n, m, d)), np.empty((n, m, m))
-        if not conditioned(*map(np.ascontiguousarray, parts), joint, factor, self._gain, self._rest):
-            factor = gaussian.psd_factor(joint[:, :d, :d])
-            self._gain = joint[:, d:, :d] @ np.linalg.pinv(joint[:, :d, :d], hermitian=True)
-            closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(m), (n, m, m))], axis=2)
-            self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+        # Joint covariance of (ε, s), then s | ε by its gain and rest, which rounding cannot make indefinite.
+        joint = stack @ self.cov @ np.swapaxes(stack, -1, -2) + noise @ np.swapaxes(noise, -1, -2)
+        factor = gaussian.psd_factor(gaussian.symmetrise(joint[:, :d, :d]))
+        self._gain = joint[:, d:, :d] @ np.linalg.pinv(joint[:, :d, :d], hermitian=True)
+        closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(m), (len(joint), m, m))], axis=2)
+        self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
     def driving(self) -> np.ndarray | None:

@@ -244,25 +244,6 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
         _add_between(weights, offset, mean[k], cov[k])
 
 
-@njit(void(CUBE, INDICES, INDICES, INDEX_MATRIX, CUBE, HYPERCUBE, CUBE), cache=True, error_model="numpy")
-def gather(pool, slabs, which, maps, mean, cov, const):
-    """Fills `mean` (N, K, D), `cov` (N, K, D, D) and `const` (N, K, A); particle i reads row `maps[which[k], i]`."""
-    dim, size_const = mean.shape[2], const.shape[2]
-    first_const = dim + dim * (dim + 1) // 2
-    for k in range(slabs.size):
-        slab, rows = pool[slabs[k]], maps[which[k]]
-        for i in range(mean.shape[0]):
-            row = rows[i]
-            field = dim
-            for a in range(dim):
-                mean[i, k, a] = slab[a, row]
-                for b in range(a + 1):
-                    cov[i, k, a, b] = cov[i, k, b, a] = slab[field, row]
-                    field += 1
-            for a in range(size_const):
-                const[i, k, a] = slab[first_const + a, row]
-
-
 @njit(void(int64, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE), cache=True, error_model="numpy")
 def call_kernel(address, state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Runs the kernel at `address` on the lanes 0..n-1 of a block; arguments as in `rbpf.kernels.signature`."""

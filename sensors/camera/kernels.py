@@ -10,7 +10,7 @@ import numpy as np
 from numba import boolean, int64, njit, types
 
 from rbpf.kernels.block import flat, rotation_at, store_by_state
-from rbpf.kernels.se3 import back, cross, rotation, times
+from rbpf.kernels.se3 import back, rotation, times
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
 from rbpf.sensors.camera.distortion import NEAR
 
@@ -288,100 +288,6 @@ def in_view(place, first_pose, alive, pose, params, limits, rows, px):
 
 
 HEADER = KIND + 1  #: Parameters before the points: the camera's.
-_SMALL = 1e-2  #: θ² below which the series of the coefficients are exact to rounding with the terms kept.
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _coefficients(square):
-    """Of Exp: a = sin θ/θ, b = (1 − cos θ)/θ², c = (θ − sin θ)/θ³, and each one's derivative by θ²/2."""
-    s = square
-    if s < _SMALL:
-        a = 1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0)))
-        b = 0.5 - s / 24.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0 * (1.0 - s / 90.0)))
-        c = 1.0 / 6.0 - s / 120.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0 * (1.0 - s / 110.0)))
-        da = -1.0 / 3.0 + s / 30.0 * (1.0 - s / 28.0 * (1.0 - s / 54.0 * (1.0 - s / 88.0)))
-        db = -1.0 / 12.0 + s / 180.0 * (1.0 - 3.0 * s / 112.0 * (1.0 - 2.0 * s / 135.0))
-        dc = -1.0 / 60.0 + s / 1260.0 * (1.0 - s / 48.0 * (1.0 - 4.0 * s / 330.0))
-        return a, b, c, da, db, dc
-    angle = math.sqrt(s)
-    sine, cosine = math.sin(angle), math.cos(angle)
-    a, b, c = sine / angle, (1.0 - cosine) / s, (angle - sine) / (s * angle)
-    return a, b, c, (cosine - a) / s, (a - 2.0 * b) / s, (b - 3.0 * c) / s
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _turned(k1, k2, w, x):
-    """The sum x + k1 ω × x + k2 ω × (ω × x)."""
-    once = cross(w, x)
-    twice = cross(w, once)
-    return (
-        x[0] + k1 * once[0] + k2 * twice[0],
-        x[1] + k1 * once[1] + k2 * twice[1],
-        x[2] + k1 * once[2] + k2 * twice[2],
-    )
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _by_turn(g, k1, k2, d1, d2, w, x):
-    """gᵀ ∂/∂ω of `_turned`, where k1 and k2 change by d1 ω and d2 ω."""
-    once = cross(w, x)
-    twice = cross(w, once)
-    along = d1 * (g[0] * once[0] + g[1] * once[1] + g[2] * once[2])
-    along += d2 * (g[0] * twice[0] + g[1] * twice[1] + g[2] * twice[2])
-    first = cross(x, g)
-    second = cross(once, g)
-    third = cross(x, cross(g, w))
-    return (
-        k1 * first[0] + k2 * (second[0] + third[0]) + along * w[0],
-        k1 * first[1] + k2 * (second[1] + third[1]) + along * w[1],
-        k1 * first[2] + k2 * (second[2] + third[2]) + along * w[2],
-    )
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _view(project, state, mean, const, z, params, n, nu, jac_state, jac_landmark):
-    """`constellation_view` through one kind of lens."""
-    count = z.shape[0] // 2
-    for i in range(n):
-        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
-        s = rotation(const[0, i], const[1, i], const[2, i], const[3, i])
-        w = (mean[0, i], mean[1, i], mean[2, i])
-        shift = (mean[3, i], mean[4, i], mean[5, i])
-        a, b, c, da, db, dc = _coefficients(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-        moved = _turned(b, c, w, shift)
-        for k in range(count):
-            first = HEADER + 3 * k
-            x = (params[first], params[first + 1], params[first + 2])
-            t = _turned(a, b, w, x)
-            u0, u1, u2 = times(s, t[0] + moved[0], t[1] + moved[1], t[2] + moved[2])
-            u0, u1 = u0 + const[4, i] - state[4, i], u1 + const[5, i] - state[5, i]
-            c0, c1, c2 = back(r, u0, u1, u2 + const[6, i] - state[6, i])
-            depth = clamp_depth(c0, c1, c2)
-            px, py, d00, d01, d02, d10, d11, d12 = project(c0, c1, depth, params)
-            nu[2 * k, i] = z[2 * k] - px
-            nu[2 * k + 1, i] = z[2 * k + 1] - py
-            for row in range(2):
-                d = (d00, d01, d02) if row == 0 else (d10, d11, d12)
-                out = 2 * k + row
-                store_by_state(d[0], d[1], d[2], c0, c1, depth, flat(jac_state[out]), i)
-                e0, e1, e2 = times(r, d[0], d[1], d[2])
-                g = back(s, e0, e1, e2)
-                turned = _by_turn(g, a, b, da, db, w, x)
-                carried = _by_turn(g, b, c, db, dc, w, shift)
-                against = (-w[0], -w[1], -w[2])
-                by_shift = _turned(b, c, against, g)
-                for f in range(3):
-                    jac_landmark[out, f, i] = turned[f] + carried[f]
-                    jac_landmark[out, 3 + f, i] = by_shift[f]
-
-
-@observation_kernel
-def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
-    """Pixels of several exact points of one group; params: the camera's, then the points in the group's frame."""
-    if params[KIND] == 0.0:
-        _view(project_radial, state, mean, const, z, params, n, nu, jac_state, jac_landmark)
-    else:
-        _view(project_equidistant, state, mean, const, z, params, n, nu, jac_state, jac_landmark)
 
 
 @observation_kernel

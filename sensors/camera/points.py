@@ -310,7 +310,6 @@ class ConstellationView(PointsView):
     def __init__(self, camera: Pinhole, points: Array) -> None:
         super().__init__(camera, points.shape[0])
         self.points = points
-        self._params = np.concatenate([camera.params, points.ravel()])
 
     def in_world(self, landmark: Array, const: Given) -> Array:
         assert const is not None
@@ -328,8 +327,3 @@ class ConstellationView(PointsView):
         # a·(ω × k) = −(a × k)·ω
         by_frame = np.concatenate([-np.cross(turned, self.points[:, None, :]), turned], axis=-1)
         return by_state, by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]
-
-    def kernel(self) -> FusedKernel | None:
-        from rbpf.sensors.camera.kernels import constellation_view
-
-        return FusedKernel(constellation_view, self._params)

@@ -1,4 +1,4 @@
-"""The compiled twins of the camera's models equal NumPy: rays, points and whole constellations."""
+"""The compiled twins of the camera's models equal NumPy: rays, points and the points of constellations."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from rbpf.core.models import ObservationModel
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.camera.kernels import in_view, project
-from rbpf.sensors.camera.points import CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView, StereoPoint
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay, MembersView, StereoPoint
 from rbpf.systems.mono.feature_table import directions
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN, Rays, compiled, with_velocity
@@ -63,36 +63,9 @@ def test_points(camera, moved):
         assert (CameraPoint(camera).in_camera(state, points)[:, 2] < 0.0).any()
 
 
-ANGLES = [0.0, 1e-9, 0.1 - 1e-9, 0.1 + 1e-9, 1.0, np.pi, 5.0]
-"""The coefficients' series end at θ² = 0.01."""
-
-
-@every_camera
-@pytest.mark.parametrize("angle", ANGLES)
-def test_exact_constellations(angle, camera):
-    rng = np.random.default_rng(7)
-    view = ConstellationView(camera, np.random.default_rng(6).normal(scale=0.3, size=(3, 3)))
-    n = 31
-    axis = rng.normal(size=(n, 3))
-    xi = np.concatenate([angle * axis / np.linalg.norm(axis, axis=1, keepdims=True), rng.normal(size=(n, 3))], axis=1)
-    const = SE3.exp(rng.normal(size=(n, 6)))
-    state = in_front(SE3.retract(const, xi), rng)
-    in_camera = SE3.inverse_transform(state[:, None], SE3.transform(SE3.retract(const, xi)[:, None], view.points))
-    assert (in_camera[..., 2] > 0.5).mean() > 0.9
-    z = np.tile(Z, 3) + 10.0 * rng.normal(size=6)
-    assert_twins(view, z, state, xi, const, 1e-9)
-
-
-def in_front(frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    ahead = np.concatenate([np.zeros(3), [0.0, 0.0, -2.5]])
-    return SE3.retract(frame, ahead + rng.normal(scale=0.2, size=(len(frame), 6)))
-
-
 def test_behind_the_camera():
     points = 0.3 * np.eye(3)
     state = SE3.exp(np.array([[0.0, 0.0, 0.0, 0.0, 0.0, z] for z in (-3.0, 0.1, 3.0)]))
-    exact = ConstellationView(DISTORTED, points)
-    assert_twins(exact, np.tile(Z, 3), state, np.zeros((3, 6)), SE3.identity((3,)), 1e-9)
     uncertain = MembersView(DISTORTED, np.arange(3))
     assert_twins(uncertain, np.tile(Z, 3), state, np.tile(points.ravel(), (3, 1)), np.zeros((3, 0)), 1e-9)
 

@@ -73,17 +73,20 @@ class RobustMotionGate(OutlierGate):
     def fit(
         self, nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, trusted: np.ndarray
     ) -> MotionFit:
-        from rbpf.kernels.robust_fit import robust_fit
-
-        rank = factor.shape[1]
-        of_trusted, u, chol_info = np.empty(int(trusted.sum())), np.empty(rank), np.empty((rank, rank))
-        rows = (np.ascontiguousarray(array[trusted], dtype=float) for array in (nu, jac, cov))
-        whitened = np.ascontiguousarray(factor, dtype=float)
-        robust_fit(*rows, whitened, ROUNDS, CAUCHY_SCALE, of_trusted, u, chol_info)
-        half = gaussian.solve_lower_matrix(chol_info, factor.T)
+        # u ~ N(0, I) with ε = L u, of whitened measurements; the weights are those of the misfit before.
+        chol = gaussian.cholesky(cov[trusted])
+        white = gaussian.solve_lower(chol, nu[trusted])
+        slope = gaussian.solve_lower_matrix(chol, jac[trusted] @ factor)
+        u, unit = np.zeros(factor.shape[1]), np.eye(factor.shape[1])
+        for _ in range(ROUNDS):
+            weight = 1.0 / (1.0 + np.square(white - slope @ u).sum(axis=1) / CAUCHY_SCALE**2)
+            weighed = (weight[:, None, None] * slope).reshape(-1, u.size)
+            info = unit + weighed.T @ slope.reshape(-1, u.size)
+            u = np.linalg.solve(info, weighed.T @ white.ravel())
+        half = gaussian.solve_lower_matrix(gaussian.cholesky(info), factor.T)
         increment, spread = factor @ u, half.T @ half
         squared = np.empty(nu.shape[0])
-        squared[trusted] = of_trusted
+        squared[trusted] = np.square(white - slope @ u).sum(axis=1)
         jac, cov, off = jac[~trusted], cov[~trusted], (nu - jac @ increment)[~trusted]
         given = cov + jac @ spread @ np.swapaxes(jac, -1, -2)
         squared[~trusted] = (off * np.linalg.solve(given, off[..., None])[..., 0]).sum(axis=-1)
