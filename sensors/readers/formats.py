@@ -4,6 +4,7 @@ import logging
 from pathlib import Path
 
 from rbpf.errors import InputError
+from rbpf.sensors.readers.format import Format, recognised
 from rbpf.sensors.readers.images.bag import RosBag
 from rbpf.sensors.readers.images.euroc import Euroc
 from rbpf.sensors.readers.images.folders import Folder, Photos, SevenScenes, Tum
@@ -13,12 +14,11 @@ from rbpf.sensors.readers.images.video import Video
 from rbpf.sensors.readers.mrclam import Mrclam
 from rbpf.sensors.readers.mrpt import Mrpt
 from rbpf.sensors.readers.part import WHOLE, Part
-from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat
-from rbpf.sensors.readers.text import quoted, read_bytes
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog
 from rbpf.sensors.readers.victoria_park import VictoriaPark
 
 #: The first that recognises a recording reads it.
-ROBOT_LOGS: tuple[RobotLogFormat, ...] = (Mrpt(), Mrclam(), VictoriaPark())
+ROBOT_LOGS: tuple[Format[LogNoise, RobotLog], ...] = (Mrpt(), Mrclam(), VictoriaPark())
 IMAGES: tuple[ImageFormat, ...] = (RosBag(), Tum(), Euroc(), Kitti(), SevenScenes(), Photos(), Video(), Folder())
 _log = logging.getLogger(__name__)
 
@@ -29,12 +29,8 @@ def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
     `noise` are standard deviations to use in place of the log's. Raises InputError: nothing is there, it is of no known
     format, or a file of it is malformed.
     """
-    path = existing(path, "a robot log")
-    for one in ROBOT_LOGS:
-        if one.recognises(path):
-            return one.read(path, noise or LogNoise())
-    kinds = "; or ".join(one.kind for one in ROBOT_LOGS)
-    raise InputError(f"{path}: found {_content(path, first_line=True)}, expected {kinds}.")
+    path, found = recognised(path, ROBOT_LOGS, "a robot log")
+    return found.read(path, noise or LogNoise())
 
 
 def open_images(
@@ -52,7 +48,7 @@ def open_images(
     is malformed; a topic is named that is not there.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics)
-    return _opened(existing(path, "an image sequence"), options, part)
+    return _opened(path, options, part)
 
 
 def open_stereo(
@@ -80,45 +76,20 @@ def open_stereo(
     baseline is zero, or the right camera is not to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s, stereo=True)
-    return _opened(existing(path, "a stereo sequence"), options, part)
+    return _opened(path, options, part)
 
 
-def _opened(path: Path, options: ReadOptions, part: Part) -> ImageSequence:
-    formats = [one for one in IMAGES if one.stereo_kind or not options.stereo]
-    for one in formats:
-        if not one.recognises(path):
-            continue
-        if not one.has_topics and (given := options.topics.entries()):
-            name, value = next(iter(given.items()))
-            problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"
-            raise InputError(f"{path}: {problem}; leave it out.")
-        sequence = one.read(path, options)
-        for note in sequence.notes:
-            _log.warning("%s", note)
-        return sequence if part == WHOLE else part.apply(sequence)
-    kinds = "; or ".join(one.stereo_kind if options.stereo else one.kind for one in formats)
-    raise InputError(f"{path}: found {_content(path)}, expected {kinds}.")
-
-
-def existing(path: str | Path, what: str) -> Path:
-    """The path of a recording; an InputError where nothing is there, which says what was expected."""
-    path = Path(path)
-    try:
-        path.stat()
-    except (OSError, ValueError) as error:
-        reason = "no such file or folder" if isinstance(error, FileNotFoundError) else str(error)
-        raise InputError(f"{path}: {reason}; expected {what}.") from None
-    return path
-
-
-def _content(path: Path, first_line: bool = False) -> str:
-    """What is at a path that no format recognises."""
-    if path.is_dir():
-        names = sorted(entry.name for entry in path.iterdir())
-        if not names:
-            return "an empty folder"
-        return f"a folder with {', '.join(names[:5])}{' and more' if len(names) > 5 else ''}"
-    if first_line:
-        first = read_bytes(path)[:80].decode(errors="replace").split("\n")[0]
-        return f"a file that begins with {quoted(first)}" if first else "an empty file"
-    return f"a file that ends in {path.suffix!r}" if path.suffix else "a file"
+def _opened(path: str | Path, options: ReadOptions, part: Part) -> ImageSequence:
+    if options.stereo:
+        pairs = [one for one in IMAGES if one.stereo_kind]
+        path, found = recognised(path, pairs, "a stereo sequence", "stereo_kind")
+    else:
+        path, found = recognised(path, IMAGES, "an image sequence")
+    if not found.has_topics and (given := options.topics.entries()):
+        name, value = next(iter(given.items()))
+        problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"
+        raise InputError(f"{path}: {problem}; leave it out.")
+    sequence = found.read(path, options)
+    for note in sequence.notes:
+        _log.warning("%s", note)
+    return sequence if part == WHOLE else part.apply(sequence)

@@ -27,7 +27,6 @@ A clock that is set back by more is refused. Scans that turn against the odometr
 """
 
 import logging
-from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,7 +39,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.ranges import Positive, Ranged
 from rbpf.sensors.laser import LaserLog, Scanner
-from rbpf.sensors.readers.formats import existing
+from rbpf.sensors.readers.format import Format, recognised
 from rbpf.sensors.readers.images.bag import SUFFIXES, Bag, numbers_of, opened
 from rbpf.sensors.readers.part import WHOLE, Part
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_number, parse_time, quoted
@@ -73,7 +72,7 @@ class LaserOptions(Ranged):
 
 @dataclass(frozen=True)
 class ScansOfFile:
-    """All scans of one scanner, S of them, in the order of the file."""
+    """All scans of one scanner, S of them, at least one, in the order of the file; each has odometry, or none has."""
 
     angles: Array  #: (B,) of the beams, from one side to the other.
     places: np.ndarray  #: (S,) where each stands in the file, in words.
@@ -91,31 +90,14 @@ class ScansOfFile:
         return replace(self, **kept, odometry=None if self.odometry is None else self.odometry[rows])
 
 
-class LaserFormat(ABC):
-    """A format of recordings of a scanner; `LASERS` lists all of them."""
-
-    kind: str  #: What it is and which files make it, for messages.
-
-    @abstractmethod
-    def recognises(self, path: Path) -> bool:
-        """Whether a file or folder is meant to be of this format."""
-
-    @abstractmethod
-    def read(self, path: Path, options: LaserOptions) -> ScansOfFile:
-        """At least one scan, each with odometry or none with it. Raises InputError: as `read_laser_log`."""
-
-
 def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> LaserLog:
     """Read a recording of a scanner, a CARMEN log or a ROS bag, which the head of this module describes.
 
     Raises InputError: nothing is there, a line is not as described (it is named), there are no scans or none of the
     scanner that is asked for, all are outside of the part, or the clock runs backwards.
     """
-    kinds, options = "; or ".join(one.kind for one in LASERS), options or LaserOptions()
-    path = existing(path, kinds)
-    found = next((one for one in LASERS if one.recognises(path)), None)
-    if found is None:
-        raise InputError(f"{path}: found a folder, expected {kinds}.")
+    options = options or LaserOptions()
+    path, found = recognised(path, LASERS, "; or ".join(one.kind for one in LASERS))
     read = found.read(path, options)
     # In order of time; those that come a little late are left out.
     late_ns = np.maximum.accumulate(read.stamps_ns)[:-1] - read.stamps_ns[1:]
@@ -208,7 +190,7 @@ def _interpolated(path: Path, scans: ScansOfFile, stamps_ns: list[int], poses: l
 
 
 @final
-class Carmen(LaserFormat):
+class Carmen(Format[LaserOptions, ScansOfFile]):
     """CARMEN logs."""
 
     kind = f"a CARMEN log (a text file with lines {', '.join(SCANNERS[:2])}, …, which may be packed by gzip)"
@@ -365,7 +347,7 @@ def _mount(path: Path, name: str, implied: Array, told: Array, rear: bool) -> Ar
 
 
 @final
-class LaserBag(LaserFormat):
+class LaserBag(Format[LaserOptions, ScansOfFile]):
     """ROS bags."""
 
     kind = "a ROS bag (.bag, .mcap, .db3, or a folder with metadata.yaml) with sensor_msgs/LaserScan"
@@ -496,4 +478,5 @@ def _pose(message: Any) -> Array | None:
     return np.asarray(SE3.normalise(pose))
 
 
-LASERS: tuple[LaserFormat, ...] = (LaserBag(), Carmen())  #: The first that recognises a recording reads it.
+#: The first that recognises a recording reads it.
+LASERS: tuple[Format[LaserOptions, ScansOfFile], ...] = (LaserBag(), Carmen())

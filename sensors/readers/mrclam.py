@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Array
 from rbpf.sensors.feature_log import Truth
-from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat, assemble, diagonal, require_ranges
+from rbpf.sensors.readers.format import Format
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, assemble, diagonal, require_ranges
 from rbpf.sensors.readers.text import read_columns
 
 DEFAULT_NOISE = LogNoise(
@@ -43,7 +44,7 @@ _log = logging.getLogger(__name__)
 
 
 @final
-class Mrclam(RobotLogFormat):
+class Mrclam(Format[LogNoise, RobotLog]):
     """Logs of one robot of the UTIAS data sets; the path may also be the robot's table of measurements."""
 
     kind = (

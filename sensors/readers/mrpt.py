@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import robot_log
-from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, RobotLogFormat, assemble
+from rbpf.sensors.readers.format import Format
+from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, assemble
 from rbpf.sensors.readers.text import Table, read_csv
 from rbpf.sensors.readers.yaml_files import read_yaml
 
@@ -45,7 +46,7 @@ _PITCH_SIGNS = {"up": 1.0, "down": -1.0}
 
 
 @final
-class Mrpt(RobotLogFormat):
+class Mrpt(Format[LogNoise, RobotLog]):
     """Range-bearing logs in MRPT's tables; ranges, bearings and pitches take the standard deviations given, if any."""
 
     kind = "an MRPT log (a folder with observations.csv, odometry.csv and sensor.yaml)"

@@ -1,11 +1,9 @@
 """What every reader of a robot log returns: odometry, observations of landmarks and, where known, the truth.
 
-Below it stands what the readers of these logs share: the class of a format, noise that a caller puts in place of the
-log's, covariances as logs write them (upper triangles, in additive coordinates, rounded to a few digits), and frames
-from arrays.
+Below it stands what the readers of these logs share: noise that a caller puts in place of the log's, covariances as logs
+write them (upper triangles, in additive coordinates, rounded to a few digits), and frames from arrays.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -83,23 +81,6 @@ class LogNoise(Ranged):
         """The fields that are not None."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
-
-
-class RobotLogFormat(ABC):
-    """A format of robot logs; `rbpf.sensors.readers.formats` lists all of them."""
-
-    kind: str  #: What it is and which files make it, for messages.
-
-    @abstractmethod
-    def recognises(self, path: Path) -> bool:
-        """Whether a file or folder is meant to be a log of this format."""
-
-    @abstractmethod
-    def read(self, path: Path, noise: LogNoise) -> RobotLog:
-        """Read the log in a file or folder, with standard deviations in place of the log's or of the format's defaults.
-
-        Raises InputError: a file is missing or a line is not as the format's module describes; names file and line.
-        """
 
 
 def std_column(table: Table, column: str, given: float | None) -> Array:

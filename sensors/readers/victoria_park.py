@@ -23,7 +23,8 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.sensors.readers import robot_log
-from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat, assemble
+from rbpf.sensors.readers.format import Format
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, assemble
 from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_bytes, read_lines
 
 _COLUMNS = {
@@ -34,7 +35,7 @@ _KEYWORD = re.compile(rb"^(ODOMETRY|LANDMARK)\b", re.MULTILINE)
 
 
 @final
-class VictoriaPark(RobotLogFormat):
+class VictoriaPark(Format[LogNoise, RobotLog]):
     """Planar graphs; landmark positions take the standard deviation given, if any."""
 
     kind = "a graph (a text file with lines ODOMETRY and LANDMARK, or a folder with one such .txt)"

@@ -185,7 +185,7 @@ def test_bags_that_say_less(tmp_path, caplog):
         bag.scan("/scan", STAMPS_NS[1], [1.0, 2.0, 3.0])
     with pytest.raises(InputError, match=r"/scan, scan 1: expected beams as in the scans before"):
         read_laser_log(tmp_path / "uneven.bag")
-    with pytest.raises(InputError, match=r"found a folder, expected a ROS bag"):
+    with pytest.raises(InputError, match=r"found a folder with bare.bag, uneven.bag, expected a ROS bag"):
         read_laser_log(tmp_path)
 
 

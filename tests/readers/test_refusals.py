@@ -198,8 +198,7 @@ def test_what_is_of_no_format_is_told_from_what_is_expected(tmp_path, read, file
         (open_log, "some.txt", b"", "found an empty file"),
         (open_log, "some.txt", b"\x00\xff\x01", r"found a file that begins with '\\x00.*'"),
         (open_log, "some.txt", b"timestamp tx ty\n1 2 3\n", "found a file that begins with 'timestamp tx ty'"),
-        (open_images, "0.png", b"something", "found a file that ends in '.png'"),
-        (open_images, "list", b"something", "found a file"),
+        (open_images, "0.png", b"something", "found a file that begins with 'something'"),
     ],
 )
 def test_a_file_of_another_kind(tmp_path, read, name, content, found):

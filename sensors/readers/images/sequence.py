@@ -11,6 +11,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import Truth
+from rbpf.sensors.readers.format import Format
 
 TOLERANCE_S = 0.005  #: Two images whose times differ by no more were taken together.
 
@@ -123,20 +124,8 @@ class ReadOptions:
     stereo: bool = False  #: both cameras are asked for, of a format that has a `stereo_kind`.
 
 
-class ImageFormat(ABC):
-    """A format of image sequences; `rbpf.sensors.readers.formats` lists all of them."""
+class ImageFormat(Format[ReadOptions, ImageSequence]):
+    """A format of image sequences: of one camera, the left one of two, or of two cameras, rectified."""
 
-    kind: str  #: What it is and which files make it, for messages.
-    stereo_kind: str = ""  #: The same of a recording of two cameras; empty where the format has one camera only.
+    stereo_kind: str = ""  #: As `kind`, of a recording of two cameras; empty where the format has one camera only.
     has_topics: bool = False  #: Whether streams in it have names.
-
-    @abstractmethod
-    def recognises(self, path: Path) -> bool:
-        """Whether a file or folder is meant to be a sequence of this format."""
-
-    @abstractmethod
-    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        """Open the images of one camera, the left one of two, or those of two cameras, rectified.
-
-        Raises InputError: a file is missing or not as the format's module describes, or two cameras are not one pair.
-        """

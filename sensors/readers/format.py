@@ -1,0 +1,61 @@
+"""What a format of recordings is, and which one a recording has: robot logs, laser scanners and images alike."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers.text import quoted, read_bytes
+
+Options = TypeVar("Options", contravariant=True)  #: What a caller may say about a recording.
+Recording = TypeVar("Recording", covariant=True)  #: What reading it gives.
+
+
+class Format(ABC, Generic[Options, Recording]):
+    """A format of recordings."""
+
+    kind: str  #: What it is and which files make it, for messages.
+
+    @abstractmethod
+    def recognises(self, path: Path) -> bool:
+        """Whether a file or folder is meant to be of this format."""
+
+    @abstractmethod
+    def read(self, path: Path, options: Options) -> Recording:
+        """Read the recording in a file or folder.
+
+        Raises InputError: a file is missing, or a line is not as the format's module describes; it names file and line.
+        """
+
+
+AnyFormat = TypeVar("AnyFormat", bound=Format[Any, Any])
+
+
+def recognised(path: str | Path, formats: Sequence[AnyFormat], what: str, kind: str = "kind") -> tuple[Path, AnyFormat]:
+    """The path, and the first of these formats that recognises it; `kind` is the attribute that says what a format is.
+
+    Raises InputError: nothing is there, where `what` was expected, or it is of no known format.
+    """
+    path = Path(path)
+    try:
+        path.stat()
+    except (OSError, ValueError) as error:
+        reason = "no such file or folder" if isinstance(error, FileNotFoundError) else str(error)
+        raise InputError(f"{path}: {reason}; expected {what}.") from None
+    for one in formats:
+        if one.recognises(path):
+            return path, one
+    kinds = "; or ".join(getattr(one, kind) for one in formats)
+    raise InputError(f"{path}: found {_content(path, kinds)}, expected {kinds}.")
+
+
+def _content(path: Path, expected: str) -> str:
+    """What is at a path that no format recognises."""
+    if path.is_dir():
+        names = sorted(entry.name for entry in path.iterdir())
+        if not names:
+            return "an empty folder"
+        return f"a folder with {', '.join(names[:5])}{' and more' if len(names) > 5 else ''}"
+    first = read_bytes(path, expected)[:80].decode(errors="replace").split("\n")[0]
+    return f"a file that begins with {quoted(first)}" if first else "an empty file"
