@@ -90,12 +90,6 @@ def rotation_at(pose, i):
 def cholesky(total, count, scale):
     """Replaces the lower triangle of `total` by its Cholesky factor with INVERTED diagonal; scale *= Π 1/l_aa."""
     p = total.shape[0]
-    if p == 2:
-        _cholesky_of_two(flat(total), count, scale)
-        return
-    if p == 3:
-        _cholesky_of_three(flat(total), count, scale)
-        return
     for a in range(p):
         for b in range(a):
             for c in range(b):
@@ -113,29 +107,6 @@ def cholesky(total, count, scale):
 
 
 @njit(cache=True, error_model="numpy")
-def _cholesky_of_two(total, count, scale):
-    for i in range(count):
-        t0 = 1.0 / math.sqrt(total[i])
-        l10 = total[2 * BLOCK + i] * t0
-        t1 = 1.0 / math.sqrt(total[3 * BLOCK + i] - l10 * l10)
-        total[i], total[2 * BLOCK + i], total[3 * BLOCK + i] = t0, l10, t1
-        scale[i] *= t0 * t1
-
-
-@njit(cache=True, error_model="numpy")
-def _cholesky_of_three(total, count, scale):
-    for i in range(count):
-        t0 = 1.0 / math.sqrt(total[i])
-        l10, l20 = total[3 * BLOCK + i] * t0, total[6 * BLOCK + i] * t0
-        t1 = 1.0 / math.sqrt(total[4 * BLOCK + i] - l10 * l10)
-        l21 = (total[7 * BLOCK + i] - l20 * l10) * t1
-        t2 = 1.0 / math.sqrt(total[8 * BLOCK + i] - l20 * l20 - l21 * l21)
-        total[i], total[3 * BLOCK + i], total[4 * BLOCK + i] = t0, l10, t1
-        total[6 * BLOCK + i], total[7 * BLOCK + i], total[8 * BLOCK + i] = l20, l21, t2
-        scale[i] *= t0 * t1 * t2
-
-
-@njit(cache=True, error_model="numpy")
 def whiten_vector(factor, count, vector):
     """Solves L y = vector in place, for a factor made by `cholesky`."""
     for a in range(factor.shape[0]):
@@ -148,53 +119,24 @@ def whiten_vector(factor, count, vector):
 
 @njit(cache=True, error_model="numpy")
 def whiten_matrix(factor, count, matrix):
-    """Solves L Y = matrix in place, for a factor made by `cholesky`."""
-    p = factor.shape[0]
-    if p == 2:
-        _whiten_two_rows(flat(factor), count, matrix[0], matrix[1])
-    elif p == 3:
-        _whiten_three_rows(flat(factor), count, matrix[0], matrix[1], matrix[2])
-    else:
-        _whiten_rows(p, matrix.shape[1], flat(factor), count, flat(matrix))
-
-
-@njit(cache=True, error_model="numpy")
-def _whiten_rows(p, size, chol, count, matrix):
+    """Solves L Y = matrix in place, for a factor made by `cholesky`; two terms at a time."""
+    p, size = matrix.shape[0], matrix.shape[1]
+    chol, out = flat(factor), flat(matrix)
     for e in range(size):
         for a in range(p):
             o, odd = (a * size + e) * BLOCK, a % 2
             for c in range(0, a - odd, 2):
                 j, k, m = (a * p + c) * BLOCK, (c * size + e) * BLOCK, ((c + 1) * size + e) * BLOCK
                 for i in range(count):
-                    first = matrix[o + i] - chol[j + i] * matrix[k + i]
-                    matrix[o + i] = first - chol[j + BLOCK + i] * matrix[m + i]
+                    first = out[o + i] - chol[j + i] * out[k + i]
+                    out[o + i] = first - chol[j + BLOCK + i] * out[m + i]
             j, k = (a * p + a - 1) * BLOCK, ((a - 1) * size + e) * BLOCK
             if odd:
                 for i in range(count):
-                    matrix[o + i] -= chol[j + i] * matrix[k + i]
+                    out[o + i] -= chol[j + i] * out[k + i]
             j = (a * p + a) * BLOCK
             for i in range(count):
-                matrix[o + i] *= chol[j + i]
-
-
-@njit(cache=True, error_model="numpy")
-def _whiten_two_rows(chol, count, first, second):
-    for e in range(first.shape[0]):
-        for i in range(count):
-            y0 = first[e, i] * chol[i]
-            first[e, i] = y0
-            second[e, i] = (second[e, i] - chol[2 * BLOCK + i] * y0) * chol[3 * BLOCK + i]
-
-
-@njit(cache=True, error_model="numpy")
-def _whiten_three_rows(chol, count, first, second, third):
-    for e in range(first.shape[0]):
-        for i in range(count):
-            y0 = first[e, i] * chol[i]
-            y1 = (second[e, i] - chol[3 * BLOCK + i] * y0) * chol[4 * BLOCK + i]
-            first[e, i], second[e, i] = y0, y1
-            y2 = third[e, i] - chol[6 * BLOCK + i] * y0 - chol[7 * BLOCK + i] * y1
-            third[e, i] = y2 * chol[8 * BLOCK + i]
+                out[o + i] *= chol[j + i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -207,29 +149,18 @@ def add_squares(vector, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_gram(matrix, sign, count, total):
-    """Total += sign · matrixᵀ matrix, packed; two and three rows, the usual sizes, in one pass."""
+    """Total += sign · matrixᵀ matrix, packed; two rows in one pass: a sum is loaded and stored once for them."""
     p = matrix.shape[0]
     for e in range(matrix.shape[1]):
         for f in range(e + 1):
             m = packed(e, f)
-            if p == 2:
+            for a in range(0, p - 1, 2):
                 for i in range(count):
-                    total[m, i] += sign * (matrix[0, e, i] * matrix[0, f, i] + matrix[1, e, i] * matrix[1, f, i])
-            elif p == 3:
+                    first = total[m, i] + sign * matrix[a, e, i] * matrix[a, f, i]
+                    total[m, i] = first + sign * matrix[a + 1, e, i] * matrix[a + 1, f, i]
+            if p % 2:
                 for i in range(count):
-                    total[m, i] += sign * (
-                        matrix[0, e, i] * matrix[0, f, i]
-                        + matrix[1, e, i] * matrix[1, f, i]
-                        + matrix[2, e, i] * matrix[2, f, i]
-                    )
-            else:
-                for a in range(0, p - 1, 2):
-                    for i in range(count):
-                        first = total[m, i] + sign * matrix[a, e, i] * matrix[a, f, i]
-                        total[m, i] = first + sign * matrix[a + 1, e, i] * matrix[a + 1, f, i]
-                if p % 2:
-                    for i in range(count):
-                        total[m, i] += sign * matrix[p - 1, e, i] * matrix[p - 1, f, i]
+                    total[m, i] += sign * matrix[p - 1, e, i] * matrix[p - 1, f, i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -237,64 +168,9 @@ def add_transposed_product(matrix, vector, count, total):
     """Total += matrixᵀ vector."""
     p = matrix.shape[0]
     for e in range(matrix.shape[1]):
-        if p == 2:
+        for a in range(p):
             for i in range(count):
-                total[e, i] += matrix[0, e, i] * vector[0, i] + matrix[1, e, i] * vector[1, i]
-        elif p == 3:
-            for i in range(count):
-                total[e, i] += (
-                    matrix[0, e, i] * vector[0, i] + matrix[1, e, i] * vector[1, i] + matrix[2, e, i] * vector[2, i]
-                )
-        else:
-            for a in range(p):
-                for i in range(count):
-                    total[e, i] += matrix[a, e, i] * vector[a, i]
-
-
-@njit(cache=True, error_model="numpy")
-def innovation_covariance(jac, cov, noise, count, cross, total):
-    """Cross = J P and the lower triangle of total = J P Jᵀ + R; the sizes of points in one pass."""
-    p, dim = jac.shape[0], jac.shape[1]
-    if p == 2 and dim == 2:
-        _innovation_in_plane(flat(jac), flat(cov), noise, count, flat(cross), flat(total))
-    elif dim == 3:
-        _innovation_in_space(p, flat(jac), flat(cov), noise, count, flat(cross), flat(total))
-    else:
-        _innovation(jac, cov, noise, count, cross, total)
-
-
-@njit(cache=True, error_model="numpy")
-def _innovation_in_plane(jac, cov, noise, count, cross, total):
-    r00, r10, r11 = noise[0, 0], noise[1, 0], noise[1, 1]
-    for i in range(count):
-        j00, j01, j10, j11 = jac[i], jac[BLOCK + i], jac[2 * BLOCK + i], jac[3 * BLOCK + i]
-        p00, p10, p11 = cov[i], cov[BLOCK + i], cov[2 * BLOCK + i]
-        c00, c01 = j00 * p00 + j01 * p10, j00 * p10 + j01 * p11
-        c10, c11 = j10 * p00 + j11 * p10, j10 * p10 + j11 * p11
-        cross[i], cross[BLOCK + i], cross[2 * BLOCK + i], cross[3 * BLOCK + i] = c00, c01, c10, c11
-        total[i] = r00 + (c00 * j00 + c01 * j01)
-        total[2 * BLOCK + i] = r10 + (c10 * j00 + c11 * j01)
-        total[3 * BLOCK + i] = r11 + (c10 * j10 + c11 * j11)
-
-
-@njit(cache=True, error_model="numpy")
-def _innovation_in_space(p, jac, cov, noise, count, cross, total):
-    for a in range(p):
-        row = 3 * a * BLOCK
-        for i in range(count):
-            j0, j1, j2 = jac[row + i], jac[row + BLOCK + i], jac[row + 2 * BLOCK + i]
-            p10, p20, p21 = cov[BLOCK + i], cov[3 * BLOCK + i], cov[4 * BLOCK + i]
-            cross[row + i] = j0 * cov[i] + j1 * p10 + j2 * p20
-            cross[row + BLOCK + i] = j0 * p10 + j1 * cov[2 * BLOCK + i] + j2 * p21
-            cross[row + 2 * BLOCK + i] = j0 * p20 + j1 * p21 + j2 * cov[5 * BLOCK + i]
-        for b in range(a + 1):
-            other, entry, r = 3 * b * BLOCK, (p * a + b) * BLOCK, noise[a, b]
-            for i in range(count):
-                total[entry + i] = r + (
-                    cross[row + i] * jac[other + i]
-                    + cross[row + BLOCK + i] * jac[other + BLOCK + i]
-                    + cross[row + 2 * BLOCK + i] * jac[other + 2 * BLOCK + i]
-                )
+                total[e, i] += matrix[a, e, i] * vector[a, i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -317,10 +193,11 @@ def _is_zero(lanes, count):
 
 
 @njit(cache=True, error_model="numpy")
-def _innovation(jac, cov, noise, count, cross, total):
-    """Three terms at a time: a sum is loaded and stored once for them. Columns of zeros at both ends are left out.
+def innovation_covariance(jac, cov, noise, count, cross, total):
+    """Cross = J P and the lower triangle of total = J P Jᵀ + R.
 
-    A measurement of several points of one record has rows that read one point each.
+    Three terms at a time: a sum is loaded and stored once for them. Columns of zeros at both ends are left out: a
+    measurement of several points of one record has rows that read one point each.
     """
     p, dim = jac.shape[0], jac.shape[1]
     for a in range(p):
