@@ -25,7 +25,7 @@ FILES = {
     "checkpoint.npz", "trajectory.tum", "trajectory.npz", "odometry.tum", "map.npz", "map.csv", "truth.npz",
     "observations.csv", "observations_odometry.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
     "report.html", "path.png", "map.png", "particles.png", "error.png", "ess.png", "timings.png",
-    "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png", "groundtruth_nees.png",
+    "validation_groundtruth.json", "groundtruth_nees.png",
     "groundtruth_landmarks.png", "groundtruth_map.png",
 }  # fmt: skip
 REQUIRED = {

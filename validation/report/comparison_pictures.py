@@ -19,17 +19,16 @@ if TYPE_CHECKING:
     from rbpf.validation.colmap.compare import ColmapComparison
     from rbpf.validation.consistency.against_batch import AgainstBatch
 
+NEES = "NEES of the pose"
 _LOWEST = 0.01  #: NEES below this fraction of the band are drawn there.
 
 
 def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
-    """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
+    """Draws NEES, landmarks and map into the run's folder; returns their names behind the run's own path and error."""
     name, world = record.name, World.of(record)
-    figures = {
-        "groundtruth_path.png": plots.plot_trajectory(record),
-        "groundtruth_error.png": plots.error_figure(record),
-        "groundtruth_nees.png": plot_consistency(record),
-    }
+    curve, dim = {"filter": _nees(record, errors)}, errors.whitened.errors.shape[1]
+    nees = consistency_figure(f"{name}: {NEES}", NEES, curve, dim, banded=True)
+    figures = {"groundtruth_nees.png": nees}
     if errors.landmarks is not None:
         found = errors.landmarks
         title = f"{name}: landmarks against the truth"
@@ -38,7 +37,7 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
         title, others = f"{name}: map over the truth, in {world.name}", {"true landmarks": ("truth", true)}
         views = Views.of(record.system, path)
         figures["groundtruth_map.png"] = draw_map(title, views, path.positions, found.map, others)
-    return save_figures(figures, record.folder)
+    return ["path.png", "error.png", *save_figures(figures, record.folder)]
 
 
 def draw_beside(runs: Sequence[RunFolder], out: Path, formats: Sequence[str]) -> list[str]:
@@ -72,7 +71,7 @@ def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = N
         nees = np.einsum("tab,tbc,tca->t", roots, cov_batch + delta[:, :, None] * delta[:, None], roots)
         title, known = f"{name}: expected NEES under the batch posterior", ranks == cov.shape[-1]
         curve = {"filter": (found.optimum.steps[known], nees[known])}
-        figures["gtsam_nees.png"] = consistency_figure(title, "NEES of the pose", curve, cov.shape[-1], banded=True)
+        figures["gtsam_nees.png"] = consistency_figure(title, NEES, curve, cov.shape[-1], banded=True)
     if len(found.landmarks):
         title = f"{name}: landmarks against the batch optimum"
         figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), found.landmarks.dims)
@@ -126,15 +125,21 @@ def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
     for run in runs:
         name = run.folder.name if len(runs) > 1 else "filter"
         if all(known):
-            white = truth_errors(run).whitened
-            curves[name] = run.truth.rows[white.ranks > 0], white.nees[white.ranks > 0]
-            dim = white.errors.shape[1]
+            errors = truth_errors(run)
+            curves[name], dim = _nees(run, errors), errors.whitened.errors.shape[1]
         else:
             table = run.table("diagnostics.csv")
             rows = np.flatnonzero((table["nis_dof"] > 0) & np.isfinite(table["nis"]))
             curves[name] = rows, table["nis"][rows] / table["nis_dof"][rows]
-    words = "NEES of the pose" if all(known) else "NIS per degree of freedom"
+    words = NEES if all(known) else "NIS per degree of freedom"
     return consistency_figure(f"{runs[0].name}: {words}", words, curves, dim, banded=all(known), ax=ax)
+
+
+def _nees(run: RunFolder, errors: TruthErrors) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (R,) and the squared errors (R,) there, without those of which nothing is known."""
+    white = errors.whitened
+    known = white.ranks > 0
+    return run.truth.rows[known], white.nees[known]
 
 
 def consistency_figure(

@@ -26,8 +26,6 @@ from rbpf.validation.report.scene import program, scene
 
 PAGE = "report.html"
 VIDEO = "annotated.mp4"
-#: Pictures of a comparison that show what one of the run's own does.
-_SAME = {"groundtruth_path.png": "path.png", "groundtruth_error.png": "error.png"}
 _TITLES = {
     "groundtruth": "Against the ground truth", "gtsam": "Against the batch optimum", "colmap": "Against COLMAP",
     "itself": "Innovations", "relations": "Against known relations", "path": "Against another path",
@@ -86,7 +84,6 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         problems.append(f"{error}.")
     verdict = verdicts.verdict_of(record, comparisons)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
-    drawn |= {own for name, own in _SAME.items() if name in drawn}
     own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
     try:
         world = World.of(record)
