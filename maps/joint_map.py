@@ -21,6 +21,7 @@ from dataclasses import replace
 from typing import final
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
@@ -54,7 +55,7 @@ from rbpf.maps.joint.rows import (
     spread_of,
     turned,
 )
-from rbpf.maps.joint.solution import SubMap
+from rbpf.maps.joint.solution import Given, SubMap
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
 from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations, projected
@@ -235,14 +236,14 @@ class JointMap(Map):
             elif not self._in_step and self._is_over():
                 self._begin_submap()
             if self.old.maps:
-                self.old.look_from(self._finished(self.origin, self.mean[0], self.cov))
+                self.old.look_from(self.finished())
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
 
     def _is_over(self) -> bool:
         """Whether the present sub-map has been joined to the old ones, and another begins with nothing."""
         if self.submap is None or self._substate[0].size:
             return False
-        return self.old.take(self._finished(self.origin, self.mean[0], self.cov), len(self.ids) >= self.submap)
+        return self.old.take(self.finished(), len(self.ids) >= self.submap)
 
     def put_away(self, ids: np.ndarray) -> None:
         """Points (K,) go to the old sub-maps when the window ends: the present one ends there, and what stays goes over."""
@@ -264,9 +265,12 @@ class JointMap(Map):
         far = int((~np.isin(returning, self.old.near)).sum()) >= 3
         if leaving.size or far:
             self._pass_on(leaving, returning if far else None)
-        returning = returning[np.isin(returning, self.old.near)]
+        self._bring_in(returning[np.isin(returning, self.old.near)])
+
+    def _bring_in(self, returning: np.ndarray) -> None:
+        """Points (K,) about the start are held again."""
         if returning.size:
-            present = self._finished(self.origin, self.mean[0], self.cov)
+            present = self.finished()
             seen, slope, rest = self.old.brought_back(returning, present)
             columns = np.append(np.arange(self.space.dim), self.held.of_one_kind(present.ids).columns)
             cross = slope @ self.cov[columns]
@@ -275,8 +279,40 @@ class JointMap(Map):
             self.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
             self._given_ids = np.union1d(self._given_ids, returning)
 
-    def _pass_on(self, leaving: np.ndarray, wanted: np.ndarray | None) -> None:
-        """Ends the present sub-map; what does not leave goes over into the next one as it is."""
+    def finished(self) -> SubMap:
+        """The present sub-map as it would be if it ended here, when a window has just done so."""
+        return self._finished(self.origin, self.mean[0], self.cov)
+
+    def recognise(self, seen: Given, tied: bool = True) -> None:
+        """Points of old sub-maps are seen again from the frame, when a window has just ended: a loop is closed.
+
+        The present sub-map, which does not hold them, ends here with them, all are solved for, linearised anew, and they are
+        held again. Not `tied`, what is seen is a sub-map of its own, as how the robot came here is not known: the substate
+        alone is held on.
+        """
+        none = seen.ids[:0]
+        if tied:
+            self._pass_on(none, seen.ids, seen)
+            self._bring_in(seen.ids)
+        else:
+            own, here = slice(self.space.dim, self._first), np.eye(self.space.dim)
+            substate = self.mean[:, own], self.cov[own, own]
+            self.old.join(self.finished())
+            sighting = SubMap(self.space.identity(), none, seen.points[:0], here, tied=False).seeing(seen)
+            self.old.join(sighting, True, seen.ids)
+            self._begin_submap()
+            self.mean[:, own], self.cov[own, own] = substate
+            # From where the next one begins, they are what all sub-maps say of them.
+            known = self.old.given(seen.ids)
+            assert known is not None
+            self.held.add(seen.ids, self.point, np.full(seen.ids.size, -1), self.held.clones[:0])
+            self.mean = np.concatenate([self.mean, np.tile(known.points.ravel(), (self.n, 1))], axis=1)
+            self.cov = block_diag(self.cov, known.cov)
+            self._given_ids, self.leaving, self._returning = seen.ids, none, none
+        self.old.look_from(self.finished())
+
+    def _pass_on(self, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:
+        """Ends the present sub-map; what does not leave goes over into the next one as it is, and what is `seen` does not."""
         d, dim, seams = self.space.dim, self.point.dim, self._seams
         # What drives the motion ties the two as landmarks do: as it is here it is held on, in numbers taken for places.
         count = -(-self._substate[0].size // dim)
@@ -288,7 +324,8 @@ class JointMap(Map):
             self.cov = np.pad(self.cov, ((0, more), (0, more)))
             self.cov[-more:, -more:] = np.eye(more)
         self.held.add(names, self.point, np.full(count, -1), self.held.clones[:0])
-        self.old.join(self._finished(self.origin, self.mean[0], self.cov), wanted is not None, wanted)
+        finished = self.finished()
+        self.old.join(finished if seen is None else finished.seeing(seen), wanted is not None, wanted)
         self._keep(self.held.drop(self.held.rows_of(np.append(leaving, seams))))
         self.origin = self.space.identity()
         self.mean[:, :d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 from scipy.sparse.linalg import SuperLU, splu
 
 from rbpf import gaussian
@@ -39,6 +39,11 @@ class SubMap(NamedTuple):
     cov: np.ndarray
     tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
     given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
+
+    def seeing(self, seen: Given) -> "SubMap":
+        """With landmarks that are seen from its end besides."""
+        cov = block_diag(self.cov, seen.cov)
+        return self._replace(ids=np.append(self.ids, seen.ids), points=np.append(self.points, seen.points, 0), cov=cov)
 
 
 def inverse_of(cov: np.ndarray) -> np.ndarray:

@@ -150,7 +150,7 @@ class SubMaps:
         self._take(finished)
         if loop:
             self.solve(wanted)
-        if finished.given is None and min(before, default=len(self.maps)) < len(self.maps) - 2:
+        if finished.given is None and finished.tied and min(before, default=len(self.maps)) < len(self.maps) - 2:
             self._fuse()
 
     def end(self, present: SubMap) -> Estimate:
@@ -171,6 +171,19 @@ class SubMaps:
         turn = np.concatenate([by_start, space.right_jacobian(x[d:])], axis=1)
         mean = space.compose(space.retract(self.start, x[:d]), end)
         return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
+
+    def relative(self, number: int, present: SubMap) -> Estimate:
+        """Where the end of the present sub-map is as seen from that of an older one, by all that is known."""
+        space, d, every = self.space, self.space.dim, self.copied()
+        every._take(present)
+        solution = every._solve(every._shared(alone=True))
+        one, other = d * number + np.arange(d), d * len(self.maps) + np.arange(d)
+        unit = np.zeros((solution.information.shape[0], 2 * d))
+        unit[np.append(one, other), np.arange(2 * d)] = 1.0
+        cov = solution.solver.solve(unit)[np.append(one, other)]
+        mean = space.between(solution.starts[number + 1], solution.starts[-1])
+        turn = np.concatenate([-space.adjoint(space.inverse(mean)), np.eye(d)], axis=1)
+        return Estimate(mean, gaussian.symmetrise(turn @ cov @ turn.T))
 
     def _followed(self, new: SubMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What a new sub-map says of landmarks it was given moves all about the start, of which these rows (R,) of `cov`.
@@ -416,6 +429,18 @@ class SubMaps:
         ends = np.array([self.starts[number + 1] for number in held[:, 0]]).reshape(-1, self.space.size)
         points = np.array([self.maps[number].points[row] for number, row in held]).reshape(-1, self.dim)
         return self.space.transform(ends, points)
+
+    def latest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Names (M,) of all landmarks, and numbers (M,) of the last sub-maps that hold them."""
+        held = [(name, number) for name, (number, _) in self._last.items() if name >= 0]
+        names, numbers = np.array(held, dtype=np.int64).reshape(-1, 2).T
+        return names, numbers
+
+    def surely_near(self, ratio: float) -> np.ndarray:
+        """Names (K,) of landmarks about the start that are known, as seen from it, to this fraction of their distance."""
+        columns = self.space.dim + self.dim * np.arange(self.near.size)[:, None] + np.arange(self.dim)
+        variance = np.diagonal(self.cov)[columns].max(axis=1, initial=0.0)
+        return self.near[np.sqrt(variance) <= ratio * np.linalg.norm(self.points, axis=1)]
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """Names (M,) of all landmarks, and where in the world (M, D) the last sub-map that holds each has it."""

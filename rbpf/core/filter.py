@@ -203,7 +203,7 @@ class Filter:
         if self.consolidation is None:
             ancestors = self.resampler.ancestors(weights, self.rng)
         elif self._age and self.consolidation.is_due(0, weights):
-            self._consolidate()
+            self.consolidate()
             consolidated = True
             prior = self._predict(control, dt)
             proposed = proposal.propose(prior, self.marginals.linearised(prior, groups), self.rng)
@@ -274,7 +274,7 @@ class Filter:
         if self.consolidation is not None:
             self._age += 1
             if self.consolidation.is_due(self._age, self.particles.weights):
-                self._consolidate()
+                self.consolidate()
         return StepReport(
             stamp_ns=stamp_ns,
             mixture=mixture,
@@ -437,7 +437,8 @@ class Filter:
         self._ends = list(accumulate(len(groups) for groups in observed))
         return self.marginals.decided([group for groups in observed for group in groups], belief)
 
-    def _consolidate(self) -> None:
+    def consolidate(self) -> None:
+        """Takes what the particles differ by into what is marginalised, now: a window ends, whether it is due or not."""
         self.particles = self.marginals.consolidate(self.particles)
         self._age = 0
 

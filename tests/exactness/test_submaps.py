@@ -191,9 +191,12 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
     assert np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov), error).mean() < 6.0
 
 
-@pytest.mark.parametrize("most", [3, 50])
-def test_what_goes_over_is_known_as_in_one_gaussian(most):
-    """Of a velocity and landmarks out of view that come back, from near and, of the smaller, by a solution of all."""
+@pytest.mark.parametrize(("most", "by_image"), [(3, False), (50, False), (3, True)])
+def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image):
+    """Of a velocity and landmarks out of view that come back, from near and, of the smaller, by a solution of all.
+
+    They are held before they are seen, or recognised after it.
+    """
     readings, (whole, submaps) = walk(20)[0], (JointMap(Euclidean(2), START, submap=n) for n in (None, most))
     options = {"n": 10, "lag": 1, "consolidation": Consolidation(1)}
     filters = [
@@ -204,9 +207,14 @@ def test_what_goes_over_is_known_as_in_one_gaussian(most):
         following = readings[min(t + 1, len(readings) - 1)].landmarks
         if t % 3 == 2:
             submaps.put_away(np.setdiff1d(submaps.ids, np.append(reading.landmarks, following)))
-        submaps.bring_back(following[~submaps.holds(following)])
-        for filter_ in filters:
-            filter_.step(reading)
+        if not by_image:
+            submaps.bring_back(following[~submaps.holds(following)])
+        filters[0].step(reading)
+        again = np.isin(reading.landmarks, submaps.old.ids) & ~submaps.holds(reading.landmarks)
+        filters[1].step(Reading(reading.landmarks[~again], reading.z[~again]))
+        if again.any():
+            assert by_image and again.sum() == 4
+            submaps.recognise(Given(reading.landmarks[again], reading.z[again], np.kron(np.eye(again.sum()), NOISE)))
     told = []
     for filter_ in filters:
         belief = filter_.belief()

@@ -149,6 +149,8 @@ class RelocalisationConfig(Ranged):
     min_spread: Annotated[NotNegative, Formerly("spread")] = 0.03
     #: of the pose's standard deviations: the map's errors are common to neighbours.
     std_inflation: Annotated[Positive, Formerly("inflation")] = 3.0
+    #: of a joint map: frames between two questions where a tracked camera has been that is unsure of its place.
+    ask_every: Count = 10
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,9 @@ line on top: the same prior comes again in every frame, so that in a frame it co
 STILL_CHI2 = 4.0
 """Squared displacement in the image over the noise of both places, up to which a ray is seen where it was started."""
 
+LINEAR = 3.0
+"""Times the greatest standard deviation at which something is looked for: so far off a measurement is taken as linear."""
+
 GroupView = ConstellationView | MembersView
 """Measurements of several known points at once."""
 
@@ -203,14 +206,18 @@ class FeatureSensor(Sensor):
         self.unknown_depth = unknown_depth
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
+        self._reach_px = np.inf
         self.most: int | None = None
         """Landmarks of a joint map's sub-map, in which nothing is updated without the state; None where it is none."""
         self.point = CameraPoint(camera)
         self._take_group(group)
 
-    def become_joint(self, unknown_depth: UnknownDepth, most: int) -> None:
-        """From now on the map is a joint one, which holds the known points one by one, in sub-maps of `most` landmarks."""
-        self.unknown_depth, self.most = unknown_depth, most
+    def become_joint(self, unknown_depth: UnknownDepth, most: int, reach_px: float) -> None:
+        """From now on the map is a joint one, which holds the known points one by one, in sub-maps of `most` landmarks.
+
+        What is expected with a greater standard deviation than `reach_px` cannot be looked for.
+        """
+        self.unknown_depth, self.most, self._reach_px = unknown_depth, most, reach_px
         self._take_group(None)
 
     def tune(self, camera: Pinhole, about: np.ndarray) -> None:
@@ -284,13 +291,42 @@ class FeatureSensor(Sensor):
         joint.remove(away[~points])
         return away
 
+    def is_unsure(self, joint: JointMap) -> bool:
+        """Whether a joint map is so unsure of its frame's place that what was seen at first cannot be looked for."""
+        points = joint.held.by_kind()[0] if joint.ids.size else None
+        if joint.old.frame is None or points is None or points.landmark.anchored:
+            return False
+        depth = float(np.median(np.linalg.norm(joint.mean[0, points.columns], axis=1)))
+        turn, shift = (np.linalg.eigvalsh(joint.old.frame.cov[part, part])[-1] for part in (slice(3), slice(3, 6)))
+        return bool(self.camera.fx * np.sqrt(turn + shift / depth**2) > self._reach_px)
+
+    def expected(self, joint: JointMap, names: np.ndarray) -> np.ndarray:
+        """Which old landmarks (K,) can be looked for, as far as the map is sure of their places."""
+        if not self.is_unsure(joint):
+            return np.ones(names.size, dtype=bool)
+        return np.isin(names, joint.old.surely_near(self._reach_px / self.camera.fx))
+
+    def amiss(self, belief: Belief, frame: FeatureFrame) -> np.ndarray:
+        """Which of a frame's features (K,) are of old sub-maps, and seen too far from where an unsure map has them."""
+        joint, amiss = belief.map, np.zeros(frame.landmarks.size, dtype=bool)
+        assert isinstance(joint, JointMap)
+        if not self.is_unsure(joint):
+            return amiss
+        ids, places = joint.old.places()
+        away = np.flatnonzero(np.isin(frame.landmarks, ids) & ~joint.holds(frame.landmarks))
+        row_of = {name: row for row, name in enumerate(ids.tolist())}
+        points = places[[row_of[name] for name in frame.landmarks[away].tolist()]]
+        seen = self.camera.project(SE3.inverse_transform(self.pose(belief), points))
+        amiss[away] = ~(np.linalg.norm(seen - frame.z[away], axis=1) <= LINEAR * self._reach_px)
+        return amiss
+
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """Turns features whose depth is known by now into points; starts one for every new name."""
         belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
         is_new = (self.members(frame.landmarks) < 0) & ~belief.map.holds(frame.landmarks)
         if isinstance(belief.map, JointMap):
             is_old = is_new & np.isin(frame.landmarks, belief.map.old.ids)
-            belief.map.bring_back(frame.landmarks[is_old])
+            belief.map.bring_back(frame.landmarks[is_old & ~self.amiss(belief, frame)])
             is_new &= ~is_old
         new = np.flatnonzero(is_new & self.camera.inside(frame.z))
         new = new[np.isfinite(self.camera.unproject(frame.z[new])).all(axis=-1)][: self.max_new_per_frame]

@@ -251,7 +251,7 @@ class ImageSensor(Sensor):
         away = ~joint.holds(old)
         table.position[old[away]] = np.insert(places[away], 3, 1.0, axis=1)
         wanted = np.zeros(len(table), dtype=bool)
-        wanted[old[away & ~table.failing(old, self.config)]] = True
+        wanted[old[away & ~table.failing(old, self.config) & self.features.expected(joint, old)]] = True
         rows, _ = self.search.in_view(self.features.pose(belief), wanted)
         joint.bring_back(rows[: max(min(self.features.most // 4, 2 * self.features.most - held.size), 0)])
 
@@ -268,7 +268,7 @@ class ImageSensor(Sensor):
         self.place(belief, rows[held & table.alive[rows]])
 
     def move(self, new_from_old: np.ndarray) -> None:
-        """The world is another one (7,): where features are and were seen from."""
+        """The world is another one (7,), or (F, 7) for each feature: where features are and were seen from."""
         table = self.table
         table.first_pose[:], table.last_pose[:] = (
             SE3.compose(new_from_old, poses) for poses in (table.first_pose, table.last_pose)
@@ -307,7 +307,7 @@ class ImageSensor(Sensor):
             return bool(found.mean() < config.lost_fraction)
         least = min(config.recovered_features, int(self.table.alive.sum()))
         radius = config.ellipse_sigmas * np.sqrt(np.einsum("kii->ki", search.cov).max(axis=1))
-        found = found[radius <= config.max_radius_px]
+        found = found[recognised | (radius <= config.max_radius_px)]
         fraction = config.lost_fraction if recognised else config.recovered_fraction
         return bool(found.sum() < max(least, fraction * found.size))
 

@@ -241,7 +241,8 @@ class HandOver:
         joint = filter_.belief().map
         assert isinstance(joint, JointMap)
         self.joint = joint
-        sensor.features.become_joint(rays, self.config.submap)
+        search = self.config.search
+        sensor.features.become_joint(rays, self.config.submap, search.max_radius_px / search.ellipse_sigmas)
         return filter_
 
 

@@ -7,7 +7,7 @@ corners say how the camera has turned since and in which direction it went.
 """
 
 from dataclasses import dataclass, replace
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -81,6 +81,15 @@ _LOSS = {
 }
 
 
+class Sighting(NamedTuple):
+    """From where an image was taken, by what it shows of landmarks."""
+
+    world_from_camera: np.ndarray  #: (7,).
+    matches: tuple[np.ndarray, np.ndarray]  #: landmarks (M,) by row, and places (M, 2) like them and like nothing else.
+    agreeing: tuple[np.ndarray, np.ndarray]  #: likewise of those that agree with the pose, (A,) and (A, 2).
+    noise_px: float  #: standard deviation of the places that agree, per axis.
+
+
 @dataclass(frozen=True)
 class Attempt:
     """How far the recognition of one image came."""
@@ -93,6 +102,7 @@ class Attempt:
     confirming: int = 0  #: of these, how many the pose explains.
     prior: PosePrior | None = None  #: the pose, for the heaviest particle's world; None where it was not convincing.
     certain: bool = False  #: whether the image was recognised beyond doubt.
+    sighting: Sighting | None = None  #: the pose, convincing or not; None where none was computed.
 
 
 @final
@@ -223,25 +233,33 @@ class Relocaliser:
         self.camera = sensor.camera
         self.config = config
         self._described: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._looked_at: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def find(self, belief: Belief, image: np.ndarray, near: np.ndarray, last: "LastView | None" = None) -> Attempt:
+    def find(
+        self,
+        belief: Belief,
+        image: np.ndarray,
+        near: np.ndarray,
+        last: "LastView | None" = None,
+        among: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Attempt:
         """Where the camera must be, if enough of the map's landmarks with known depth are seen in an image (H, W) uint8.
 
         Their appearances are predicted from a pose near by (7,), the last trusted one; `last` is the image from there.
+        It is looked for `among` other landmarks, rows (K,) and places in the world (K, 3), where these are given.
         """
         config, camera = self.config, self.camera
-        rows, points = self.known_landmarks(belief)
+        rows, points = self.known_landmarks(belief) if among is None else among
         attempt = Attempt(rows.size)
         if rows.size < (config.min_inliers if last is None else config.min_inliers_with_last_view):
             return attempt
-        px = image_corners(self.sensor, image, config, BORDER_PX).px
+        px, descriptors = self.corners(image)
         attempt = replace(attempt, corners=px.shape[0])
         if px.shape[0] < config.min_inliers:
             return attempt
 
         # Landmarks as they should look from near by are matched with the corners; and so is the last view.
         candidates = Candidates(image, rows, points, px)
-        descriptors = describe_corners(self.sensor, image, px)
         products = similarities(self.describe_landmarks(candidates, near), descriptors)
         distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
@@ -249,6 +267,7 @@ class Relocaliser:
         again = None if last is None else last.match(descriptors, px, points)
         view = None if again is None else again[1]
         attempt = replace(attempt, matches=pairs[0].size, matched=0 if again is None else int(again[0].size))
+        first = rows[pairs[0]], px[pairs[1]]
 
         # A pose that most of them agree with, and then all that is seen around it.
         rough = self._consensus(points[pairs[0]], self.refine_px(candidates, pairs, near), view, belief.rng)
@@ -256,7 +275,7 @@ class Relocaliser:
             return attempt
         if last is not None and again is not None:
             view = last.refine_px(image, *again, rough)
-        best, places = None, px[:0]
+        best, places, best_pairs = None, px[:0], pairs[0][:0]
         for _ in range(MAX_ROUNDS):
             # Few landmarks in one part of the image determine a pose that is right for them alone; from there it has
             # to reach their neighbours first.
@@ -265,21 +284,30 @@ class Relocaliser:
             found = self._refined(rough, points[pairs[0]], at, view)
             if found is None or (best is not None and found.inliers.sum() <= best.inliers.sum()):
                 break
-            best, places, rough = found, at, found.world_from_camera
+            best, places, best_pairs, rough = found, at, pairs[0], found.world_from_camera
         if best is None:
             return attempt
 
         agreeing, confirming = int(best.inliers.sum()), 0
         if view is not None:
             confirming = int((squared_distances(camera, best.world_from_camera[None], view) <= GATE).sum())
-        attempt = replace(attempt, agreeing=agreeing, confirming=confirming)
+        noise = max(best.rms_px, self.sensor.config.noise_px)
+        seen = rows[best_pairs][best.inliers], places[best.inliers]
+        sighting = Sighting(best.world_from_camera, first, seen, noise)
+        attempt = replace(attempt, agreeing=agreeing, confirming=confirming, sighting=sighting)
         confirmed = is_confirmed(agreeing, confirming, attempt.matched, config)
         if not (confirmed or is_convincing(best, places, camera.width, config)):
             return attempt
-        noise = config.std_inflation * max(best.rms_px, self.sensor.config.noise_px)
-        cov = gaussian.symmetrise(noise**2 * np.linalg.inv(best.information))
+        cov = gaussian.symmetrise((config.std_inflation * noise) ** 2 * np.linalg.inv(best.information))
         certain = confirmed or agreeing >= config.certain_inliers
         return replace(attempt, prior=PosePrior(best.world_from_camera, cov), certain=certain)
+
+    def corners(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The best corners (K, 2) of an image and their descriptors (S, K, d), kept for when it is looked at again."""
+        if self._looked_at is None or self._looked_at[0] is not image:
+            px = image_corners(self.sensor, image, self.config, BORDER_PX).px
+            self._looked_at = image, px, describe_corners(self.sensor, image, px)
+        return self._looked_at[1:]
 
     def known_landmarks(self, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         """Rows (K,) of the living features whose depth is known, and where they are (K, 3)."""
@@ -329,6 +357,13 @@ class Relocaliser:
         descriptors = self.sensor.descriptor.describe_windows(patches, size, angle)
         self._described = *asked, descriptors
         return descriptors
+
+    def describe_as_first_seen(self, rows: np.ndarray) -> np.ndarray:
+        """Descriptors (L, d) of landmarks as they looked at first."""
+        patches = self.sensor.table.first_patch[rows]
+        return self.sensor.descriptor.describe_windows(
+            patches, np.full(rows.size, WINDOW_SCALE_PX), np.zeros(rows.size)
+        )
 
     def refine_px(
         self, candidates: Candidates, pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray

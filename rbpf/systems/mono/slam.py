@@ -19,7 +19,7 @@ import numpy as np
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Conditional, MotionModel, Records, Sensor
-from rbpf.core.particles import mixture_estimate
+from rbpf.core.particles import Estimate, mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.landmark_map import LandmarkMap
@@ -41,6 +41,7 @@ from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
 from rbpf.systems.mono.joint import HandOver
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture, world_of
+from rbpf.systems.mono.places import Places
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
 from rbpf.systems.mono.self_calibration import NUMBERS
 from rbpf.systems.mono.unknown_start import UnknownStart
@@ -65,6 +66,9 @@ LINE_SIGMAS = 3.0
 LOST = "the camera is lost, its pose is held until the map is seen again"
 FOUND_AGAIN = "the camera is found again"
 FOUND_IN_MAP = "the camera is found in the map"
+COME_BACK = "the camera is back where it was, its way and its map are corrected"
+EXACT = 1e-4
+"""Standard deviation [rad, m] of where a lost camera is in a sub-map that begins where it is."""
 
 
 @final
@@ -168,6 +172,7 @@ class MonoSlam(System):
             self.loss = TrackingLoss(self.sensor, config, known_map.views, known_map.size_m)
         else:
             self.loss = TrackingLoss(self.sensor, config)
+        self.places = Places(self.loss.relocaliser, config.relocalisation)
         is_unknown = points is None and wrapped is None
         self.start = UnknownStart(config, self.features, lambda: self._new_filter(self.features), is_unknown)
         self.gauge: Gauge = "none"
@@ -249,6 +254,14 @@ class MonoSlam(System):
             elif sensor.lost:
                 prior, self.attempt = self.loss.prior(self.filter, measured.image)
                 measured.recognised = self.attempt is not None and self.attempt.certain
+                if self.joint is not None and self.attempt is not None and measured.image is not None:
+                    pose, cov = self.loss.trusted
+                    trusted, sighting = Estimate(pose, cov + self.loss.drift(stamp_ns)), self.attempt.sighting
+                    if self.attempt.prior is not None and sighting is not None:
+                        measured.recognised |= self.places.is_here(self.joint, sighting, trusted)
+                    elif self.places.recover(self.filter, self.joint, measured.image, trusted):
+                        here, measured.recognised = self.joint.world(SE3.identity((self.filter.n,))), True
+                        prior = PosePrior(here, EXACT**2 * np.eye(6), self.config.velocity.start_std())
 
         if prior is not None and self.joint is not None:  # its states are in a frame of its own
             frame_of_states = self.joint.world(SE3.identity((self.filter.n,)))
@@ -311,6 +324,14 @@ class MonoSlam(System):
                 if isinstance(measured, Measurement):
                     self.loss.trust(self.filter, measured.image)
         self.hand_over.hold(self.filter, sensor.lost)
+
+        if self.joint is not None and not sensor.bad_frames:
+            image, used = (measured.image, measured.used) if isinstance(measured, Measurement) else (None, measured)
+            if self.places.come_back(self.filter, self.joint, image, used):
+                messages.append(COME_BACK)
+                self.loss.trust(self.filter, image)
+                estimate = self.joint.estimate(self.filter.particles)
+                pose, cov = estimate.mean, estimate.cov
 
         # 8. How it stands.
         if sensor.lost and not was_lost:
