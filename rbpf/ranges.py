@@ -9,13 +9,12 @@ Every number has a range: where none is declared, no number is infinite or large
 """
 
 import math
+import numbers
 import os
 from dataclasses import dataclass, field, fields
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
-
-import numpy as np
 
 from rbpf.errors import InputError
 
@@ -131,10 +130,10 @@ def _expected(hint: Any, value: Any, allowed: Range) -> str | None:
     if hint is NoneType:
         return None if value is None else "none"
     if hint is bool:
-        return None if isinstance(value, bool | np.bool_) else "true or false"
+        return None if isinstance(value, bool) or getattr(value, "dtype", None) == bool else "true or false"
     if hint in (int, float):
-        kinds_ = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
-        fits = isinstance(value, kinds_) and not isinstance(value, bool)
+        # NumPy's numbers are such numbers, too.
+        fits = isinstance(value, numbers.Integral if hint is int else numbers.Real) and not isinstance(value, bool)
         what = "a whole number, " if hint is int else ""
         return None if fits and allowed.holds(value) else f"{what}{allowed.words()}"
     return None

@@ -24,8 +24,7 @@ from rbpf.ranges import MOST, Range
 
 PROGRAM = "rbpf"
 BAD_INPUT, STOPPED = 2, 130  #: Exit codes; 0 is success, 1 a fault of the program.
-APP = Commands()
-_DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
+APP = Commands("""Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
 
   try it:    rbpf demo
   record:    rbpf simulate desk --out desk
@@ -35,7 +34,7 @@ _DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --h
   check:     rbpf validate RUN --against gtsam; rbpf compare RUN OTHER; rbpf sweep plan.yaml
   machine:   rbpf doctor; eval "$(rbpf completion bash)"
 
-Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C."""
+Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C.""")
 
 
 @APP.add("demo")
@@ -54,10 +53,10 @@ class Demo(Printed):
         RunMono(sequence=images, known_points=known, out=self.out / "run", overwrite=True, json=self.json)()
 
 
-APP.add_group("simulate", SIMULATE)
+APP.kinds["simulate"] = SIMULATE
 APP.add("calibrate")(cameras.Calibrate)
 APP.add("recalibrate")(cameras.Recalibrate)
-APP.add_group("run", RUN)
+APP.kinds["run"] = RUN
 APP.add("report")(judging.Report)
 APP.add("plot")(judging.Plot)
 APP.add("export")(judging.Export)
@@ -97,9 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
         threads = os.environ.get("NUMBA_NUM_THREADS", "1")
         if not (threads.isdecimal() and int(threads) >= 1):
             raise InputError(f"the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got {threads!r}")
-        expanded = repeated(given)
-        APP.require_known(expanded, PROGRAM)
-        APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=expanded)
+        APP.call(repeated(given), PROGRAM)
         sys.stdout.flush()  # so that a broken pipe is noticed here
     except InputError as error:
         say(f"{PROGRAM}: {error}")

@@ -3,69 +3,78 @@
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from difflib import get_close_matches
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_type_hints
 
 import tyro
-from tyro.extras import SubcommandApp
 
 from rbpf.errors import InputError
+from rbpf.ranges import SettingError, check_ranges
 
 Command = TypeVar("Command", bound=Callable[[], None])
 
 
-class Commands(SubcommandApp):
+class Commands:
     """Commands, and groups of them, by name; `first` is called before each command of the group."""
 
-    def __init__(self, help: str | None = None, first: Callable[[], object] | None = None) -> None:
-        super().__init__()
-        self.__doc__ = help
+    def __init__(self, help: str, first: Callable[[], object] | None = None) -> None:
         self.kinds: dict[str, Commands | type[Any]] = {}
-        self._first = first
+        self._help, self._first = help, first
 
     def add(self, name: str) -> Callable[[type[Command]], type[Command]]:
         """Makes a dataclass a command of this name: its fields are the options, its call is what the command does."""
 
         def added(kind: type[Command]) -> type[Command]:
-            def called(options: Any) -> None:
-                if self._first is not None:
-                    self._first()
-                options()
-
-            called.__doc__ = kind.__doc__
-            called.__annotations__["options"] = Annotated[kind, tyro.conf.arg(name="")]
             self.kinds[name] = kind
-            self.command(name=name)(called)
             return kind
 
         return added
 
-    def add_group(self, name: str, group: "Commands") -> None:
-        """Makes a group of commands a command of this name."""
-        self.kinds[name] = group
-        self.command(group, name=name)
+    def call(self, arguments: list[str], before: str) -> None:
+        """Calls the command that the arguments name; `before` are the words that led here.
 
-    def require_known(self, arguments: list[str], before: str) -> None:
-        """Refuses the name of a command or of an option that there is not; `before` are the words that led here."""
+        Of a group, or where help on one is asked for, the parser says which commands there are.
+
+        Raises:
+            InputError: there is no such command or option, or a value is out of its range.
+        """
         if not arguments or arguments[0].startswith("-"):
+            tyro.cli(self._parsed(), prog=before, description=self._help, args=arguments)
             return
         name = arguments[0].replace("_", "-")
         if name not in self.kinds:
-            hint = _nearest(name, self.kinds)
-            raise InputError(f"there is no command `{before} {arguments[0]}`: {hint}")
-        group, before = self.kinds[name], f"{before} {name}"
-        if isinstance(group, Commands):
-            group.require_known(arguments[1:], before)
+            raise InputError(f"there is no command `{before} {arguments[0]}`: {_nearest(name, self.kinds)}")
+        kind, before, arguments = self.kinds[name], f"{before} {name}", arguments[1:]
+        if isinstance(kind, Commands):
+            kind.call(arguments, before)
             return
-        options, hints = ["--help"], get_type_hints(group, include_extras=True)
-        for field in fields(group):
+        options, hints = ["--help"], get_type_hints(kind, include_extras=True)
+        for field in fields(kind):
             hint, option = hints[field.name], field.name.replace("_", "-")
             if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
                 options += [f"--{option}", f"--no-{option}"] if hint is bool else [f"--{option}"]
-        for word in arguments[1:]:
+        for word in arguments:
             option = word.partition("=")[0].replace("_", "-")
             if len(option) > 2 and option.startswith("--") and option not in options:
-                hint = _nearest(option, options)
-                raise InputError(f"`{before}` has no option {option}: {hint}")
+                raise InputError(f"`{before}` has no option {option}: {_nearest(option, options)}")
+        command = tyro.cli(kind, prog=before, args=arguments)
+        try:
+            check_ranges(command)
+        except SettingError as error:
+            raise InputError(f"--{error.name.replace('_', '-')} {error.words}") from error
+        if self._first is not None:
+            self._first()
+        command()
+
+    def _parsed(self) -> Any:
+        """What the parser takes for the group: it is told a help text, for which it would read the source of `typing`."""
+        parts = []
+        for name, kind in self.kinds.items():
+            if isinstance(kind, Commands):
+                group = tyro.conf.subcommand(name, description=kind._help, constructor_factory=kind._parsed)
+                parts.append(Annotated[Any, group])
+            else:
+                parts.append(Annotated[Any, tyro.conf.subcommand(name, constructor=kind)])
+        return Annotated[Union[tuple(parts)], tyro.conf.arg(help="")]  # noqa: UP007
 
 
 def _nearest(name: str, names: Iterable[str]) -> str:

@@ -6,8 +6,6 @@ from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 import rbpf
 from rbpf.cli.showing import progress, say
 
@@ -62,6 +60,8 @@ def compile_kernels(every: bool = False) -> list[str]:
 
 def _first_calls() -> None:
     """Calls what is compiled at its first call, as the systems call it, on a few numbers."""
+    import numpy as np
+
     from rbpf.motion.stereo_geometry import Matches
     from rbpf.motion.stereo_vo import estimate_motion
     from rbpf.runs.recordings import RobotRecording, filter_recording

@@ -74,5 +74,5 @@ class Completion:
 
         printed = StringIO()
         with suppress(SystemExit), redirect_stdout(printed):
-            APP.cli(prog=PROGRAM, args=["--tyro-print-completion", self.shell])
+            APP.call(["--tyro-print-completion", self.shell], PROGRAM)
         sys.stdout.write(printed.getvalue().replace(*_ZSH))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from rbpf.errors import InputError
-from rbpf.ranges import MOST, Range, SettingError, check_ranges
+from rbpf.ranges import MOST, Range
 
 if TYPE_CHECKING:
     from rbpf.sensors.calibration import Board
@@ -29,12 +29,6 @@ class Printed:
     """Of every command that has a result."""
 
     json: Flag = False  #: print the result as one JSON object on standard output, for programs.
-
-    def __post_init__(self) -> None:
-        try:
-            check_ranges(self)
-        except SettingError as error:
-            raise InputError(f"--{error.name.replace('_', '-')} {error.words}") from error
 
 
 def given_board(size: str | None, square_m: float | None) -> "Board | None":
