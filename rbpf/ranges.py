@@ -130,7 +130,10 @@ def _expected(hint: Any, value: Any, allowed: Range) -> str | None:
     if hint is NoneType:
         return None if value is None else "none"
     if hint is bool:
-        return None if isinstance(value, bool) or getattr(value, "dtype", None) == bool else "true or false"
+        boolean = (
+            isinstance(value, bool) or str(getattr(value, "dtype", "")) == "bool"
+        )  # NumPy's, which is not imported
+        return None if boolean else "true or false"
     if hint in (int, float):
         # NumPy's numbers are such numbers, too.
         fits = isinstance(value, numbers.Integral if hint is int else numbers.Real) and not isinstance(value, bool)

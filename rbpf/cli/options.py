@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import tyro
 
@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
-# What is None unless it is given: the help says in words what that means.
-Whole = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
-Real = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+# What is None unless it is given: the help says in words what that means. Of `int | None` the parser would ask typeguard,
+# whose import takes longer than NumPy's.
+Whole = Annotated[Optional[int], tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+Real = Annotated[Optional[float], tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 WholeCount = Annotated[Whole, Range(ge=1, le=MOST)]
 RealPositive = Annotated[Real, Range(gt=0.0)]
-Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
-Where = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+Text = Annotated[Optional[str], tyro.conf.arg(metavar="STR", help_behavior_hint="")]
+Where = Annotated[Optional[Path], tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 MOST_PX = 1 << 15  #: Of a side of an image.
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
 
 import tyro
 
@@ -52,7 +52,7 @@ class RunOptions(Printed):
     seed: Annotated[Whole, Range(ge=0, le=2**63 - 1)] = None
     config: Where = None  #: YAML file of settings, such as a former run's config.yaml; by default the system's own.
     #: a setting as key=value, such as resampling.scheme=residual; may be given several times.
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    set: tyro.conf.UseAppendAction[tuple] = ()
     resume: Flag = False  #: go on from the checkpoint in the results' folder, if there is one.
     overwrite: Flag = False  #: write over the run that lies in the results' folder.
     threads: Annotated[Whole, Range(ge=1, le=4096)] = None  #: threads of the kernels; by default all.
@@ -116,7 +116,7 @@ class RunRangeBearing(PartOptions):
     particles: WholeCount = None  #: number of particles; by default 100, or as in --config.
     #: landmarks named by the log, or by maximum likelihood; by default known, or as in --config.
     association: Annotated[
-        Literal["known", "ml"] | None, tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
+        Optional[Literal["known", "ml"]], tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
     ] = None
     batch: bool = True  #: also solve for the batch optimum with GTSAM.
 
@@ -218,7 +218,7 @@ class RunStereo(ImageRunOptions):
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PAIRS")]
     particles: WholeCount = None  #: number of particles; by default 400, or as in --config.
     #: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default 6, or as in --config.
-    dof: Annotated[Literal[3, 6] | None, tyro.conf.arg(metavar="{3,6}", help_behavior_hint="")] = None
+    dof: Annotated[Optional[Literal[3, 6]], tyro.conf.arg(metavar="{3,6}", help_behavior_hint="")] = None
 
     def __call__(self) -> None:
         from rbpf.runs.recordings import StereoRecording
@@ -282,10 +282,10 @@ def _run(
     """
     from rbpf.runs.files import holds_run, numbered, own_folder
     from rbpf.runs.recordings import filter_recording
-    from rbpf.validation.finish import finish_run
-    from rbpf.validation.report.live import require_rerun, viewer
 
     if options.view or made.get("rerun") is not None:
+        from rbpf.validation.report.live import require_rerun, viewer
+
         require_rerun()
     # Threads as asked for, and the folder for the results, which nobody else writes to.
     if options.resume and options.overwrite:
@@ -311,6 +311,9 @@ def _run(
             if view is not None:
                 view.finish(run)
         filtered(run)
+        # Not before the first frame: it takes as long to import as everything above.
+        from rbpf.validation.finish import finish_run
+
         solving = bar("batch")
         made |= {"on_frame": bar("drawing"), "on_iteration": lambda count, _error: solving(count, None)}
         try:

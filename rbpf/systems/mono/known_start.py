@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
 
 from rbpf import gaussian
 from rbpf.core.diagnostics import chi_square_quantile
@@ -132,6 +131,8 @@ def constellation_records(
     first, and the covariance is taken there. `cov_frame` (6, 6) is that of the points' frame around where the resection
     puts it.
     """
+    from scipy.optimize import least_squares  # takes long to import
+
     fit = _FirstImage(camera, start, cov_frame, isinstance(group, Constellation))
     x = least_squares(fit.residual, np.zeros(fit.size), fit.jacobian, method="lm").x
     pose, local = fit.split(x)
