@@ -12,6 +12,8 @@ from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_tex
 
 DEEPEST = 20  #: Lists and mappings within each other.
 MOST_BYTES = 1 << 20  #: Settings and calibrations are a few kilobytes.
+#: That of libyaml, in a tenth of the time, where PyYAML was built with it.
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -99,14 +101,14 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
         # Before anything is built: a few nested aliases stand for more values than memory holds, and what is nested
         # thousands deep takes minutes.
         depth = 0
-        for event in yaml.parse(text, yaml.SafeLoader):
+        for event in yaml.parse(text, _LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             line = event.start_mark.line + 1 if event.start_mark else 1
             if depth > DEEPEST:
                 raise line_error(path, line, f"expected values, found more than {DEEPEST} nested lists or mappings")
             if isinstance(event, yaml.AliasEvent):
                 raise line_error(path, line, "found an alias (*name): write the values out")
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        node = yaml.compose(text, Loader=_LOADER)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise line_error(path, line, f"expected YAML, found a syntax error ({error.problem})") from None

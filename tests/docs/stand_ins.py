@@ -34,8 +34,13 @@ SHORTER = {
 }
 """Added to a command that would render or simulate for minutes."""
 
-SHORTER_OF_PAGE = {"docs/how_to/datasets.md": {("run",): ["--no-batch", "--no-video"]}}
-"""On a page about something else."""
+FEW = {
+    ("run", "mono"): ["--particles=10", "--no-batch", "--no-video"],
+    ("run", "stereo"): ["--particles=50", "--no-batch", "--no-video"],
+    ("run", "range-bearing"): ["--particles=20", "--no-batch"],
+}
+WHOLE = {"README.md", "docs/how_to/compare.md"}
+"""Added on all pages but these, which show what a run leaves, or use it: tests/cli has runs with everything."""
 
 LEFT_OUT = {("sweep",): "--scheduler"}
 """An option with its value: tests/validation/test_sweep.py starts a cluster."""
@@ -194,9 +199,10 @@ def shortened(arguments: list[str], page: str = "") -> list[str]:
         if tuple(arguments[: len(start)]) == start and option in arguments:
             at = arguments.index(option)
             arguments = arguments[:at] + arguments[at + 2 :]
-    for start, more in (SHORTER | SHORTER_OF_PAGE.get(page, {})).items():
+    given = {word.partition("=")[0] for word in arguments}
+    for start, more in (SHORTER | ({} if page in WHOLE else FEW)).items():
         if tuple(arguments[: len(start)]) == start:
-            arguments = arguments + more
+            arguments = arguments + [word for word in more if word.partition("=")[0] not in given]
     return arguments
 
 
