@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.asked import verdict
 from benchmarks.gate import regressions, write_baseline
 from benchmarks.machine import description
 from benchmarks.rows import Row, Settings, SkippedError
@@ -17,6 +18,7 @@ from benchmarks.rows import Row, Settings, SkippedError
 FOLDER = Path(__file__).parent
 BASELINE = FOLDER / "baseline.json"
 NAMES = (
+    "start_up",
     "small_update",
     "many_particles",
     "map_size",
@@ -78,12 +80,11 @@ def show(rows: list[Row], machine: dict[str, object]) -> None:
     """The table, then the notes."""
     console = Console(width=150 if not sys.stdout.isatty() else None)
     table = Table(title=", ".join(f"{key} {value}" for key, value in machine.items()))
-    for heading in ("benchmark", "figure", "baseline", "ratio", "aim", ""):
+    for heading in ("benchmark", "figure", "floor", "ratio", "asked", "goal", ""):
         table.add_column(heading)
     for row in rows:
-        met = {True: "met", False: "MISSED", None: ""}[row.met]
         against = f"{row.baseline_figure:.4g} {row.unit}: {row.baseline}"
-        table.add_row(row.name, f"{row.figure:.4g} {row.unit}", against, f"{row.ratio:.3g}", row.aim, met)
+        table.add_row(row.name, f"{row.figure:.4g} {row.unit}", against, f"{row.ratio:.3g}", *verdict(row))
     console.print(table)
     for row in rows:
         console.print(f"{row.name}: {row.notes}", highlight=False, markup=False)

@@ -18,7 +18,7 @@ from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import Systematic
 from rbpf.lie import Euclidean
 
-SIZES = (1_000, 10_000)
+SIZES = (100, 1_000, 10_000, 100_000)
 BEACONS = np.array([[0.0, -10.0], [10.0, 0.0]])
 STD_WALK, STD_RANGE, STD_START = 0.3, 0.2, 1.0
 STEPS = 40

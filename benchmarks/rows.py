@@ -36,10 +36,9 @@ class Row:
     Attributes:
         name: unique, the key in the committed baseline.
         figure: the measured value, in `unit`.
-        baseline: what it is compared with, in words;  baseline_figure: its value, in the same unit.
+        baseline: what it is compared with, a peer or a floor, in words;  baseline_figure: its value, in the same unit.
         ratio: what the gate compares: it does not depend on how fast the machine is.
         higher: whether a higher ratio is better.
-        aim: what is asked for, in words;  met: whether it is, None where nothing is asked for.
         tolerance: relative change of the ratio that the gate lets pass.
         optional: whether a machine without the peer may leave it out.
     """
@@ -51,8 +50,6 @@ class Row:
     baseline_figure: float
     ratio: float
     higher: bool = True
-    aim: str = ""
-    met: bool | None = None
     notes: str = ""
     tolerance: float = 0.35
     optional: bool = False

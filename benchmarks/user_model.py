@@ -7,7 +7,6 @@ from benchmarks.worlds import Run, planar
 from rbpf.core.models import ObservationModel
 
 K, M = 30, 300
-AIM = 10.0
 CALLS = {"kernel": 5}
 
 
@@ -52,7 +51,5 @@ def figure(n: int, turns: int) -> Row:
         fast * 1e3,
         slow / fast,
         higher=False,
-        aim=f"<= {AIM:g}x",
-        met=slow / fast <= AIM,
         notes=f"{times['user'].spread}; {user.diversity.text()}",
     )
