@@ -21,14 +21,16 @@ DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Long statistics, studies and recordings run lines a thousand times that other tests run, too.
+    """Long statistics, studies, recordings, pages and damaged files run lines a thousand times that other tests run, too.
 
     Counting these would take a third of their time; what they alone run counts as not run.
     """
     if config.pluginmanager.hasplugin("pytest_cov"):
         for item in items:
             folder = item.path.relative_to(Path(__file__).parent).parts[0]
-            if folder in {"exactness", "examples", "recordings"} and item.get_closest_marker("slow"):
+            if folder in {"docs", "exactness", "examples", "properties", "recordings"} and item.get_closest_marker(
+                "slow"
+            ):
                 item.add_marker("no_cover")
 
 

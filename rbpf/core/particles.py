@@ -178,6 +178,8 @@ class Proposed:
         noise = rng.standard_normal((ancestors.size, self.mean.shape[1]))
         if balance is not None:
             noise = balanced(noise, *balance)
+        if self.root.shape[0] == 1 and not self.mean.any() and np.array_equal(self.root[0], np.eye(noise.shape[1])):
+            return noise, np.zeros(noise.shape[0])  # from the prior
         root = take(self.root, ancestors)
         u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)

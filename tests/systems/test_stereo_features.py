@@ -84,7 +84,7 @@ def test_the_prior_proposal(log, kind):
     assert np.isfinite(run.log["log_evidence"]).all() == (kind == "outliers")
 
 
-def test_nees_of_the_pose(log):
+def test_nees_of_the_pose():
     """Per degree of freedom, 12 recordings of 20 pairs: where each pixel counts once it is 1, in S05 1.4 and more.
 
     With a joint map 50 particles are enough.
@@ -95,9 +95,9 @@ def test_nees_of_the_pose(log):
         twice, proposal=ProposalConfig("ekf"), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
     )
     joint = replace(CONFIG, particles=50, map=MapConfig(kind="joint"))
-    nees = []
+    nees, logs = [], [simulated(20, seed) for seed in range(12)]
     for config in (once, twice, joint):
-        runs = [filtered(simulated(20, seed), config) for seed in range(12)]
+        runs = [filtered(log, config) for log in logs]
         whitened = [whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]) for run in runs]
         nees.append(np.mean([one.nees.mean() for one in whitened]) / 6)
     assert 0.75 < nees[0] < 1.25  # 1.03 with a standard error of 0.09
