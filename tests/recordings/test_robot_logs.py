@@ -27,7 +27,7 @@ def mean_scores(path, seeds, *settings):
 
 
 def test_planar_simulated_log(data_dir):
-    path, _, landmarks, _ = mean_scores(data_dir / "mrpt_kf_slam_2d", 1, "map=particles")
+    path, _, landmarks, _ = mean_scores(data_dir / "mrpt_kf_slam_2d", 3, "map=particles")
     assert path <= 0.0060
     assert landmarks <= 0.0045
 
@@ -53,17 +53,17 @@ def test_the_refined_proposal_beats_the_bootstrap_one(data_dir):
 
 def test_the_start_re_estimated_halves_the_error_of_a_spatial_simulated_log(data_dir):
     folder = data_dir / "mrpt_kf_slam_6d"
-    path, _, landmarks, _ = mean_scores(folder, 1, "map=particles")
+    path, _, landmarks, _ = mean_scores(folder, 3, "map=particles")
     assert landmarks <= 0.010
     assert path <= 0.020
-    assert landmarks < 0.65 * mean_scores(folder, 1, "map=particles", "anchor_every=0")[2]
+    assert landmarks < 0.65 * mean_scores(folder, 3, "map=particles", "anchor_every=0")[2]
 
 
 def test_robot_with_motion_capture(data_dir):
-    known = mean_scores(data_dir / "mrclam6_robot1", 1, "map=particles")
+    known = mean_scores(data_dir / "mrclam6_robot1", 2, "map=particles")
     assert known[1] <= 0.37
     assert known[3] <= 0.09
-    unknown = mean_scores(data_dir / "mrclam6_robot1", 1, "association=ml")
+    unknown = mean_scores(data_dir / "mrclam6_robot1", 2, "association=ml")
     assert unknown[1] <= 0.25
 
 

@@ -153,7 +153,7 @@ def test_the_intel_research_lab(data_dir: Path):
     """GMapping's own path misses these relations by 0.126 m and 4.1 degrees, the odometry by 7.4 m."""
     folder = data_dir / "laser_intel"
     log, known = read_laser_log(folder / "intel.clf"), read_relations(folder / "intel.relations")
-    slam = LaserSlam(log.scanner, LaserConfig(particles=15))
+    slam = LaserSlam(log.scanner, LaserConfig())
     tracked = [slam.take(scan) for scan in log.frames]
     path = read_tum(folder / "gmapping.tum")
     poses = np.array([each.pose for each in tracked])
