@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.sensors.readers.part import WHOLE
 from rbpf.sensors.readers.robot_log import UNNAMED
+from rbpf.systems.laser.config import LaserConfig
+from rbpf.systems.laser.slam import LaserSlam
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageScreen
 from rbpf.systems.mono.known_map import KnownMap, read_known_map
@@ -32,9 +34,6 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
-
-if TYPE_CHECKING:
-    from rbpf.systems.laser.config import LaserConfig
 
 Sources = dict[str, str | float | bool]  #: What a run reads, by the name that it has in config.yaml.
 
@@ -178,9 +177,7 @@ class LaserRecording:
     #: what it leaves open, and which of its scans.
     options: readers.LaserOptions = field(default_factory=readers.LaserOptions)
 
-    def open(self, config: "LaserConfig") -> Opened:
-        from rbpf.systems.laser.slam import LaserSlam  # the kernels of its grid, which nobody else waits for
-
+    def open(self, config: LaserConfig) -> Opened:
         log = readers.read_laser_log(self.log, self.options)
         return Opened(LaserSlam(log.scanner, config), LogSource(log), log.stamps_ns, None)
 
