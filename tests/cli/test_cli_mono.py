@@ -29,7 +29,7 @@ FILES = {
     "truth.npz", "validation_groundtruth.json", "groundtruth_nees.png",
 }  # fmt: skip
 BATCH = {
-    "batch.tum", "validation_gtsam.json", "gtsam_path.png", "gtsam_nees.png", "gtsam_landmarks.png", "gtsam_map.png"
+    "batch.tum", "validation_gtsam.json", "gtsam_nees.png", "gtsam_landmarks.png", "gtsam_map.png"
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "seed", "ms_per_frame", "frames_tracked", "lost_frames",

@@ -27,7 +27,7 @@ FILES = {
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "trajectory.npz", "truth.npz", "validation_groundtruth.json",
     "groundtruth_nees.png", "checkpoint.npz", "batch.tum", "validation_gtsam.json",
-    "gtsam_path.png", "gtsam_nees.png", "gtsam_landmarks.png", "gtsam_map.png", "observations.csv", "observations_frames.csv",
+    "gtsam_nees.png", "gtsam_landmarks.png", "gtsam_map.png", "observations.csv", "observations_frames.csv",
     "annotated.mp4",
 }  # fmt: skip
 REQUIRED = {

@@ -49,7 +49,7 @@ def draw_beside(runs: Sequence[RunFolder], out: Path, formats: Sequence[str]) ->
 
 
 def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = None) -> list[str]:
-    """Paths, expected NEES, landmarks and map beside the batch posterior, drawn in a world, by default the filter's own.
+    """Expected NEES, landmarks and map beside the batch posterior, drawn in a world, by default the filter's own.
 
     Writes PNG files into the folder and returns their names.
     """
@@ -58,13 +58,7 @@ def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = N
     motions = {which: world.motion(path) for which, path in both.items()}
     paths = {which: path.transformed(motions[which]) for which, path in both.items()}
     views = Views.of("mono" if isinstance(found.optimum.problem, FeatureLog) else "range-bearing", paths["batch"])
-    figure, shown = views.axes(f"{name}: paths in {world.name}")
-    for axes, plane in shown:
-        for which, path in paths.items():
-            axes.plot(*path.positions[:, plane].T, "-", color=COLOURS[which], lw=1.2, label=which)
-            axes.plot(*path.positions[0, plane], "o", color=COLOURS[which], ms=4)
-    shown[0][0].legend(fontsize="small")
-    figures = {"gtsam_path.png": figure}
+    figures: dict[str, Any] = {}
     cov, cov_batch, delta = found.pose_errors()
     if len(cov):
         roots, ranks = inverse_roots(cov)
