@@ -30,12 +30,12 @@ from rbpf.motion.constant_velocity import MarginalVelocity
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraModel, CameraRay
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
+from rbpf.systems.mono.adjustment import FirstFrames
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.known_start import world_of
 from rbpf.systems.mono.self_calibration import NUMBERS, adjusted, begin
-from rbpf.systems.mono.unknown_start import FirstFrames
 from rbpf.systems.system import Revision
 
 LINEARISATIONS = 3

@@ -20,10 +20,7 @@ from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.sensors.feature_log import KnownPoints
-from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.known_start import world_of
-from rbpf.systems.mono.unknown_start import (
+from rbpf.systems.mono.adjustment import (
     MIN_FRAMES,
     FirstFrames,
     Known,
@@ -34,6 +31,9 @@ from rbpf.systems.mono.unknown_start import (
     structure_of,
     tangents,
 )
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.systems.mono.known_start import world_of
 from rbpf.systems.system import Revision
 
 NUMBERS = "fx", "fy", "k1", "k2"

@@ -3,78 +3,44 @@
 Before a camera has moved, nothing tells the depth of what it sees, and of a scene that is nearly flat two shapes with
 two motions look alike. Particles decide too early: each image alone tells little, those that happen to fit it survive,
 and what later images say comes too late. All first images together tell it well. So while depths are unknown, the
-frames until now are adjusted in one piece now and then, whole paths are drawn from the Gaussian about the optimum, and
-each particle's map is that of its path (a block move: A. Doucet, M. Briers and S. Sénécal, 2006).
-
-The adjustment: a feature is a direction d, a unit vector, and an inverse distance q, both from the first camera, which
-is the origin: the camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it is. Minimised is, Mathematics
-(start-cost),
-
-    Σ ρ(|z − h(c)|/σ) + ½ Σ ((q − q̄)/σ_q)² + ½ Σ |(v_k − v_{k−1})/σ_v|² + ½ ((s − 1)/σ_s)²,
-
-with Cauchy's loss ρ, the prior of an inverse distance, mean velocities v between frames that walk as in E06 (4) (their
-differences share something with the next ones, which is not written here), and the scale s = Σ q / (F q̄), which no
-image tells: it is held.
+frames until now are adjusted in one piece now and then ({py:mod}`rbpf.systems.mono.adjustment`), whole paths are drawn
+from the Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
+S. Sénécal, 2006).
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
-from scipy.special import exp1
 
-from rbpf.core.checkpoint import integers, numbers, poses, read, split
+from rbpf.core.checkpoint import integers, numbers, poses, read
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.camera.points import clamp_depth
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.systems.mono.active_search import CAUCHY_SCALE
+from rbpf.systems.mono.adjustment import (
+    MIN_FRAMES,
+    FirstFrames,
+    Optimum,
+    Structure,
+    Window,
+    between,
+    gathered,
+    optimum,
+    structure_of,
+)
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.system import Revision
-
-MIN_VIEWS = 3
-"""Frames that must see a feature for it to take part."""
-
-MIN_FRAMES = 3
-
-MIN_SHARED = 6
-"""Features that two frames in a row must have in common: three determine a pose, and half of them may be wrong."""
 
 DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
     "camera sideways at first, or start with known points"
 )
 """Of a start without known points that ended before depths were known."""
-
-SCALE_STD = 1e-4
-"""Standard deviation to which the scale is held."""
-
-MAX_STEPS, MIN_GAIN = 30, 1e-4
-"""Steps of the adjustment at most, and the fraction of the cost that ends it."""
-
-_HALF = CAUCHY_SCALE**2 / 2.0
-_BEYOND = float(np.exp(_HALF) * exp1(_HALF))
-LOSS_INFORMATION = (1.0 - _HALF * _BEYOND) ** 2 / ((_BEYOND + _HALF * _BEYOND - 1.0) * _HALF * _BEYOND)
-"""How many times Gauss's and Newton's information with the loss's weights w is known where noise is Gaussian: 1.27.
-
-The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), the weights' is E w of it. In two dimensions, with
-a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
-"""
-
-MIN_STD_VELOCITY = 1e-6
-"""A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s."""
-
-DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
-"""Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""
 
 TINY = np.finfo(float).tiny
 
@@ -86,14 +52,6 @@ _LAST = {
     "direction": numbers("features", 3),
     "inverse": numbers("features"),
 }
-_FRAMES = {
-    "stamps_ns": integers("frames"),
-    "counts": integers("frames", least=0),
-    "names": integers("seen", least=0),
-    "px": numbers("seen", 2),
-    "cov_px": numbers("seen", 2, 2),
-    "path": poses("frames"),
-}
 
 
 @dataclass(frozen=True)
@@ -104,45 +62,6 @@ class Resampled:
     revision: Revision  #: of all T frames so far: means over the particles' paths.
     path: np.ndarray  #: (T, 7) of the heaviest particle.
     frame_of: np.ndarray  #: (F,) in which of the frames each of F features was seen first, in the order of their names.
-
-
-@final
-class FirstFrames:
-    """What was seen in the first frames, and from where (7,) as far as is known, in the particles' world."""
-
-    def __init__(self) -> None:
-        self.seen: list[FeatureFrame] = []
-        self.path: list[np.ndarray] = []
-
-    def frame_of(self) -> np.ndarray:
-        """In which of the frames each of F features was seen first (F,), in the order of their names."""
-        _, first = np.unique(np.concatenate([frame.landmarks for frame in self.seen]), return_index=True)
-        return np.repeat(np.arange(len(self.seen)), [frame.landmarks.size for frame in self.seen])[first]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint; nothing where there are none."""
-        if not self.seen:
-            return {}
-        return {
-            "stamps_ns": np.array([frame.stamp_ns for frame in self.seen], dtype=np.int64),
-            "counts": np.array([frame.landmarks.size for frame in self.seen], dtype=np.int64),
-            "names": np.concatenate([frame.landmarks for frame in self.seen]),
-            "px": np.concatenate([frame.z for frame in self.seen]),
-            "cov_px": np.concatenate([frame.cov_z for frame in self.seen]),
-            "path": np.array(self.path),
-        }
-
-    @classmethod
-    def restored(cls, arrays: dict[str, np.ndarray], prefix: str) -> "FirstFrames":
-        """The inverse of `arrays`, whose names begin with a prefix; errors as `rbpf.core.checkpoint.read`."""
-        out = cls()
-        if f"{prefix}stamps_ns" in arrays:
-            held = read(arrays, _FRAMES, prefix)
-            columns = held["names"], held["px"], held["cov_px"]
-            parts = zip(*(split(column, held["counts"].tolist(), prefix[:-1]) for column in columns), strict=True)
-            out.seen = [FeatureFrame(t, *part) for t, part in zip(held["stamps_ns"].tolist(), parts, strict=True)]
-            out.path = list(held["path"])
-        return out
 
 
 @final
@@ -306,288 +225,3 @@ class UnknownStart:
         landmark_map.remove(landmark_map.ids[~old.belief().map.holds(landmark_map.ids)])
         new.sensors = old.sensors
         return new
-
-
-def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Poses (W, n, 7) of paths (n, T, 7) at other times (W,): on the way between two, or the first or the last."""
-    moved = SE3.log(SE3.between(paths[:, :-1], paths[:, 1:]))
-    k = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, times.size - 2)
-    fraction = np.clip((wanted - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
-    return np.swapaxes(SE3.retract(paths[:, k], fraction[:, None] * moved[:, k]), 0, 1)
-
-
-@dataclass(frozen=True)
-class Known:
-    """Which M features (M,) are at known positions (M, 3), with whiteners (M, 3, 3) of their errors."""
-
-    feature: np.ndarray
-    positions: np.ndarray
-    whitener: np.ndarray
-
-
-@dataclass(frozen=True)
-class Window:
-    """What T frames saw of F features, K observations in all."""
-
-    camera: Pinhole  #: of the images.
-    stamps_ns: np.ndarray  #: (T,) of the frames.
-    frame: np.ndarray  #: (K,) in which of them.
-    feature: np.ndarray  #: (K,) which one; no feature twice in a frame.
-    px: np.ndarray  #: (K, 2) where.
-    noise_px: float  #: standard deviation, per axis.
-    known: Known | None = None  #: those of the features whose place is known.
-    tuning: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  #: (k, k) information of the camera's `tuned`.
-
-    def is_connected(self) -> bool:
-        """Whether every two frames in a row have enough features in common."""
-        sees = np.zeros((self.stamps_ns.size, self.feature.max(initial=-1) + 1), dtype=bool)
-        sees[self.frame, self.feature] = True
-        return bool(((sees[1:] & sees[:-1]).sum(axis=1) >= MIN_SHARED).all())
-
-
-def gathered(
-    frames: Sequence[FeatureFrame], features: FeatureSensor, held: Callable[[np.ndarray], np.ndarray], most: int
-) -> tuple[np.ndarray, np.ndarray, Window]:
-    """Numbers (T,) of `most` frames to adjust, names (F,) of features that are `held` and seen often enough, what was seen.
-
-    The frames see something, with a stamp of their own, the first and the last among them.
-    """
-    stamps = np.array([frame.stamp_ns for frame in frames])
-    fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
-    steps = np.flatnonzero(fresh)
-    steps = steps[np.linspace(0, steps.size - 1, min(most, steps.size)).round().astype(np.int64)]
-    chosen = [frames[t] for t in steps.tolist()]
-    none = [np.zeros(0, dtype=np.int64)]
-    seen_by = np.concatenate(none + [frame.landmarks for frame in chosen])
-    names, views = np.unique(seen_by[held(seen_by)], return_counts=True)
-    names = names[views >= MIN_VIEWS]
-    parts = [np.isin(frame.landmarks, names) for frame in chosen]
-    return (
-        steps,
-        names,
-        Window(
-            features.camera,
-            stamps[steps],
-            np.repeat(np.arange(len(chosen)), [part.sum() for part in parts]),
-            np.searchsorted(names, np.concatenate(none + [f.landmarks[p] for f, p in zip(chosen, parts, strict=True)])),
-            np.concatenate([np.zeros((0, 2)), *(f.z[p] for f, p in zip(chosen, parts, strict=True))]),
-            float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z] or [1.0]))),
-        ),
-    )
-
-
-@final
-@dataclass(frozen=True)
-class Structure:
-    """Paths and features."""
-
-    path: np.ndarray  #: (T, 7) world_from_camera; the first one is the identity.
-    direction: np.ndarray  #: (F, 3) unit vectors.
-    inverse: np.ndarray  #: (F,) 1/m.
-    tuned: np.ndarray = field(default_factory=lambda: np.zeros(0))  #: (k,) of the camera, where it is not known.
-    frame: np.ndarray | None = None  #: (7,) first camera_from_known of the known points' frame, where there are some.
-
-    def moved(self, step: np.ndarray) -> "Structure":
-        """By a step (6 (T − 1) + 3 F + k + 6,) in the right charts of the poses, the tangent planes and 1/m."""
-        free = 6 * (self.path.shape[0] - 1)
-        end = free + 3 * self.inverse.size
-        path, of_features = self.path.copy(), step[free:end].reshape(-1, 3)
-        tuned, left = self.tuned + step[end : end + self.tuned.size], step[end + self.tuned.size :]
-        frame = None if self.frame is None else SE3.retract(self.frame, left)
-        path[1:] = SE3.retract(path[1:], step[:free].reshape(-1, 6))
-        direction = self.direction + (tangents(self.direction) @ of_features[:, :2, None])[..., 0]
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        return Structure(path, direction, self.inverse + of_features[:, 2], tuned, frame)
-
-
-@final
-@dataclass(frozen=True)
-class Optimum:
-    """A minimum."""
-
-    structure: Structure  #: there.
-    cost: float  #: the sum above.
-    #: (6 (T − 1) + 3 F + k + 6, …) of the step from it: its inverse is the covariance of the minimum's error.
-    information: np.ndarray
-
-    @cached_property
-    def _factor(self) -> np.ndarray:
-        return np.asarray(cholesky(self.information, lower=True))
-
-    def paths(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Paths (n, T, 7) drawn from the Gaussian about the minimum (P. Laplace's approximation)."""
-        whitened = rng.standard_normal((self.information.shape[0], n))
-        step = solve_triangular(self._factor.T, whitened, lower=False).T
-        path = self.structure.path
-        out = np.broadcast_to(path, (n, *path.shape)).copy()
-        out[:, 1:] = SE3.retract(path[1:], step[:, : 6 * (path.shape[0] - 1)].reshape(n, -1, 6))
-        return out
-
-    def std_inverse(self) -> np.ndarray:
-        """Standard deviations (F,) of the inverse distances, 1/m."""
-        count = self.structure.inverse.size
-        rows = np.arange(count) * 3 + 2 + 6 * (len(self.structure.path) - 1)
-        picked = np.zeros((self.information.shape[0], count))
-        picked[rows, np.arange(count)] = 1.0
-        half = solve_triangular(self._factor, picked, lower=True)
-        return np.asarray(np.sqrt(np.square(half).sum(axis=0)))
-
-
-def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum:
-    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations.
-
-    What is expected before anything is seen, of inverse distances and velocities, is that of the settings.
-    """
-    now, damping = Linearised(seen, config, start), DAMPING
-    for _ in range(MAX_STEPS):
-        information, vector = now.normal_equations()
-        while True:
-            ahead = None
-            with suppress(LinAlgError, ValueError):  # ValueError where it is not finite
-                factor = cho_factor(information + damping * np.diag(np.diag(information)))
-                ahead = Linearised(seen, config, now.at.moved(np.asarray(cho_solve(factor, vector))))
-            if ahead is not None and ahead.cost < now.cost:
-                break
-            damping *= DAMPING_FACTOR
-            if damping > MAX_DAMPING:
-                return Optimum(now.at, now.cost, now.normal_equations(LOSS_INFORMATION)[0])
-        damping /= DAMPING_FACTOR
-        gain, now = now.cost - ahead.cost, ahead
-        if gain < MIN_GAIN * (1.0 + now.cost):
-            break
-    return Optimum(now.at, now.cost, now.normal_equations(LOSS_INFORMATION)[0])
-
-
-@final
-class Linearised:
-    """All residuals at a structure, whitened; their derivatives where they are asked for."""
-
-    def __init__(self, seen: Window, config: MonoConfig, at: Structure) -> None:
-        self.seen, self.rho, self.at = seen, config.inverse_depth, at
-        pose, feature = at.path[seen.frame], seen.feature
-        position = SE3.translation(pose)
-        place = at.direction[feature] + (1.0 - at.inverse[feature, None]) * position
-        self._direction = clamp_depth(SE3.inverse_transform(pose, place))
-        self.camera = seen.camera.tuned(at.tuned) if at.tuned.size else seen.camera
-        self.misfit = (seen.px - self.camera.project(self._direction)) / seen.noise_px
-        squared = np.square(self.misfit).sum(axis=1) / CAUCHY_SCALE**2
-        self.weight = 1.0 / (1.0 + squared)
-        self._interval = np.diff(seen.stamps_ns) * 1e-9
-        self._relative = SE3.between(at.path[:-1], at.path[1:])
-        # Of the first mean velocity and the differences of mean velocities: that over an interval δ is v + w₁/δ with the noise
-        # of E06 (5), so that the difference from the one before has the variance (δ + δ′)/3 of the walk's in a second, and
-        # shares δ/6 with the difference after it.
-        interval, before = self._interval, np.concatenate([[0.0], self._interval[:-1]])
-        walk = np.diag((before + interval) / 3.0) + np.diag(interval[:-1] / 6.0, 1) + np.diag(interval[:-1] / 6.0, -1)
-        cov = np.square(np.maximum(config.velocity.walk_std(), MIN_STD_VELOCITY))[:, None, None] * walk
-        cov[:, 0, 0] += np.square(np.maximum(config.velocity.start_std(), MIN_STD_VELOCITY))
-        self._whitener = np.linalg.inv(np.linalg.cholesky(cov))
-        self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
-        self.prior = (at.inverse - self.rho.mean_per_m) / self.rho.std_per_m
-        # The scale is the known points', or held.
-        self._by_scale = 0.0 if seen.known else 1.0 / (at.inverse.size * self.rho.mean_per_m * SCALE_STD)
-        self.scale = 0.0 if seen.known else float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
-        self.known = np.zeros((0, 3))
-        if seen.known is not None and at.frame is not None:
-            self._places = (at.direction / at.inverse[:, None])[seen.known.feature]
-            self._local = SE3.inverse_transform(at.frame, self._places)
-            self.known = (seen.known.whitener @ (self._local - seen.known.positions)[..., None])[..., 0]
-        quadratic = sum(np.square(part).sum() for part in (self.velocity, self.prior, self.scale, self.known))
-        quadratic += at.tuned @ seen.tuning @ at.tuned
-        self.cost = float(0.5 * CAUCHY_SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
-
-    def _differences(self, velocity: np.ndarray) -> np.ndarray:
-        """The first of T − 1 rows, and from row to row, whitened."""
-        moved = np.concatenate([velocity[:1], np.diff(velocity, axis=0)])
-        return np.einsum("ktj,jk...->tk...", self._whitener, moved)
-
-    def normal_equations(self, loss_information: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss and Newton's: information of the step, what was seen counting so often, and the vector it is solved with."""
-        seen, at, direction = self.seen, self.at, self._direction
-        frames, features = at.path.shape[0], at.inverse.size
-        free = 6 * frames
-        end = free + 3 * features
-        frame = end + at.tuned.size
-        size = frame + (0 if seen.known is None else 6)
-        h, b = np.zeros((size, size)), np.zeros(size)
-        of_poses = h[:free, :free].reshape(frames, 6, frames, 6)
-        of_features = h[free:end, free:end].reshape(features, 3, features, 3)
-        across = h[:free, free:end].reshape(frames, 6, features, 3)
-
-        # Derivatives of what should be seen by the pose (K, 2, 6) and by the feature (K, 2, 3).
-        pose, inverse = at.path[seen.frame], at.inverse[seen.feature, None, None]
-        slope = self.camera.jacobian(direction) / seen.noise_px
-        by_pose = np.concatenate([np.cross(slope, direction[:, None, :]), -inverse * slope], axis=2)
-        turned = slope @ np.swapaxes(SE3.rotation(pose), 1, 2)
-        along = turned @ tangents(at.direction)[seen.feature]
-        by_feature = np.concatenate([along, -turned @ SE3.translation(pose)[:, :, None]], axis=2)
-
-        # What was seen, each observation with its loss's weight.
-        of_pose, of_feature = (np.swapaxes(self.weight[:, None, None] * by, 1, 2) for by in (by_pose, by_feature))
-        each = np.arange(frames), np.arange(features)
-        of_poses[each[0], :, each[0]] = _summed(of_pose @ by_pose, seen.frame, frames)
-        of_features[each[1], :, each[1]] = _summed(of_feature @ by_feature, seen.feature, features)
-        across[seen.frame, :, seen.feature] = of_pose @ by_feature
-        misfit = self.misfit[..., None]
-        b[:free] = _summed((of_pose @ misfit)[..., 0], seen.frame, frames).ravel()
-        b[free:end] = _summed((of_feature @ misfit)[..., 0], seen.feature, features).ravel()
-        if at.tuned.size:
-            by_camera = self.camera.by_tuning(direction) / seen.noise_px
-            of_camera = np.swapaxes(self.weight[:, None, None] * by_camera, 1, 2)
-            h[:free, end:frame] = _summed(of_pose @ by_camera, seen.frame, frames).reshape(free, -1)
-            h[free:end, end:frame] = _summed(of_feature @ by_camera, seen.feature, features).reshape(end - free, -1)
-            h[end:frame, end:frame] = (of_camera @ by_camera).sum(axis=0)
-            b[end:frame] = (of_camera @ misfit)[..., 0].sum(axis=0)
-        h *= loss_information
-        h[free:, :free], h[end:, free:end] = h[:free, free:].T, h[free:end, end:].T
-        h[end:frame, end:frame] += seen.tuning
-        b[end:frame] -= seen.tuning @ at.tuned
-
-        # Velocities between frames; their logarithms' derivatives by the poses to first order in a step.
-        steps = frames - 1
-        by_poses, k = np.zeros((steps, 6, frames, 6)), np.arange(steps)
-        by_poses[k, :, k + 1] = np.eye(6) / self._interval[:, None, None]
-        by_poses[k, :, k] = -SE3.adjoint(SE3.inverse(self._relative)) / self._interval[:, None, None]
-        of_velocity = self._differences(by_poses.reshape(steps, 6, -1)).reshape(6 * steps, -1)
-        h[:free, :free] += of_velocity.T @ of_velocity
-        b[:free] -= of_velocity.T @ self.velocity.ravel()
-
-        # The prior of the inverse distances, and the scale.
-        q = free + 2 + 3 * np.arange(features)
-        h[q, q] += self.rho.std_per_m**-2
-        h[np.ix_(q, q)] += self._by_scale**2
-        b[q] -= self.prior / self.rho.std_per_m + self.scale * self._by_scale
-
-        # The known points, in their own frame.
-        if seen.known is not None and at.frame is not None:
-            rows, q = np.zeros((*self.known.shape, size)), at.inverse[seen.known.feature, None, None]
-            back = np.swapaxes(SE3.rotation(at.frame), 0, 1)
-            place = np.concatenate([tangents(at.direction)[seen.known.feature], -self._places[..., None]], axis=2)
-            for m, feature in enumerate(seen.known.feature.tolist()):
-                rows[m, :, free + 3 * feature : free + 3 * feature + 3] = back @ place[m] / q[m]
-            rows[:, :, frame:] = -SE3.transform_jacobian(self._local)
-            by_all = (seen.known.whitener @ rows).reshape(-1, size)
-            h += by_all.T @ by_all
-            b -= by_all.T @ self.known.ravel()
-        return h[6:, 6:], b[6:]
-
-
-def tangents(direction: np.ndarray) -> np.ndarray:
-    """Two unit vectors (F, 3, 2) across each unit vector (F, 3) and one another."""
-    helper = np.where(np.abs(direction[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(direction, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(direction, first)], axis=-1)
-
-
-def _summed(parts: np.ndarray, row: np.ndarray, count: int) -> np.ndarray:
-    """Sums (count, …) of parts (K, …) by their rows (K,)."""
-    out = np.zeros((count, *parts.shape[1:]))
-    np.add.at(out, row, parts)
-    return out
-
-
-def structure_of(path: np.ndarray, position: np.ndarray) -> Structure:
-    """From poses (T, 7), and homogeneous points (F, 4)."""
-    length = np.linalg.norm(position[:, :3], axis=1, keepdims=True)
-    return Structure(path, position[:, :3] / length, position[:, 3] / length[:, 0])
