@@ -52,14 +52,6 @@ class Constellation(Landmark):
         chart = SE3.right_jacobian(mean)
         return SE3.retract(records.const[:, 0], mean), chart @ gaussian.psd_factor(records.cov[:, 0])
 
-    def jointly(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        """world_from_group (N, 7), covariance (N, 6 + 3M, …) of it, in the right chart, and of the points in the world."""
-        frame, factor = self.frame(records)
-        # T k moves by R transform_jacobian(k) dξ.
-        moved = SE3.rotation(frame)[:, None] @ SE3.transform_jacobian(np.asarray(self.points)) @ factor[:, None]
-        both = np.concatenate([factor, moved.reshape(len(frame), -1, factor.shape[-1])], axis=1)
-        return frame, gaussian.gram(both)
-
     def in_world(self, records: Records) -> np.ndarray:
         """The points (N, M, 3) of one landmark."""
         return SE3.transform(self.frame(records)[0][:, None], np.asarray(self.points))
@@ -106,14 +98,6 @@ class UncertainConstellation(Landmark):
     def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         frame, _, _, cov = self._fit(records)
         return frame, gaussian.psd_factor(cov)
-
-    def jointly(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        """As `Constellation.jointly`."""
-        frame, slope, cov_fit, _ = self._fit(records)
-        both = np.concatenate([slope, np.broadcast_to(np.eye(self.dim), (len(frame), self.dim, self.dim))], axis=1)
-        cov = both @ records.cov[:, 0] @ np.swapaxes(both, 1, 2)
-        cov[:, :6, :6] += cov_fit
-        return frame, gaussian.symmetrise(cov)
 
     def in_world(self, records: Records) -> np.ndarray:
         return self._points_of(records.mean[:, 0])

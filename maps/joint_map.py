@@ -121,25 +121,16 @@ class JointMap(Map):
         self._given_ids = self.leaving = self._returning = self._observed = np.zeros(0, dtype=np.int64)
         self._begin_submap()
 
-    def begin_at(self, world: np.ndarray, substate: np.ndarray, ids: np.ndarray, cov: np.ndarray) -> None:
-        """Places a map that was filled by `add_records` with what particles had sampled so far.
+    def begin_at(self, origin: np.ndarray, substate: np.ndarray, ids: np.ndarray, cov: np.ndarray) -> None:
+        """Places a map that was filled by `add_records`: its frame at `origin` (E,), the substate at (m,).
 
-        Args:
-            world: (N, E) world_from_frame of each particle's own frame, where its state and landmarks are.
-            substate: (N, m) means.
-            ids: (K,) landmarks that are correlated with each other, with the substate and with the frame's place.
-            cov: (N, d + m + ΣD, …) of that place, in its right chart, of the substate and of these landmarks.
+        Of that place, in its right chart, of the substate and of landmarks (K,) the covariance is (d + m + ΣD, …).
         """
-        d, table = self.space.dim, self.held.table
-        self.origin = self.space.mean(world, np.full(self.n, 1.0 / self.n))
-        self.mean[:, :d] = offset = self.space.local(self.origin, world)
-        self.mean[:, d : self._first] = substate
-        chart = np.tile(np.eye(cov.shape[1]), (self.n, 1, 1))
-        chart[:, :d, :d] = self.space.right_jacobian_inverse(offset)
+        self.origin, self.mean[:, self.space.dim : self._first] = origin, substate
+        table = self.held.table
         each = [(table.first[row], self.held.kinds[table.kind[row]].dim) for row in self.held.rows_of(ids)]
         columns = np.concatenate([np.arange(self._first), *(first + np.arange(dim) for first, dim in each)])
-        moved = (chart @ cov @ np.swapaxes(chart, 1, 2)).mean(axis=0)
-        self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(moved)
+        self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(cov)
 
     def _begin_submap(self) -> None:
         """At the robot, with no landmark."""

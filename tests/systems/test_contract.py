@@ -78,14 +78,14 @@ RESUMED = {
     "lost": Case(lambda: mono(KNOWN), lambda: list(sequence(18, blinking).frames()), (1, 4, 8, 10, 12, 14, 16), LOST),
     "known points, joint map": Case(
         lambda: mono(KNOWN, map="joint", settled_frames=3),
-        lambda: list(sequence(16).frames()),
-        (0, 4, 9, 12),
+        lambda: list(sequence(22).frames()),
+        (0, 4, 12, 19),
         joint=True,
     ),
     "known points, camera unknown": Case(
         lambda: mono(KNOWN, settled_frames=3, calibrate="online"),
-        lambda: list(sequence(16).frames()),
-        (0, 4, 9, 12),
+        lambda: list(sequence(22).frames()),
+        (0, 4, 12, 19),
         joint=True,
     ),
     "lost, joint map": Case(

@@ -1,4 +1,4 @@
-"""One camera whose particles hand their maps over to a joint one: nothing is lost by it, and it stays honest."""
+"""One camera whose first frames become a joint map: nothing is lost by it, and it stays honest."""
 
 from dataclasses import replace
 
@@ -8,65 +8,62 @@ import pytest
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, RoomWorld, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.runs.recordings import filter_features
-from rbpf.systems.mono.config import MonoConfig, VelocityConfig
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.systems.mono.adjustment import FirstFrames
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
+from rbpf.systems.mono.joint import begin
 from rbpf.systems.mono.slam import MonoSlam
 from tests.systems.mono_logs import desk, errors, nees, without_known
 from tests.systems.plane_sequences import CAMERA, sequence
 
-JOINT = MonoConfig(map="joint", starting_particles=200, settled_frames=4)
+JOINT = MonoConfig(map="joint", settled_frames=4)
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_what_the_particles_hold_is_handed_over(known):
-    """Pose, landmarks and their covariances are the same after it as before, up to the second order."""
-    log = desk(3, frames=45, measurements=20)
-    slam = filter_features(log if known else without_known(log), replace(JOINT, settled_frames=100)).system
+@pytest.mark.parametrize("ratio", [1.0, 1e-12], ids=["points", "rays"])
+def test_the_joint_map_is_the_gaussian_about_the_optimum(known, ratio):
+    """Its mean moves with the optimum, from which numeric derivatives; its covariance is what that makes of an error."""
+    log = desk(3, frames=12, measurements=20)
+    config = replace(JOINT, settled_frames=100, calibrate="online" if known else "off")
+    slam = filter_features(log if known else without_known(log), config).system
+    hand_over, config = slam.hand_over, replace(config, inverse_depth=InverseDepthConfig(promote_std_ratio=ratio))
+    names, seen, best = hand_over._adjusted(slam.filter, slam.features)
 
-    def told():
-        return slam.map(), slam.filter.n, SE3.mean(slam.particle_poses(), slam.filter.particles.weights)
+    def begun(structure, information):
+        new = hand_over._new_filter(hand_over._rays, slam.sensor, slam.filter.rng)
+        optimum = replace(best, structure=structure, information=information)
+        stamps = np.array(hand_over.first.stamps_ns)
+        revision = begin(new, hand_over._rays.landmark, config, names, seen, optimum, stamps)
+        np.testing.assert_allclose(revision.poses[-1], new.belief().map.origin, atol=1e-12)
+        return new.belief().map
 
-    before, many, pose = told()
-    evidence = slam.filter.log_evidence
-    slam.filter = slam.hand_over.become(slam.filter, slam.sensor).filter
-    after, few, same_pose = told()
-    np.testing.assert_equal(slam.filter.log_evidence, evidence)
-    assert (many, few) == (200, 50) and before.ids.size > 20
-    np.testing.assert_array_equal(after.ids, before.ids)
-    np.testing.assert_array_equal(after.is_ray(), before.is_ray())
-    std = np.sqrt(np.einsum("kii->ki", before.cov))
-    full = ~before.is_ray()
-    assert (np.abs(after.mean - before.mean) < 0.2 * std + 1e-6)[full].all()
-    ratio = np.trace(after.cov[full], axis1=1, axis2=2) / np.trace(before.cov[full], axis1=1, axis2=2)
-    assert 0.6 < ratio.min() < ratio.max() < 1.6
-    assert np.abs(SE3.local(pose, same_pose)).max() < 2e-3
+    # cov = s sᵀ + η, by which all is known well enough for a point, or for none.
+    step = 1e-4 * np.random.default_rng(0).normal(size=len(best.information))
+    least, size = 1e-9 * step @ step, step.size
+    information = (np.eye(size) - np.outer(step, step) / (least + step @ step)) / least
+    one, here, other = (begun(best.structure.moved(sign * step), information) for sign in (-1.0, 0.0, 1.0))
+    moved = (other.mean - one.mean)[0] / 2.0
+    moved[:6] = SE3.local(one.origin, other.origin) / 2.0
+    is_ray = here.are(here.ids, hand_over._rays.landmark)
+    assert is_ray.sum() == (0 if ratio == 1.0 else here.ids.size - 4 * known) and here.ids.size > 15
+    found = here.cov[: moved.size, : moved.size].copy()
+    found[6:12, 6:12] -= np.diag(config.velocity.walk_std() ** 2) * 0.1 / 3.0  # the walk since the last frame
+    std = np.sqrt(np.square(moved) + 1e-6 * step @ step)
+    np.testing.assert_allclose(found / np.outer(std, std), np.outer(moved / std, moved / std), atol=0.01)
 
 
-@pytest.mark.parametrize("exact", [True, False])
-def test_known_points_are_as_uncertain_one_by_one_as_together(exact):
-    """By draws of the frame, or of the points, from what the group says."""
-    rng, points = np.random.default_rng(0), np.random.default_rng(1).normal((0.0, 0.0, 3.0), 1.0, (4, 3))
-    root = 0.01 * rng.normal(size=(6, 6))
-    frame = SE3.exp(np.array([0.3, -0.2, 0.4, 1.0, 2.0, -1.0]))
-    if exact:
-        group = Constellation(points)
-        found, cov = group.jointly(group.started(1, frame, root @ root.T))
-        drawn = SE3.retract(frame, rng.normal(size=(20_000, 6)) @ root.T)
-        moved = SE3.transform(drawn[:, None], points)
-    else:
-        group = UncertainConstellation(points, np.tile(1e-4 * np.eye(3), (4, 1, 1)))
-        world = SE3.transform(frame, points)
-        half = 0.01 * rng.normal(size=(12, 12))
-        found, cov = group.jointly(group.started(1, world, half @ half.T))
-        moved = world + (rng.normal(size=(20_000, 12)) @ half.T).reshape(-1, 4, 3)
-        drawn = None
-    np.testing.assert_allclose(found[0], frame, atol=1e-9)
-    offset = (moved - SE3.transform(frame, points)).reshape(len(moved), 12)
-    np.testing.assert_allclose(cov[0, 6:, 6:], np.cov(offset.T), atol=0.05 * np.abs(cov).max())
-    if drawn is not None:
-        both = np.concatenate([SE3.local(frame, drawn), offset], axis=1)
-        np.testing.assert_allclose(cov[0], np.cov(both.T), atol=0.05 * np.abs(cov).max())
+def test_the_longer_ago_the_fewer_frames_are_kept():
+    first = FirstFrames()
+    for t in range(200):
+        first.note(FeatureFrame(t, np.array([t // 50]), np.zeros((1, 2)), np.eye(2)[None]), SE3.identity())
+        first.thin(40)
+    kept = [frame.stamp_ns for frame in first.seen]
+    assert len(kept) == 40 and kept[0] == 0 and kept[-10:] == list(range(190, 200)) and len(first.stamps_ns) == 200
+    assert (np.diff(kept) <= 1 + (200 - np.array(kept[:-1])) / 6).all()  # 40 that lie further apart the longer ago
+    names, poses = first.seen_first(np.arange(200.0)[:, None] * np.ones(7))
+    np.testing.assert_array_equal(names, range(4))
+    assert poses[0, 0] == 0.0 and (np.diff(poses[:, 0]) >= 40).all()
 
 
 @pytest.mark.slow
@@ -84,7 +81,7 @@ def test_it_is_honest_where_the_baseline_was_hardly_known():
 
 def test_features_of_old_sub_maps_are_found_again():
     """What is put away is in the map all the time, and is looked for and found as it is in view."""
-    slam = MonoSlam(CAMERA, replace(JOINT, particles=20, starting_particles=20), None)
+    slam = MonoSlam(CAMERA, replace(JOINT, particles=20), None)
     gone, held, found = np.arange(6), [], []
     for t, frame in enumerate(sequence(40).frames()):
         if t == 30:
@@ -107,8 +104,9 @@ def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     off = [np.linalg.norm(errors(run)[:, 3:], axis=1) for run in (whole, submaps)]
     assert off[1][-40:].mean() < 1.5 * off[0][-40:].mean() + 0.01
     assert nees(submaps).mean() < 1.2 * nees(whole).mean()
-    mapped = whole.system.map()  # rays that are out of view when a sub-map is left are dropped
-    assert set(mapped.ids[~mapped.is_ray()]) <= set(submaps.system.map().ids)
+    mapped = whole.system.map()
+    missing = set(mapped.ids[~mapped.is_ray()]) - set(submaps.system.map().ids)
+    assert len(missing) < 3  # rays that are out of view when a sub-map is left are dropped; one Gaussian may know them later
 
 
 def test_what_is_refused():

@@ -17,7 +17,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.slam import MonoSlam
 from tests.systems.mono_logs import desk, without_known
 
-ONLINE = MonoConfig(calibrate="online", particles=30, starting_particles=60, settled_frames=5)
+ONLINE = MonoConfig(calibrate="online", particles=30, settled_frames=15)
 BENT = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
 FISHEYE = Pinhole(640, 480, 300.0, 310.0, 320.0, 240.0, (0.02, -0.01, 0.002, 0.001), "equidistant")
 

@@ -21,6 +21,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_tri
 from scipy.special import exp1
 
 from rbpf.core.checkpoint import integers, numbers, poses, read, split
+from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import clamp_depth
@@ -28,6 +29,7 @@ from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.active_search import CAUCHY_SCALE
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.systems.system import Revision
 
 MIN_VIEWS = 3
 """Frames that must see a feature for it to take part."""
@@ -58,7 +60,9 @@ MIN_STD_VELOCITY = 1e-6
 DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
 """Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""
 
+_PREFIX = "start/frames/"
 _FRAMES = {
+    "all_ns": integers("all"),
     "stamps_ns": integers("frames"),
     "counts": integers("frames", least=0),
     "names": integers("seen", least=0),
@@ -70,22 +74,47 @@ _FRAMES = {
 
 @final
 class FirstFrames:
-    """What was seen in the first frames, and from where (7,) as far as is known, in the particles' world."""
+    """What was seen in the first frames, and from where (7,) as far as is known, in the particles' world.
+
+    Attributes:
+        stamps_ns: of all frames.
+        seen: those that are kept.
+        path: as many poses, from which an adjustment may start.
+    """
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        self.stamps_ns: list[int] = []
         self.seen: list[FeatureFrame] = []
         self.path: list[np.ndarray] = []
 
-    def frame_of(self) -> np.ndarray:
-        """In which of the frames each of F features was seen first (F,), in the order of their names."""
-        _, first = np.unique(np.concatenate([frame.landmarks for frame in self.seen]), return_index=True)
-        return np.repeat(np.arange(len(self.seen)), [frame.landmarks.size for frame in self.seen])[first]
+    def note(self, seen: FeatureFrame, pose: np.ndarray) -> None:
+        """The next frame."""
+        self.stamps_ns.append(seen.stamp_ns)
+        self.seen.append(seen)
+        self.path.append(pose)
+
+    def thin(self, most: int) -> None:
+        """Of more than `most` those are dropped that lie closest for their age: the longer ago, the fewer are left."""
+        while len(self.seen) > most:
+            at = np.array([frame.stamp_ns for frame in self.seen])
+            dropped = 1 + int(np.argmin((at[2:] - at[:-2]) / np.maximum(at[-1] - at[1:-1], 1)))
+            del self.seen[dropped], self.path[dropped]
+
+    def seen_first(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Names (F,) of all features, and from where (F, 7) on the path (T, 7) of all frames each of them was seen first."""
+        names, first = np.unique(np.concatenate([frame.landmarks for frame in self.seen]), return_index=True)
+        stamps = np.repeat([frame.stamp_ns for frame in self.seen], [frame.landmarks.size for frame in self.seen])
+        return names, path[np.searchsorted(self.stamps_ns, stamps[first])]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint; nothing where there are none."""
         if not self.seen:
             return {}
-        return {
+        found = {
+            "all_ns": np.array(self.stamps_ns, dtype=np.int64),
             "stamps_ns": np.array([frame.stamp_ns for frame in self.seen], dtype=np.int64),
             "counts": np.array([frame.landmarks.size for frame in self.seen], dtype=np.int64),
             "names": np.concatenate([frame.landmarks for frame in self.seen]),
@@ -93,18 +122,27 @@ class FirstFrames:
             "cov_px": np.concatenate([frame.cov_z for frame in self.seen]),
             "path": np.array(self.path),
         }
+        return {f"{_PREFIX}{name}": array for name, array in found.items()}
 
-    @classmethod
-    def restored(cls, arrays: dict[str, np.ndarray], prefix: str) -> "FirstFrames":
-        """The inverse of `arrays`, whose names begin with a prefix; errors as `rbpf.core.checkpoint.read`."""
-        out = cls()
-        if f"{prefix}stamps_ns" in arrays:
-            held = read(arrays, _FRAMES, prefix)
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
+        self.clear()
+        if f"{_PREFIX}stamps_ns" in arrays:
+            held = read(arrays, _FRAMES, _PREFIX)
             columns = held["names"], held["px"], held["cov_px"]
-            parts = zip(*(split(column, held["counts"].tolist(), prefix[:-1]) for column in columns), strict=True)
-            out.seen = [FeatureFrame(t, *part) for t, part in zip(held["stamps_ns"].tolist(), parts, strict=True)]
-            out.path = list(held["path"])
-        return out
+            parts = zip(*(split(column, held["counts"].tolist(), _PREFIX[:-1]) for column in columns), strict=True)
+            self.stamps_ns = held["all_ns"].tolist()
+            self.seen = [FeatureFrame(t, *part) for t, part in zip(held["stamps_ns"].tolist(), parts, strict=True)]
+            self.path = list(held["path"])
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What an adjustment of the first T frames leaves."""
+
+    filter: Filter  #: that goes on, in place of the one so far.
+    revision: Revision  #: of all poses so far.
+    seen_first: tuple[np.ndarray, np.ndarray]  #: names (F,) of all features, and from where (F, 7) they were.
 
 
 def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -145,11 +183,16 @@ class Window:
 
 
 def gathered(
-    frames: Sequence[FeatureFrame], features: FeatureSensor, held: Callable[[np.ndarray], np.ndarray], most: int
+    frames: Sequence[FeatureFrame],
+    features: FeatureSensor,
+    held: Callable[[np.ndarray], np.ndarray],
+    most: int,
+    known: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Window]:
     """Numbers (T,) of `most` frames to adjust, names (F,) of features that are `held` and seen often enough, what was seen.
 
-    The frames see something, with a stamp of their own, the first and the last among them.
+    The frames see something, with a stamp of their own, the first and the last among them. Features that are `known` take
+    part however seldom they were seen.
     """
     stamps = np.array([frame.stamp_ns for frame in frames])
     fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
@@ -159,7 +202,7 @@ def gathered(
     none = [np.zeros(0, dtype=np.int64)]
     seen_by = np.concatenate(none + [frame.landmarks for frame in chosen])
     names, views = np.unique(seen_by[held(seen_by)], return_counts=True)
-    names = names[views >= MIN_VIEWS]
+    names = names[(views >= MIN_VIEWS) | np.isin(names, [] if known is None else known)]
     parts = [np.isin(frame.landmarks, names) for frame in chosen]
     return (
         steps,

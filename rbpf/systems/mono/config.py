@@ -189,9 +189,7 @@ class MonoConfig(Ranged):
     #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
     #: below the threshold of resampling, which does not take place.
     window: Count = 5
-    #: of a joint map: how many particles begin, with maps of their own …
-    starting_particles: Count = 250
-    #: … until half of the depths in view were known in so many frames in a row.
+    #: of a joint map: particles have maps of their own until half of the depths in view were known in so many frames in a row.
     settled_frames: Count = 30
     #: of a joint map: landmarks beyond which a sub-map ends; those in view, and others up to half of these, go over into the
     #: next one, and old ones come back when they are in view. No point is dropped; rays that are left behind are.

@@ -90,7 +90,6 @@ class UnknownDepth(ABC):
         return Records(points, gaussian.symmetrise(slope @ records.cov @ np.swapaxes(slope, -1, -2)))
 
 
-@final
 class InverseDepthRays(UnknownDepth):
     """Rays with an inverse depth from where a feature was seen first, E06 §5."""
 

@@ -255,17 +255,15 @@ class ImageSensor(Sensor):
         rows, _ = self.search.in_view(self.features.pose(belief), wanted)
         joint.bring_back(rows[: max(min(self.features.most // 4, 2 * self.features.most - held.size), 0)])
 
-    def resampled(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
-        """Remembers where all features are and were seen first, after the particles were resampled from a batch posterior.
-
-        The heaviest particle's path is (T, 7); each feature of the table was started in one (F,) of its frames.
-        """
-        table, rows = self.table, np.arange(started.size)
-        held = belief.map.holds(rows)
-        table.alive[rows[~held]] = False  # started in a frame that did not take part
-        table.first_pose[rows] = table.last_pose[rows] = path[started]
-        table.last_patch[rows] = table.first_patch[rows]  # later appearances are from the old path
-        self.place(belief, rows[held & table.alive[rows]])
+    def resampled(self, belief: Belief, names: np.ndarray, first_pose: np.ndarray) -> None:
+        """Remembers where all features are, and from where (F, 7) on a new path those of names (F,) were seen first."""
+        table = self.table
+        if self.features.group is None:
+            table.member[:] = -1
+        table.alive &= belief.map.holds(np.arange(len(table)))  # not those started in a frame that did not take part
+        table.first_pose[names] = table.last_pose[names] = first_pose
+        table.last_patch[names] = table.first_patch[names]  # later appearances are from the old path
+        self.place(belief, np.flatnonzero(table.alive))
 
     def move(self, new_from_old: np.ndarray) -> None:
         """The world is another one (7,), or (F, 7) for each feature: where features are and were seen from."""
@@ -275,7 +273,6 @@ class ImageSensor(Sensor):
         )
         x, w = table.position[:, :3], table.position[:, 3:]
         table.position[:, :3] = SE3.transform(new_from_old, x) + (w - 1.0) * SE3.translation(new_from_old)
-        table.member[:] = -1
 
     def place(self, belief: Belief, rows: np.ndarray) -> None:
         """Remembers where in the heaviest particle's world features are now."""

@@ -5,7 +5,7 @@
         frame = slam.track(image, stamp_ns)
 
 `MonoSlam.take` is the life of a frame: is the image usable, where may the camera be, the filter's step with active
-search inside, what is reported, and, as long as depths are unknown, the batch adjustment of the first frames.
+search inside, what is reported, and, as long as depths are not settled, the batch adjustment of the first frames.
 """
 
 import time
@@ -34,16 +34,16 @@ from rbpf.sensors.readers.images.calibration import camera_text
 from rbpf.systems.anchoring import Anchored, relative_estimate
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.active_search import OutlierGate
+from rbpf.systems.mono.adjustment import FirstFrames
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
-from rbpf.systems.mono.joint import HandOver
+from rbpf.systems.mono.joint import NUMBERS, HandOver
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture, world_of
 from rbpf.systems.mono.places import Places
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
-from rbpf.systems.mono.self_calibration import NUMBERS
 from rbpf.systems.mono.unknown_start import UnknownStart
 from rbpf.systems.system import (
     DIAGNOSTICS,
@@ -77,21 +77,22 @@ class MonoSlam(System):
 
     It takes images, or features that carry names, but not both. The world is that of the known points or of the known
     map; without them that of the first camera, in a scale in which new features are 1 / `inverse_depth.mean_per_m` away
-    on the average. Memory: the map and its features' appearances, and what `lag` keeps of the particles' paths.
+    on the average. When the map becomes a joint one, the first frames are adjusted in batch, and their poses revised. Memory:
+    the map and its features' appearances, and what `lag` keeps of the particles' paths.
 
     Args:
         camera: of the images.
         config: all settings.
         known: points of known position that the first image shows: with their pixels in it, or, for features, under
-            their names. Without them the first frames are adjusted in batch; poses that were reported are then revised.
+            their names. Without them particles are resampled from adjustments of the first frames.
         known_map: a map that the camera is to be found in, in place of making one; it is not changed.
         unknown_depth: how features are kept as long as their depth is not known; by default rays with inverse depth.
         gate: which matches of a frame agree with one motion of the camera; by default a robust fit.
         detector: where features are started, and what a lost image is matched by; by default FAST corners, scored as Shi
             and Tomasi do.
         descriptor: by what a lost image is matched with the map; by default SIFT.
-        wrapped: puts a sensor around the one that takes named features, to change what it observes or starts. The first
-            frames are then not adjusted in batch, which would not be what that sensor observes.
+        wrapped: puts a sensor around the one that takes named features, to change what it observes or starts. An adjustment
+            of the first frames is of what they show, and only a joint map begins with one.
 
     Raises:
         InputError: known points do not determine the camera, or the map was made with another one.
@@ -159,7 +160,8 @@ class MonoSlam(System):
 
         rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
         is_fixed = known_map is not None
-        self.hand_over = HandOver(config, camera, points, rays, is_fixed)
+        self.first = FirstFrames()
+        self.hand_over = HandOver(config, camera, points, rays, is_fixed, self.first)
         self.features = FeatureSensor(camera, rays, config.max_new_per_frame, group, is_fixed)
         self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
         self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
@@ -174,7 +176,9 @@ class MonoSlam(System):
             self.loss = TrackingLoss(self.sensor, config)
         self.places = Places(self.loss.relocaliser, config.relocalisation)
         is_unknown = points is None and wrapped is None
-        self.start = UnknownStart(config, self.features, lambda: self._new_filter(self.features), is_unknown)
+        self.start = UnknownStart(
+            config, self.features, self.first, lambda: self._new_filter(self.features), is_unknown
+        )
         self.gauge: Gauge = "none"
         if known_map is not None:
             self.gauge = known_map.alignment
@@ -296,33 +300,25 @@ class MonoSlam(System):
         # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
         near = mixture_estimate(*report.mixture).mean[:7]
 
-        # 6. While depths are unknown: batch adjustment of the frames so far, and particles drawn from it.
+        # 6. As long as depths are unknown: batch adjustment of the frames so far, and particles drawn from it; once they are
+        # known, one Gaussian, if there is to be one. It stays where it is while the camera is lost.
         revision: Revision | None = None
-        if not self.start.over:
-            is_lost = sensor.lost and len(sensor.table) > 0
-            resampled, words = self.start.after_frame(self.filter, seen, near, not sensor.bad_frames, is_lost)
-            if resampled is not None:
-                self.filter, revision = resampled.filter, resampled.revision
+        if not self.start.over or self.hand_over.is_ahead:
+            self.first.note(seen, near)
+            is_usable, is_lost = not sensor.bad_frames, sensor.lost and len(sensor.table) > 0
+            adjusted, words = self.start.after_frame(self.filter, is_usable, is_lost)
+            messages = [words, *messages] if words is not None else messages
+            if adjusted is None and self.start.over and is_usable:
+                used = measured.used if isinstance(measured, Measurement) else measured
+                adjusted = self.hand_over.after_frame(self.filter, sensor, used)
+            if adjusted is not None:
+                self.filter, revision = adjusted.filter, adjusted.revision
                 pose, cov = revision.poses[-1], revision.covs[-1]
                 if isinstance(measured, Measurement):
-                    sensor.resampled(self.filter.belief(), resampled.path, resampled.frame_of)
+                    sensor.resampled(self.filter.belief(), *adjusted.seen_first)
                     self.loss.trust(self.filter, measured.image)
-            messages = [words, *messages] if words is not None else messages
-
-        self.hand_over.note(seen, near, revision)
-
-        # 7. Once depths are known: one Gaussian, if there is to be one. It stays where it is while the camera is lost.
-        if self.start.over and not sensor.bad_frames:
-            seen = measured.used if isinstance(measured, Measurement) else measured
-            handed = self.hand_over.after_frame(self.filter, sensor, seen)
-            if handed is not None:
-                self.filter = handed.filter
-                messages += [] if handed.words is None else [handed.words]
-                if handed.revision is not None:
-                    revision = handed.revision
-                    pose, cov = revision.poses[-1], revision.covs[-1]
-                if isinstance(measured, Measurement):
-                    self.loss.trust(self.filter, measured.image)
+            if self.start.over and not self.hand_over.is_ahead:
+                self.first.clear()
         self.hand_over.hold(self.filter, sensor.lost)
 
         if self.joint is not None and not sensor.bad_frames:
@@ -333,7 +329,7 @@ class MonoSlam(System):
                 estimate = self.joint.estimate(self.filter.particles)
                 pose, cov = estimate.mean, estimate.cov
 
-        # 8. How it stands.
+        # 7. How it stands.
         if sensor.lost and not was_lost:
             messages.append(LOST)
         is_found = was_lost and not sensor.lost
@@ -463,9 +459,9 @@ class MonoSlam(System):
         return KnownMap(self.features.camera, self.gauge, rows, positions, found.cov[kept], *looks, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The sensor's table, the last trusted pose, and the frames of a start that is not over."""
+        """The sensor's table, the last trusted pose, and the first frames as long as they are kept."""
         arrays: dict[str, np.ndarray] = {}
-        for part in (self.sensor, self.screen, self.loss, self.start, self.hand_over):
+        for part in (self.sensor, self.screen, self.loss, self.first, self.start, self.hand_over):
             arrays |= part.arrays()
         return arrays
 
@@ -476,7 +472,7 @@ class MonoSlam(System):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        for part in (self.sensor, self.screen, self.loss, self.start, self.hand_over):
+        for part in (self.sensor, self.screen, self.loss, self.first, self.start, self.hand_over):
             part.restore(arrays)
         self.hand_over.hold(self.filter, self.sensor.lost)
         table, landmark_map = self.sensor.table, self.filter.belief().map
@@ -502,7 +498,7 @@ class MonoSlam(System):
         parts: list[Conditional] = [landmark_map]
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
-        return Filter(motion, sensor, parts, proposal, resampling, self.hand_over.particles, rng, lag=self.lag)
+        return Filter(motion, sensor, parts, proposal, resampling, self.config.particles, rng, lag=self.lag)
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""

@@ -9,7 +9,6 @@ S. Sénécal, 2006).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -23,6 +22,7 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.adjustment import (
     MIN_FRAMES,
+    Adjusted,
     FirstFrames,
     Optimum,
     Structure,
@@ -54,87 +54,67 @@ _LAST = {
 }
 
 
-@dataclass(frozen=True)
-class Resampled:
-    """What a batch adjustment leaves."""
-
-    filter: Filter  #: whose particles were resampled, in place of the one so far.
-    revision: Revision  #: of all T frames so far: means over the particles' paths.
-    path: np.ndarray  #: (T, 7) of the heaviest particle.
-    frame_of: np.ndarray  #: (F,) in which of the frames each of F features was seen first, in the order of their names.
-
-
 @final
 class UnknownStart:
-    """Gathers the first frames, adjusts them when it is time, and resamples the particles.
+    """Adjusts the first frames when it is time, and resamples the particles.
 
     `new_filter` makes a filter without a past, with `features` as its sensor; `needed` is whether the run starts without known
     points and without a map.
     """
 
     def __init__(
-        self, config: MonoConfig, features: FeatureSensor, new_filter: Callable[[], Filter], needed: bool
+        self,
+        config: MonoConfig,
+        features: FeatureSensor,
+        first: FirstFrames,
+        new_filter: Callable[[], Filter],
+        needed: bool,
     ) -> None:
-        self.config, self.features, self.new_filter = config, features, new_filter
+        self.config, self.features, self.first, self.new_filter = config, features, first, new_filter
         self.over = not (needed and config.start.batch_adjust)
         """Whether depths are known well enough, and the filter goes on alone."""
         self._next = config.start.first_adjustment
-        self._first = FirstFrames()
         nothing = np.zeros(0, dtype=np.int64)
         self._last = nothing, nothing, Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0))
         """Names, numbers of the frames, and optimum of the last adjustment; empty before one."""
 
-    def after_frame(
-        self, filter_: Filter, seen: FeatureFrame, pose: np.ndarray, usable: bool, lost: bool
-    ) -> tuple[Resampled | None, str | None]:
-        """Takes note of a frame, and adjusts all so far if it is time.
+    def after_frame(self, filter_: Filter, usable: bool, lost: bool) -> tuple[Adjusted | None, str | None]:
+        """Adjusts all frames so far if it is time.
 
         Args:
             filter_: after its step; a new one has its sensors and its random generator.
-            seen: what was measured in the frame.
-            pose: (7,) world_from_camera as the filter predicts and refines it: an adjustment starts from there.
             usable: whether the frame may be the last of an adjustment.
             lost: whether the camera is lost: then there will be no adjustment any more.
 
         Returns:
             The resampled particles, None where they go on as they are; and what there is to say, None for nothing.
         """
+        first, count = self.first, len(self.first.seen)
         self.over = self.over or lost
-        if self.over:
-            self._first = FirstFrames()
-            return None, None
-        self._first.seen.append(seen)
-        self._first.path.append(pose)
-        count = len(self._first.seen)
-        if count < self._next or not usable:
+        if self.over or count < self._next or not usable:
             return None, None
         self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
-        first, frames, path = self._first, self._first.seen, np.array(self._first.path)
-        best, self.over = self._adjusted(filter_, frames, path)
-        if self.over:
-            self._first = FirstFrames()
+        best, self.over = self._adjusted(filter_, first.seen, np.array(first.path))
         if best is None:
             return None, DISCONNECTED if self.over else None
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         steps, optimum_ = best
-        stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+        stamps = np.array(first.stamps_ns)
         drawn = optimum_.paths(filter_.n, filter_.rng)
         paths = between(stamps[steps], drawn, stamps)
-        filter_ = self._along(paths, set(steps.tolist()), filter_, frames)
+        filter_ = self._along(paths, set(steps.tolist()), filter_, first.seen)
         equal = uniform_log_weights(paths.shape[1])
         means = [mixture_estimate(Prior.exactly(SE3, poses), None, equal) for poses in paths]
         poses, covs = np.array([each.mean for each in means]), np.array([each.cov for each in means])
-        frame_of = first.frame_of()
-        if not self.over:
-            self._first.path = list(poses)
-        path = paths[:, filter_.belief().mode]
-        return Resampled(filter_, Revision(stamps, poses, covs), path, frame_of), None
+        first.path = list(poses)
+        seen_first = first.seen_first(paths[:, filter_.belief().mode])
+        return Adjusted(filter_, Revision(stamps, poses, covs), seen_first), None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         names, steps, structure = self._last
-        out = {
+        return {
             "start/progress": np.array([self.over, self._next]),
             "start/names": names,
             "start/steps": steps,
@@ -142,17 +122,15 @@ class UnknownStart:
             "start/direction": structure.direction,
             "start/inverse": structure.inverse,
         }
-        return out | {f"start/frames/{name}": array for name, array in self._first.arrays().items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
+        """The inverse of `arrays`, once the first frames are there; errors as `rbpf.core.checkpoint.read`."""
         last = read(arrays, _LAST, "start/")
         over, self._next = last["progress"].tolist()
         self.over = bool(over)
         names, steps = last["names"], last["steps"]
         self._last = names, steps, Structure(last["path"], last["direction"], last["inverse"])
-        self._first = FirstFrames.restored(arrays, "start/frames/")
-        if not self.over and names.size and not (steps.size and steps[-1] < len(self._first.seen)):
+        if not self.over and names.size and not (steps.size and steps[-1] < len(self.first.seen)):
             raise InputError("the last adjustment of the start is of frames that are not there")
 
     def _adjusted(
