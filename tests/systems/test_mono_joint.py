@@ -12,7 +12,6 @@ from rbpf.runs.recordings import filter_features
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.adjustment import FirstFrames
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
-from rbpf.systems.mono.joint import begin
 from rbpf.systems.mono.slam import MonoSlam
 from tests.systems.mono_logs import desk, errors, nees, without_known
 from tests.systems.plane_sequences import CAMERA, sequence
@@ -27,14 +26,15 @@ def test_the_joint_map_is_the_gaussian_about_the_optimum(known, ratio):
     log = desk(3, frames=12, measurements=20)
     config = replace(JOINT, settled_frames=100, calibrate="online" if known else "off")
     slam = filter_features(log if known else without_known(log), config).system
-    hand_over, config = slam.hand_over, replace(config, inverse_depth=InverseDepthConfig(promote_std_ratio=ratio))
+    hand_over = slam.hand_over
     names, seen, best = hand_over._adjusted(slam.filter, slam.features)
+    hand_over.config = replace(config, inverse_depth=InverseDepthConfig(promote_std_ratio=ratio))
 
     def begun(structure, information):
-        new = hand_over._new_filter(hand_over._rays, slam.sensor, slam.filter.rng)
-        optimum = replace(best, structure=structure, information=information)
-        stamps = np.array(hand_over.first.stamps_ns)
-        revision = begin(new, hand_over._rays.landmark, config, names, seen, optimum, stamps)
+        new = hand_over._use(
+            hand_over._new_filter(hand_over._rays, slam.sensor, slam.filter.rng), hand_over._rays, slam.sensor
+        )
+        revision = hand_over._begin(new, names, seen, replace(best, structure=structure, information=information))
         np.testing.assert_allclose(revision.poses[-1], new.belief().map.origin, atol=1e-12)
         return new.belief().map
 
@@ -106,7 +106,8 @@ def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     assert nees(submaps).mean() < 1.2 * nees(whole).mean()
     mapped = whole.system.map()
     missing = set(mapped.ids[~mapped.is_ray()]) - set(submaps.system.map().ids)
-    assert len(missing) < 3  # rays that are out of view when a sub-map is left are dropped; one Gaussian may know them later
+    # Rays that are out of view when a sub-map is left are dropped; one Gaussian of all may know them later.
+    assert len(missing) < 3
 
 
 def test_what_is_refused():

@@ -54,9 +54,9 @@ def adjusted(monkeypatch) -> list[int]:
     """Numbers of frames of each adjustment, those that found too little included."""
     counts, original = [], UnknownStart._adjusted
 
-    def counted(self, filter_, frames, path):
-        counts.append(len(frames))
-        return original(self, filter_, frames, path)
+    def counted(self, filter_):
+        counts.append(len(self.first.seen))
+        return original(self, filter_)
 
     monkeypatch.setattr(UnknownStart, "_adjusted", counted)
     return counts

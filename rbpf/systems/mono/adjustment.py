@@ -10,7 +10,6 @@ differences share something with the next ones, which is not written here), and 
 image tells: it is held, unless there are known points, whose errors in their own frame come in its place.
 """
 
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,6 +21,7 @@ from scipy.special import exp1
 
 from rbpf.core.checkpoint import integers, numbers, poses, read, split
 from rbpf.core.filter import Filter
+from rbpf.core.models import Belief
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import clamp_depth
@@ -183,39 +183,35 @@ class Window:
 
 
 def gathered(
-    frames: Sequence[FeatureFrame],
-    features: FeatureSensor,
-    held: Callable[[np.ndarray], np.ndarray],
-    most: int,
-    known: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, Window]:
-    """Numbers (T,) of `most` frames to adjust, names (F,) of features that are `held` and seen often enough, what was seen.
+    first: FirstFrames, features: FeatureSensor, belief: Belief, most: int, known: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, Window, "Structure"]:
+    """Numbers (T,) of `most` frames to adjust, names (F,) of features in the map that were seen often enough, what was seen.
 
     The frames see something, with a stamp of their own, the first and the last among them. Features that are `known` take
-    part however seldom they were seen.
+    part however seldom they were seen. Last, where path and features are as far as the particles know.
     """
-    stamps = np.array([frame.stamp_ns for frame in frames])
-    fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
+    stamps = np.array([frame.stamp_ns for frame in first.seen])
+    fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in first.seen]
     steps = np.flatnonzero(fresh)
     steps = steps[np.linspace(0, steps.size - 1, min(most, steps.size)).round().astype(np.int64)]
-    chosen = [frames[t] for t in steps.tolist()]
+    chosen = [first.seen[t] for t in steps.tolist()]
     none = [np.zeros(0, dtype=np.int64)]
     seen_by = np.concatenate(none + [frame.landmarks for frame in chosen])
-    names, views = np.unique(seen_by[held(seen_by)], return_counts=True)
+    held = belief.map.holds(seen_by) | (features.members(seen_by) >= 0)
+    names, views = np.unique(seen_by[held], return_counts=True)
     names = names[(views >= MIN_VIEWS) | np.isin(names, [] if known is None else known)]
     parts = [np.isin(frame.landmarks, names) for frame in chosen]
-    return (
-        steps,
-        names,
-        Window(
-            features.camera,
-            stamps[steps],
-            np.repeat(np.arange(len(chosen)), [part.sum() for part in parts]),
-            np.searchsorted(names, np.concatenate(none + [f.landmarks[p] for f, p in zip(chosen, parts, strict=True)])),
-            np.concatenate([np.zeros((0, 2)), *(f.z[p] for f, p in zip(chosen, parts, strict=True))]),
-            float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z] or [1.0]))),
-        ),
+    seen = Window(
+        features.camera,
+        stamps[steps],
+        np.repeat(np.arange(len(chosen)), [part.sum() for part in parts]),
+        np.searchsorted(names, np.concatenate(none + [f.landmarks[p] for f, p in zip(chosen, parts, strict=True)])),
+        np.concatenate([np.zeros((0, 2)), *(f.z[p] for f, p in zip(chosen, parts, strict=True))]),
+        float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z] or [1.0]))),
     )
+    which, position = features.positions(belief, names)
+    path = np.array(first.path)[steps]
+    return steps, names, seen, structure_of(SE3.between(path[:1], path), position[np.argsort(which)])
 
 
 @final

@@ -39,7 +39,6 @@ from rbpf.systems.mono.adjustment import (
     between,
     gathered,
     optimum,
-    structure_of,
     tangents,
 )
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
@@ -153,27 +152,17 @@ class HandOver:
             return None
         new = self._new_filter(self._rays, sensor, filter_.rng)
         new.steps, new.stamp_ns, new.log_evidence = filter_.steps, filter_.stamp_ns, filter_.log_evidence
-        revision = begin(new, self._rays.landmark, self.config, *found, np.array(self.first.stamps_ns))
-        self._use(new, self._rays, sensor)
+        revision = self._begin(self._use(new, self._rays, sensor), *found)
         self.tune(new, sensor)
         return Adjusted(new, revision, self.first.seen_first(revision.poses))
 
     def _adjusted(self, filter_: Filter, features: FeatureSensor) -> tuple[np.ndarray, Window, Optimum] | None:
         """Names (F,), what was seen of them, and the optimum downhill from the particles; None where there is none."""
         belief, config, given = filter_.belief(), self.config, self.known
-
-        def held(names: np.ndarray) -> np.ndarray:
-            return belief.map.holds(names) | (features.members(names) >= 0)
-
         always = None if given is None else given.names
-        steps, names, seen = gathered(self.first.seen, features, held, MAX_FRAMES, always)
+        steps, names, seen, start = gathered(self.first, features, belief, MAX_FRAMES, always)
         if steps.size < MIN_FRAMES:
             return None
-        which, position = features.positions(belief, names)
-        ordered = np.empty_like(position)
-        ordered[which] = position
-        path = np.array(self.first.path)[steps]
-        start = structure_of(SE3.between(path[:1], path), ordered)
         if self._numbers:
             seen = replace(seen, tuning=np.linalg.inv(config.self_calibration.cov()))
             start = replace(start, tuned=np.zeros(len(self._numbers)))
@@ -183,7 +172,7 @@ class HandOver:
             seen = replace(seen, known=Known(at, given.positions[row], whitener))
             world = world_of(filter_)
             of_points = SE3.identity() if world is None else world.mean[belief.mode]
-            start = replace(start, frame=SE3.between(path[0], of_points))
+            start = replace(start, frame=SE3.between(self.first.path[steps[0]], of_points))
         best = optimum(seen, config, start)
         is_finite = np.isfinite(best.cost) and np.isfinite(best.information).all()
         return (names, seen, best) if is_finite else None
@@ -246,76 +235,68 @@ class HandOver:
         sensor.features.become_joint(rays, self.config.submap, search.max_radius_px / search.ellipse_sigmas)
         return filter_
 
+    def _begin(self, new: Filter, names: np.ndarray, seen: Window, best: Optimum) -> Revision:
+        """Gives a filter on an empty joint map the Gaussian about an optimum of features (F,); the path of all frames there.
 
-def begin(
-    new: Filter,
-    rays: InverseDepth,
-    config: MonoConfig,
-    names: np.ndarray,
-    seen: Window,
-    best: Optimum,
-    stamps_ns: np.ndarray,
-) -> Revision:
-    """Gives a filter on an empty joint map the Gaussian about an optimum of features (F,); the path at stamps (T,) there.
+        The frame is the last camera. What is known well enough is a point in it, all else a ray from there.
+        """
+        joint, config = self.joint, self.config
+        assert joint is not None and self._rays is not None
+        at, cov, times = best.structure, np.linalg.inv(best.information), seen.stamps_ns
+        count, free = at.inverse.size, 6 * (len(at.path) - 1)
+        size, end = len(cov), free + 3 * count
+        of_pose = [np.eye(6, size, 6 * (t - 1)) if t else np.zeros((6, size)) for t in range(len(at.path))]
 
-    The frame is the last camera. What is known well enough is a point in it, all else a ray from there.
-    """
-    joint = new.belief().map
-    assert isinstance(joint, JointMap)
-    at, cov, times = best.structure, np.linalg.inv(best.information), seen.stamps_ns
-    count, free = at.inverse.size, 6 * (len(at.path) - 1)
-    size, end = len(cov), free + 3 * count
-    of_pose = [np.eye(6, size, 6 * (t - 1)) if t else np.zeros((6, size)) for t in range(len(at.path))]
+        # The poses in the world, which the known points' frame is or the first camera.
+        world, by_world = at.path, np.array(of_pose)
+        if at.frame is not None:
+            world = SE3.between(at.frame, at.path)
+            by_world[:, :, -6:] -= SE3.adjoint(SE3.inverse(world))
 
-    # The poses in the world, which the known points' frame is or the first camera.
-    world, by_world = at.path, np.array(of_pose)
-    if at.frame is not None:
-        world = SE3.between(at.frame, at.path)
-        by_world[:, :, -6:] -= SE3.adjoint(SE3.inverse(world))
+        # The velocity: the mean one between the last two frames, and its walk since.
+        seconds = 1e-9 * float(times[-1] - times[-2])
+        relative = SE3.between(at.path[-2], at.path[-1])
+        moved = SE3.log(relative)
+        apart = of_pose[-1] - SE3.adjoint(SE3.inverse(relative)) @ of_pose[-2]
+        by_velocity = SE3.right_jacobian_inverse(moved) @ apart / seconds
 
-    # The velocity: the mean one between the last two frames, and its walk since.
-    seconds = 1e-9 * float(times[-1] - times[-2])
-    relative = SE3.between(at.path[-2], at.path[-1])
-    moved = SE3.log(relative)
-    apart = of_pose[-1] - SE3.adjoint(SE3.inverse(relative)) @ of_pose[-2]
-    by_velocity = SE3.right_jacobian_inverse(moved) @ apart / seconds
+        # Rays (u, v, q) from the last camera, and points: of directions c = Rᵀ(d − q t).
+        pose, q = at.path[-1], at.inverse
+        back = SE3.rotation(pose).T
+        c = SE3.inverse_transform(pose, at.direction + (1.0 - q[:, None]) * SE3.translation(pose))
+        by_c = np.concatenate([skew(c), -q[:, None, None] * np.eye(3)], axis=2) @ of_pose[-1]
+        by_q, rows = np.zeros((count, 1, size)), np.arange(count)
+        for f in rows.tolist():
+            own = slice(free + 3 * f, free + 3 * f + 3)
+            by_c[f, :, own] += back @ np.column_stack([tangents(at.direction[f : f + 1])[0], -SE3.translation(pose)])
+            by_q[f, 0, own] = 0.0, 0.0, 1.0
+        ahead = np.concatenate([c[:, :2], q[:, None]], axis=1) / c[:, 2:]
+        by_ray = (np.concatenate([by_c[:, :2], by_q], axis=1) - ahead[..., None] * by_c[:, 2:]) / c[:, 2:, None]
+        point = c / q[:, None]
+        by_point = (by_c - point[..., None] * by_q) / q[:, None, None]
+        std = np.sqrt(np.einsum("fi,ij,fj->f", by_ray[:, 2], cov, by_ray[:, 2]))
+        settled = std <= config.inverse_depth.promote_std_ratio * ahead[:, 2]
+        if seen.known is not None:
+            settled[seen.known.feature] = True
+        points, others = rows[settled], rows[~settled & (c[:, 2] > 0.0) & (q > 0.0)]
 
-    # Rays (u, v, q) from the last camera, and points: of directions c = Rᵀ(d − q t).
-    pose, q = at.path[-1], at.inverse
-    back = SE3.rotation(pose).T
-    c = SE3.inverse_transform(pose, at.direction + (1.0 - q[:, None]) * SE3.translation(pose))
-    by_c = np.concatenate([skew(c), -q[:, None, None] * np.eye(3)], axis=2) @ of_pose[-1]
-    by_q, rows = np.zeros((count, 1, size)), np.arange(count)
-    for f in rows.tolist():
-        own = slice(free + 3 * f, free + 3 * f + 3)
-        by_c[f, :, own] += back @ np.column_stack([tangents(at.direction[f : f + 1])[0], -SE3.translation(pose)])
-        by_q[f, 0, own] = 0.0, 0.0, 1.0
-    ahead = np.concatenate([c[:, :2], q[:, None]], axis=1) / c[:, 2:]
-    by_ray = (np.concatenate([by_c[:, :2], by_q], axis=1) - ahead[..., None] * by_c[:, 2:]) / c[:, 2:, None]
-    point = c / q[:, None]
-    by_point = (by_c - point[..., None] * by_q) / q[:, None, None]
-    std = np.sqrt(np.einsum("fi,ij,fj->f", by_ray[:, 2], cov, by_ray[:, 2]))
-    settled = std <= config.inverse_depth.promote_std_ratio * ahead[:, 2]
-    if seen.known is not None:
-        settled[seen.known.feature] = True
-    points, others = rows[settled], rows[~settled & (c[:, 2] > 0.0) & (q > 0.0)]
+        by_camera = np.eye(at.tuned.size, size, end)
+        slopes = [by_world[-1], by_velocity, by_camera, *by_point[points], *by_ray[others]]
+        by_all = np.concatenate(slopes)
+        whole = by_all @ cov @ by_all.T
+        whole[6:12, 6:12] += np.diag(config.velocity.walk_std() ** 2) * seconds / 3.0
+        joint.begin(1, new.lineage)
+        for chosen, kind, mean in ((points, Point(3), point), (others, self._rays.landmark, ahead)):
+            if chosen.size:
+                const = SE3.identity((1, chosen.size)) if kind.anchored else None
+                nothing = np.zeros((1, chosen.size, 3, 3))
+                joint.add_records(Records(mean[None, chosen], nothing, const), kind, ids=names[chosen])
+        substate = np.concatenate([moved / seconds, at.tuned])
+        joint.begin_at(world[-1], substate, names[np.concatenate([points, others])], whole)
+        joint.resample(np.zeros(new.n, dtype=np.int64))
+        new.particles = Particles(SE3.identity((new.n,)), uniform_log_weights(new.n))
 
-    by_camera = np.eye(at.tuned.size, size, end)
-    slopes = [by_world[-1], by_velocity, by_camera, *by_point[points], *by_ray[others]]
-    by_all = np.concatenate(slopes)
-    whole = by_all @ cov @ by_all.T
-    whole[6:12, 6:12] += np.diag(config.velocity.walk_std() ** 2) * seconds / 3.0
-    joint.begin(1, new.lineage)
-    for chosen, kind, mean in ((points, Point(3), point), (others, rays, ahead)):
-        if chosen.size:
-            const = SE3.identity((1, chosen.size)) if kind.anchored else None
-            nothing = np.zeros((1, chosen.size, 3, 3))
-            joint.add_records(Records(mean[None, chosen], nothing, const), kind, ids=names[chosen])
-    substate = np.concatenate([moved / seconds, at.tuned])
-    joint.begin_at(world[-1], substate, names[np.concatenate([points, others])], whole)
-    joint.resample(np.zeros(new.n, dtype=np.int64))
-    new.particles = Particles(SE3.identity((new.n,)), uniform_log_weights(new.n))
-
-    covs = by_world @ cov @ np.swapaxes(by_world, 1, 2)
-    nearest = np.clip(np.searchsorted(times, stamps_ns), 0, len(world) - 1)
-    return Revision(stamps_ns, between(times, world[None], stamps_ns)[:, 0], covs[nearest])
+        covs = by_world @ cov @ np.swapaxes(by_world, 1, 2)
+        stamps_ns = np.array(self.first.stamps_ns)
+        nearest = np.clip(np.searchsorted(times, stamps_ns), 0, len(world) - 1)
+        return Revision(stamps_ns, between(times, world[None], stamps_ns)[:, 0], covs[nearest])

@@ -94,7 +94,7 @@ class UnknownStart:
         if self.over or count < self._next or not usable:
             return None, None
         self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
-        best, self.over = self._adjusted(filter_, first.seen, np.array(first.path))
+        best, self.over = self._adjusted(filter_)
         if best is None:
             return None, DISCONNECTED if self.over else None
 
@@ -133,24 +133,20 @@ class UnknownStart:
         if not self.over and names.size and not (steps.size and steps[-1] < len(self.first.seen)):
             raise InputError("the last adjustment of the start is of frames that are not there")
 
-    def _adjusted(
-        self, filter_: Filter, frames: Sequence[FeatureFrame], path: np.ndarray
-    ) -> "tuple[tuple[np.ndarray, Optimum] | None, bool]":
+    def _adjusted(self, filter_: Filter) -> tuple[tuple[np.ndarray, Optimum] | None, bool]:
         """Numbers of the frames that took part, and the best optimum, or None; and whether the start is over."""
-        steps, names, seen = gathered(frames, self.features, filter_.belief().map.holds, self.config.start.max_frames)
+        first, config = self.first, self.config
+        steps, names, seen, start = gathered(first, self.features, filter_.belief(), config.start.max_frames)
         if steps.size < MIN_FRAMES:
             return None, False
         if not seen.is_connected():
             return None, True
 
         # The lower of the minima downhill from where the filter is, and from where the last adjustment would have gone.
-        which, position = self.features.positions(filter_.belief(), names)
-        ordered = np.empty_like(position)
-        ordered[which] = position
-        starts = [structure_of(SE3.between(path[steps][:1], path[steps]), ordered)]
+        starts = [start]
         if self._last[0].size:
-            starts.append(self._gone_on(seen, names, path[steps], steps))
-        found = [optimum(seen, self.config, start) for start in starts]
+            starts.append(self._gone_on(seen, names, np.array(first.path)[steps], steps))
+        found = [optimum(seen, config, start) for start in starts]
         found = [each for each in found if np.isfinite(each.cost) and np.isfinite(each.information).all()]
         if not found:
             return None, True
@@ -158,8 +154,8 @@ class UnknownStart:
         self._last = names, steps, best.structure
 
         relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
-        relative = relative[np.isin(names, frames[-1].landmarks)]
-        depths_known = relative.size > 0 and np.median(relative) < self.config.start.depth_std_ratio
+        relative = relative[np.isin(names, first.seen[-1].landmarks)]
+        depths_known = relative.size > 0 and np.median(relative) < config.start.depth_std_ratio
         return (steps, best), bool(depths_known)
 
     def _gone_on(self, seen: "Window", names: np.ndarray, path: np.ndarray, steps: np.ndarray) -> "Structure":
