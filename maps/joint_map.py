@@ -62,6 +62,8 @@ from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
+FEWEST = 3
+"""Landmarks from afar with which all sub-maps are solved for."""
 SINGULAR = 1e-15
 """Fraction of the largest variance of an increment below which another one is none."""
 
@@ -82,8 +84,9 @@ class JointMap(Map):
             frame; None has none. It may be observed together with a landmark.
         compiled: use the models' fused kernels where they have one.
         submap: landmarks with which a sub-map ends, so that a step costs the same however large the map becomes; None keeps
-            one Gaussian. With a substate it ends when landmarks are `put_away`, and what stays goes over into the next one;
-            else that begins with nothing. Nothing may be observed in the world.
+            one Gaussian. Nothing may be observed in the world.
+        passed_on: a sub-map ends when landmarks are `put_away`, and what stays goes over into the next one, as always with a
+            substate; else that begins with nothing.
         unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
 
     Attributes:
@@ -102,6 +105,7 @@ class JointMap(Map):
         substate: tuple[np.ndarray, np.ndarray] | None = None,
         compiled: bool = True,
         submap: int | None = None,
+        passed_on: bool = False,
         unnamed: bool = False,
     ) -> None:
         self.space, self.compiled = space, compiled
@@ -112,13 +116,14 @@ class JointMap(Map):
         gaussian.psd_factor(cov)
         self._substate, self._first = (mean, cov), space.dim + mean.size
         self.held = JointColumns(space, self._first, [self.point])
-        self.submap, self.unnamed = submap, unnamed
+        self.submap, self.passed_on, self.unnamed = submap, passed_on or mean.size > 0, unnamed
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n, self._next_id = n, 0
         self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed)
-        self._given_ids = self.leaving = self._returning = self._observed = np.zeros(0, dtype=np.int64)
+        self._given_ids = self.leaving = self._returning = np.zeros(0, dtype=np.int64)
+        self._observed = self.leaving  # in a step what has been observed already, which stays until that ends
         self._begin_submap()
 
     def begin_at(self, origin: np.ndarray, substate: np.ndarray, ids: np.ndarray, cov: np.ndarray) -> None:
@@ -204,7 +209,7 @@ class JointMap(Map):
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
         self.mean, self.cov = self._given(increment)
-        self._gain, self._in_step = None, False
+        self._gain, self._in_step, self._observed = None, False, self._observed[:0]
         if not groups:
             return LogDensities(np.zeros(self.n), np.zeros(self.n))
         total, moves, self.cov = self._rows(state, self.mean, self.cov, groups).update(self.cov)
@@ -232,28 +237,50 @@ class JointMap(Map):
 
     def _is_over(self) -> bool:
         """Whether the present sub-map has been joined to the old ones, and another begins with nothing."""
-        if self.submap is None or self._substate[0].size:
+        if self.submap is None or self.passed_on:
             return False
         return self.old.take(self.finished(), len(self.ids) >= self.submap)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether more landmarks are held than a sub-map should have, without those that leave."""
+        return self.submap is not None and np.setdiff1d(self.ids, self.leaving).size > self.submap
+
+    def make_room(self, order: np.ndarray) -> np.ndarray:
+        """Lets go of the first of these landmarks (K,) until half of a sub-map is left, if they are worth one.
+
+        Points are put away, what is anchored is dropped. Returns which (k,) are gone, or will be when the window ends.
+        """
+        assert self.submap is not None
+        held = np.setdiff1d(self.ids, self.leaving).size
+        away = order[: max(held - self.submap // 2, 0) if order.size >= self.submap // 4 else 0]
+        points = self.are(away, self.point)
+        self.put_away(away[points])
+        self.remove(away[~points])
+        return away
 
     def put_away(self, ids: np.ndarray) -> None:
         """Points (K,) go to the old sub-maps when the window ends: the present one ends there, and what stays goes over."""
         self.leaving = np.union1d(self.leaving, ids)
 
-    def bring_back(self, ids: np.ndarray) -> None:
-        """Points (K,) of old sub-maps are held again when the window ends, with all that is known of them."""
-        self._returning = np.union1d(self._returning, ids)
+    def bring_back(self, ids: np.ndarray) -> bool:
+        """Points (K,) of old sub-maps are held again when the window ends, with all that is known of them; others stay.
+
+        Returns whether some can be: of those that are not about the start of the present one at least three, as many as tell
+        a pose in space; fewer are not worth a solution of all.
+        """
+        self._returning = np.union1d(self._returning, ids[~self.holds(ids)])
+        self.leaving = np.setdiff1d(self.leaving, ids)
+        near = np.isin(self._returning, self.old.near)
+        return bool(near.any()) or np.isin(self._returning[~near], self.old.ids).sum() >= FEWEST
 
     def _exchange(self) -> None:
         """Points leave for the old sub-maps, and others come back, Mathematics (passed-on); all particles are alike."""
         leaving = self.leaving[self.holds(self.leaving)]
         returning = np.intersect1d(self._returning[~self.holds(self._returning)], self.old.ids)
-        self.leaving = self._returning = leaving[:0]
-        if self._in_step:  # what has been observed already stays
-            observed = np.isin(leaving, self._observed)
-            self.leaving, leaving = leaving[observed], leaving[~observed]
-        # As many as tell a pose in space; fewer are not worth a solution of all.
-        far = int((~np.isin(returning, self.old.near)).sum()) >= 3
+        observed = np.isin(leaving, self._observed)
+        self._returning, self.leaving, leaving = leaving[:0], leaving[observed], leaving[~observed]
+        far = int((~np.isin(returning, self.old.near)).sum()) >= FEWEST
         if leaving.size or far:
             self._pass_on(leaving, returning if far else None)
         self._bring_in(returning[np.isin(returning, self.old.near)])
@@ -579,6 +606,8 @@ class JointMap(Map):
 
     def remove(self, ids: np.ndarray) -> None:
         if len(ids):
+            self.old.forget(ids)
+            self._given_ids = np.setdiff1d(self._given_ids, ids)
             self._keep(self.held.drop(self.held.rows_of(ids)))
 
     def _keep(self, columns: np.ndarray) -> None:

@@ -64,6 +64,11 @@ class LandmarkManager:
         return self._table[:, 1]
 
     @property
+    def unseen_for(self) -> np.ndarray:
+        """(M,) for how many frames each has not been seen."""
+        return self.frame - self._table[:, 2]
+
+    @property
     def confirmed(self) -> np.ndarray:
         """(M,) whether each is a landmark."""
         return self.observations >= self.config.observations
@@ -150,14 +155,3 @@ class LandmarkManager:
         if not known.all():
             raise InputError(f"there is no landmark named {names[~known][0]}")
         return rows
-
-
-def surplus(held: np.ndarray, observations: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
-    """Landmarks that a joint map drops so that at most so many are left: of those not seen now, the least often seen.
-
-    To drop a landmark is to marginalise it: what is left stays exactly as uncertain as it is, and a place whose landmarks
-    were all dropped is a new one. Landmarks (M,), how often each was seen (M,), and those seen now (k,).
-    """
-    rows = np.flatnonzero(~np.isin(held, seen))
-    rows = rows[np.argsort(observations[rows], kind="stable")]
-    return held[rows[: max(held.size - most, 0)]]

@@ -155,27 +155,19 @@ def solve(
             between = space.between(begin, end)
             error, seen = space.local(each.end, between), space.inverse_transform(end, world[at])
             residual = np.append(error, seen - each.points[rows])
-            slope = np.zeros((residual.size, columns.size))
-            back = space.right_jacobian_inverse(error)
-            slope[:d, :d] = -back @ space.adjoint(space.inverse(between))
-            slope[:d, d : 2 * d] = back
-            slope[d:, d : 2 * d] = -space.transform_jacobian(seen).reshape(-1, d)
-            slope[d:, 2 * d :] = np.kron(np.eye(rows.size), space.rotation(end).T)
-            half = slope.T @ info
-            entries.append((half @ slope).ravel())
+            by_ends, back = np.zeros((residual.size, 2 * d)), space.right_jacobian_inverse(error)
+            by_ends[:d, :d] = -back @ space.adjoint(space.inverse(between))
+            by_ends[:d, d:] = back
+            by_ends[d:, d:] = -space.transform_jacobian(seen).reshape(-1, d)
+            slope, half, product = _weighed(info, by_ends, space.rotation(end), d)
+            entries.append(product.ravel())
             gradient[columns] += half @ residual  # columns below zero fall behind the end
             factors.append(Factor(own, columns, info, residual, slope))
         for number, points, at, columns, info in taken:
             seen = space.inverse_transform(starts[number], world[at])
-            slope = np.concatenate(
-                [
-                    -space.transform_jacobian(seen).reshape(-1, d),
-                    np.kron(np.eye(at.size), space.rotation(starts[number]).T),
-                ],
-                1,
-            )
-            half = -slope.T @ info
-            entries.append((half @ slope).ravel())
+            by_start = -space.transform_jacobian(seen).reshape(-1, d)
+            _, half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0)
+            entries.append(product.ravel())
             gradient[columns] += half @ (seen - points).ravel()
         information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
         solver = splu(information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
@@ -187,6 +179,22 @@ def solve(
         if np.abs(step).max() < CLOSE_ENOUGH:
             break
     return Solution(ids, world, starts, factors, information, solver, is_whole)
+
+
+def _weighed(info: np.ndarray, by_poses: np.ndarray, rotation: np.ndarray, first: int) -> tuple[np.ndarray, ...]:
+    """A slope J, Jᵀ I and Jᵀ I J of a residual whose information is I (r, r), at the work of their entries.
+
+    J has columns of poses (r, c), and behind them those of landmarks, each with Rᵀ in rows of its own from the `first` on.
+    """
+    rows, poses, dim = len(info), by_poses.shape[1], len(rotation)
+    count = (rows - first) // dim
+    slope = np.concatenate([by_poses, np.zeros((rows, count * dim))], axis=1)
+    slope[first:, poses:] = np.kron(np.eye(count), rotation.T)
+    half = np.concatenate(
+        [by_poses.T @ info, (rotation @ info[first:].reshape(count, dim, rows)).reshape(count * dim, rows)]
+    )
+    turned = half[:, first:].reshape(len(half), count, dim) @ rotation.T
+    return slope, half, np.concatenate([half @ by_poses, turned.reshape(len(half), count * dim)], axis=1)
 
 
 def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:

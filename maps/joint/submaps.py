@@ -9,11 +9,12 @@ Gaussian, to which a finished sub-map is joined at a cost that does not grow (J.
 Sub-maps of the same place become one, so that there are as many as the ground takes, and not the time.
 """
 
+from collections.abc import Callable
 from copy import copy
 from typing import NamedTuple, final
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
@@ -25,6 +26,8 @@ from rbpf.maps.joint.solution import CLOSE_ENOUGH, EXACT, ITERATIONS, Given, Sol
 
 ROUNDING = 1e-12
 """Variance [m²] below which nothing is told apart."""
+FORGOTTEN = -(2**40)
+"""Below it are names of what is no landmark any more."""
 FIRM = 6
 """Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
 
@@ -85,7 +88,7 @@ class SubMaps:
         self.near, self.points = np.zeros(0, dtype=np.int64), np.zeros((0, dim))
         self.cov = np.zeros((space.dim, space.dim))
         self._places: tuple[np.ndarray, np.ndarray] | None = None
-        self._inverse_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
+        self._factor_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
         self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
 
     @property
@@ -121,7 +124,7 @@ class SubMaps:
         """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
         if (found := self.beside) is None:
             return held, mean, cov
-        own, new = held.holds(found.own), ~held.holds(found.ids)
+        own, new = held.holds(found.own), ~held.holds(found.ids) & (found.ids >= 0)
         columns = held.of_one_kind(found.own[own]).columns.ravel()
         at, rows = np.repeat(own, self.dim), np.repeat(new, self.dim)
         slope, rest = found.slope[np.ix_(rows, at)], found.rest[np.ix_(rows, rows)]
@@ -130,6 +133,27 @@ class SubMaps:
         wide.add(found.ids[new], held.kinds[0], np.full(int(new.sum()), -1), held.clones[:0])
         mean = np.concatenate([mean, found.points[new].ravel() + moved @ slope.T], axis=1)
         return wide, mean, np.block([[cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
+
+    def forget(self, ids: np.ndarray) -> None:
+        """Landmarks (K,) that are held no more: what was said of them ties the rest, and no one is told or asked for it."""
+        gone = np.array([name for name in ids.tolist() if name in self._last], dtype=np.int64)
+        if not gone.size:
+            return
+        others = min(FORGOTTEN, *self._last) - 1 - np.arange(gone.size)
+
+        def renamed(names: np.ndarray) -> np.ndarray:
+            _, at, which = np.intersect1d(names, gone, return_indices=True)
+            names = names.copy()
+            names[at] = others[which]
+            return names
+
+        maps, self.maps, self._last, self._places = self.maps, [], {}, None
+        for each in maps:
+            given = None if each.given is None else each.given._replace(ids=renamed(each.given.ids))
+            self._hold(each._replace(ids=renamed(each.ids), given=given))
+        self.near = renamed(self.near)
+        if self.beside is not None:
+            self.beside = self.beside._replace(ids=renamed(self.beside.ids))
 
     def given(self, ids: np.ndarray) -> Given | None:
         """What is known of landmarks (K,) about the start, by all that is finished."""
@@ -192,24 +216,26 @@ class SubMaps:
         (passed-on). Returns how far the rows move (R,), by what slope with the new sub-map (R, d + MD), and what is left
         of their covariance given it.
         """
-        assert new.given is not None
         space, d, dim = self.space, self.space.dim, self.dim
+        by_new = np.zeros((rows.size, len(new.cov)))
+        if new.given is None:
+            return np.zeros(rows.size), by_new, self.cov[np.ix_(rows, rows)]
         _, mine, its = np.intersect1d(self.near, new.given.ids, assume_unique=True, return_indices=True)
         columns = (d + dim * mine[:, None] + np.arange(dim)).ravel()
-        held = self._inverse_of_given
+        held = self._factor_of_given
         if held is None or held[0] is not self.cov or not np.array_equal(held[1], columns):
             own = self.cov[np.ix_(columns, columns)] + ROUNDING * np.eye(columns.size)
-            self._inverse_of_given = held = self.cov, columns, inverse_of(own)
-        gain = self.cov[np.ix_(rows, columns)] @ held[2]
+            self._factor_of_given = held = self.cov, columns, gaussian.cholesky(own)
+        cross = self.cov[np.ix_(columns, rows)]
+        gain = cho_solve((held[2], True), cross, check_finite=False).T
         row_of = {landmark: row for row, landmark in enumerate(new.ids.tolist())}
         theirs = np.array([row_of[landmark] for landmark in new.given.ids[its].tolist()])
         seen = new.points[theirs]
         by_points = gain.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)
-        by_new = np.zeros((rows.size, len(new.cov)))
         by_new[:, (d + dim * theirs[:, None] + np.arange(dim)).ravel()] = by_points.reshape(rows.size, -1)
         by_new[:, :d] = by_points.reshape(rows.size, -1) @ space.transform_jacobian(seen).reshape(-1, d)
         moved = gain @ (space.transform(new.end, seen) - self.points[mine]).ravel()
-        return moved, by_new, self.cov[np.ix_(rows, rows)] - gain @ self.cov[np.ix_(columns, rows)]
+        return moved, by_new, self.cov[np.ix_(rows, rows)] - gain @ cross
 
     def brought_back(self, ids: np.ndarray, present: SubMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Landmarks (K,) about the start, as seen from the end of the present sub-map (K, D).
@@ -228,28 +254,38 @@ class SubMaps:
 
     def _about(self, present: SubMap) -> Beside:
         """The old landmarks about the end of the present sub-map, by all that is known."""
-        space, d, dim = self.space, self.space.dim, self.dim
-        x, cov, half, mine = self._tied(present)
-        first = d + dim * self.near.size
-        turned, own = slice(first, first + d), slice(first + d, len(x))
-        end = space.retract(present.end, x[turned])
+        x, cov, half, mine = tied = self._tied(present)
+        own = slice(self.space.dim * 2 + self.dim * self.near.size, len(x))
         others = np.setdiff1d(np.arange(self.near.size), mine)
-        seen = space.inverse_transform(end, x[d:first].reshape(-1, dim)[others])
-        theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
-        by_end = (-space.transform_jacobian(seen) @ space.right_jacobian(x[turned])).reshape(-1, d)
-
-        def of_others(columns: np.ndarray) -> np.ndarray:
-            back = columns[theirs].reshape(others.size, dim, -1)
-            return (space.rotation(end).T @ back).reshape(theirs.size, -1) + by_end @ columns[turned]
-
+        seen, of_others = self._seen_from_end(tied, present, others)
         # Rows of the joint covariance, then what of it goes with the present landmarks.
         rows, halves = of_others(cov), of_others(half.T)
         within = of_others(rows.T) - halves @ halves.T
         cross = rows[:, own] - halves @ half[:, own]
-        spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(len(x) - first - d)
+        spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(own.stop - own.start)
         slope = cross @ inverse_of(gaussian.symmetrise(spread)) if present.ids.size else cross
         rest = gaussian.symmetrise(within - slope @ cross.T)
         return Beside(self.near[others], seen, present.ids, present.points, slope, rest)
+
+    def _seen_from_end(
+        self, tied: _Tied, new: SubMap, others: np.ndarray
+    ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Landmarks about the start, by number (K,), as seen from the end of a new sub-map (K, D).
+
+        And what turns rows of the Gaussian that is tied, (n, …), into theirs (KD, …).
+        """
+        space, d, dim = self.space, self.space.dim, self.dim
+        first = d + dim * self.near.size
+        turned = slice(first, first + d)
+        end, theirs = space.retract(new.end, tied.mean[turned]), d + dim * others[:, None] + np.arange(dim)
+        seen = space.inverse_transform(end, tied.mean[theirs])
+        by_end = -space.transform_jacobian(seen) @ space.right_jacobian(tied.mean[turned])
+        back = space.rotation(end).T
+
+        def of_others(rows: np.ndarray) -> np.ndarray:
+            return (back @ rows[theirs] + by_end @ rows[turned]).reshape(theirs.size, rows.shape[1])
+
+        return seen, of_others
 
     def comes_near(self, end: Estimate, reach: float) -> bool:
         """Whether an old landmark that is not among those about the start may be within reach of a pose."""
@@ -357,27 +393,26 @@ class SubMaps:
     def _take(self, new: SubMap) -> None:
         """About its end: it, its landmarks, and the old ones that it has not, as far as there is room."""
         space, d, dim = self.space, self.space.dim, self.dim
-        x, cov, half, mine = self._tied(new)
-        first, size = d + dim * self.near.size, len(x)
-        second, turned = size - first, slice(first, first + d)
-        end = space.retract(new.end, x[turned])
-        start = space.retract(self.start, x[:d])
+        x, cov, half, mine = tied = self._tied(new)
+        first = d + dim * self.near.size
+        turned = slice(first, first + d)
+        start, end = space.retract(self.start, x[:d]), space.retract(new.end, x[turned])
+        by_start, by_end = (
+            space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d]),
+            space.right_jacobian(x[turned]),
+        )
         others = np.setdiff1d(np.arange(self.near.size), mine)
-        seen = space.inverse_transform(end, x[d:first].reshape(-1, dim)[others])
-        kept = np.sort(np.argsort(np.linalg.norm(seen, axis=1), kind="stable")[: max(self.most - new.ids.size, 0)])
-        kept = kept[self.near[others[kept]] >= 0]
-        others, seen = others[kept], seen[kept]
-        by_end = space.right_jacobian(x[turned])
-        turn = np.zeros((second + dim * others.size, size))
-        turn[:d, :d] = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
-        turn[:d, turned] = by_end
-        turn[d:second, first + d :] = np.eye(second - d)
-        theirs = (d + dim * others[:, None] + np.arange(dim)).ravel()
-        turn[second:, theirs] = np.kron(np.eye(others.size), space.rotation(end).T)
-        turn[second:, turned] = (-space.transform_jacobian(seen) @ by_end).reshape(-1, d)
+        far = np.linalg.norm(self._seen_from_end(tied, new, others)[0], axis=1)
+        kept = np.sort(np.argsort(far, kind="stable")[: max(self.most - new.ids.size, 0)])
+        others = others[kept[self.near[others[kept]] >= 0]]
+        seen, of_others = self._seen_from_end(tied, new, others)
+
+        def of_all(rows: np.ndarray) -> np.ndarray:
+            return np.concatenate([by_start @ rows[:d] + by_end @ rows[turned], rows[first + d :], of_others(rows)])
+
         self.near = np.append(new.ids, self.near[others])
         self.points = np.concatenate([x[first + d :].reshape(-1, dim), seen])
-        self.cov = gaussian.symmetrise(turn @ (cov - half.T @ half) @ turn.T)
+        self.cov = gaussian.symmetrise(of_all(of_all(cov - half.T @ half).T))
         self.starts[-1:] = [start, space.compose(start, end)]
         self._places = None
         self._hold(new)

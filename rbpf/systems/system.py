@@ -337,5 +337,7 @@ class System(ABC):
         """
         arrays, held = self.filter.load(path), self.filter.marginals.parts.get(Part.LANDMARK)
         with fitting(Path(path)):
-            self.restore(arrays | ({MAP_IDS: held.ids} if isinstance(held, Map) else {}))
+            if isinstance(held, Map):
+                arrays[MAP_IDS] = held.all_ids if isinstance(held, JointMap) else held.ids
+            self.restore(arrays)
         return arrays

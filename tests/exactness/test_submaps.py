@@ -191,16 +191,18 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
     assert np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov), error).mean() < 6.0
 
 
+@pytest.mark.parametrize(("motion", "start"), [(DRIFTING, START), (Walk(), None)])
 @pytest.mark.parametrize(("most", "by_image"), [(3, False), (50, False), (3, True)])
-def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image):
+def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, motion, start):
     """Of a velocity and landmarks out of view that come back, from near and, of the smaller, by a solution of all.
 
     They are held before they are seen, or recognised after it.
     """
-    readings, (whole, submaps) = walk(20)[0], (JointMap(Euclidean(2), START, submap=n) for n in (None, most))
+    readings, space = walk(20)[0], Euclidean(2)
+    whole, submaps = (JointMap(space, start, submap=n, passed_on=True) for n in (None, most))
     options = {"n": 10, "lag": 1, "consolidation": Consolidation(1)}
     filters = [
-        Filter(DRIFTING, NamedLandmarkSensor(Relative(), Point(2)), each, rng=np.random.default_rng(0), **options)
+        Filter(motion, NamedLandmarkSensor(Relative(), Point(2)), each, rng=np.random.default_rng(0), **options)
         for each in (whole, submaps)
     ]
     for t, reading in enumerate(readings):
@@ -220,10 +222,32 @@ def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image):
         belief = filter_.belief()
         ids, places, covs = belief.map.landmarks(filter_.particles)
         order = np.argsort(ids)
-        told += [[ids[order], places[order], covs[order], *belief.moments(Part.STATE), *belief.moments(Part.SUBSTATE)]]
+        told += [[ids[order], places[order], covs[order], *belief.moments(Part.STATE)]]
+        if start is not None:
+            told[-1] += belief.moments(Part.SUBSTATE)
     assert len(submaps.old.maps) > 5 and submaps.cov.shape[0] < whole.cov.shape[0] / 2
     for one, other in zip(*told, strict=True):
         np.testing.assert_allclose(other, one, atol=3e-6)
+
+
+def test_what_is_removed_is_in_no_sub_map():
+    """Nor is it told, or the same landmark as one that is begun anew under its name; all else stays as it is."""
+    finished, *_ = ring(SE2, 1)
+    maps = SubMaps(SE2, 2, 50)
+    for each in finished[:6]:
+        maps.join(each)
+    gone = np.intersect1d(maps.maps[2].ids, maps.maps[3].ids)[:2]
+    before = {name: (place, cov) for name, place, cov in zip(*maps.landmarks(), strict=True)}
+    maps.forget(gone)
+    after = {name: (place, cov) for name, place, cov in zip(*maps.landmarks(), strict=True)}
+    assert set(after) == set(before) - set(gone) == set(maps.ids) == set(maps.places()[0])
+    for name, found in after.items():
+        for one, other in zip(found, before[name], strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9)
+    assert not maps.returned(gone).any() and maps.arrays()["submaps/ids"].min() < 0
+    maps.join(finished[6]._replace(ids=np.append(gone, finished[6].ids[2:])))
+    maps.forget(gone)
+    assert np.unique(maps.arrays()["submaps/ids"]).size == len(maps.landmarks()[0]) + 2 * gone.size
 
 
 def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():

@@ -9,7 +9,7 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
-from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import Pair, log_support
 from rbpf.systems.stereo.place_noise import PlaceNoise
 from rbpf.systems.stereo.slam import StereoSlam
@@ -102,3 +102,29 @@ def test_noise_of_each_landmark_is_learnt_from_its_residuals():
     again.restore(noise.arrays() | {MAP_IDS: ids})
     noise.remove(ids[:1])
     assert noise.factor(ids[:2])[0] == noise.factor(np.array([3]))[0] != again.factor(ids[:1])[0]
+
+
+def test_what_was_put_away_is_held_again_when_it_is_seen():
+    """By what it looks like, and where: all of it from near, or as if it were from afar, where it has to agree on a motion."""
+    for far in (False, True):
+        sequence, held = pairs(16), []
+        slam = StereoSlam(sequence.rig, replace(CONFIG, map=MapConfig(kind="joint")))
+        landmarks = slam.front_end.landmarks
+        for t, frame in enumerate(sequence.frames()):
+            if t == COUNT:
+                gone = landmarks.manager.names[landmarks.manager.confirmed]
+                slam.joint.put_away(gone)
+                slam.filter.consolidate()
+                assert gone.size > 30 and not slam.joint.holds(gone).any()
+                if far:
+                    old = slam.joint.old
+                    rows = np.flatnonzero(slam.joint.holds(old.near))
+                    used = np.append(np.arange(6), 6 + 3 * rows[:, None] + np.arange(3))
+                    old.near, old.points, old.cov = old.near[rows], old.points[rows], old.cov[np.ix_(used, used)]
+            told = slam.take(frame)
+            held.append(slam.joint.holds(gone).mean() if t >= COUNT else 1.0)
+        assert held[-1] > 0.5 and np.isin(gone, slam.map().ids).all()
+        seen = np.isin(gone, landmarks.ids)
+        assert seen.mean() > 0.3
+        off = SE3.between(SE3.between(sequence.truth.poses[0], sequence.truth.poses[-1]), told.pose)
+        assert np.linalg.norm(SE3.translation(off)) < 0.02

@@ -206,17 +206,15 @@ class FeatureSensor(Sensor):
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
         self._reach_px = np.inf
-        self.most: int | None = None
-        """Landmarks of a joint map's sub-map, in which nothing is updated without the state; None where it is none."""
         self.point = CameraPoint(camera)
         self._take_group(group)
 
-    def become_joint(self, unknown_depth: UnknownDepth, most: int, reach_px: float) -> None:
-        """From now on the map is a joint one, which holds the known points one by one, in sub-maps of `most` landmarks.
+    def become_joint(self, unknown_depth: UnknownDepth, reach_px: float) -> None:
+        """From now on the map is a joint one, which holds the known points one by one.
 
         What is expected with a greater standard deviation than `reach_px` cannot be looked for.
         """
-        self.unknown_depth, self.most, self._reach_px = unknown_depth, most, reach_px
+        self.unknown_depth, self._reach_px = unknown_depth, reach_px
         self._take_group(None)
 
     def tune(self, camera: Pinhole, about: np.ndarray) -> None:
@@ -266,29 +264,16 @@ class FeatureSensor(Sensor):
         return started
 
     def make_room(self, belief: Belief, seen: np.ndarray) -> np.ndarray:
-        """Names (K,) that a joint map does not look for any more: points are put away, rays are dropped.
-
-        Where it holds more than `most` it is what is out of view, the farthest first, until half of these are left, if
-        that is worth a sub-map.
-        """
+        """Names (K,) that a full joint map lets go: what is out of view, the farthest from where the camera looks first."""
         joint = belief.map
-        if self.most is None or not isinstance(joint, JointMap):
+        if not isinstance(joint, JointMap) or not joint.is_full:
             return np.zeros(0, dtype=np.int64)
-        held = np.setdiff1d(joint.ids, joint.leaving)
-        if held.size <= self.most:
-            return held[:0]
-        others = np.setdiff1d(held, seen)
+        others = np.setdiff1d(np.setdiff1d(joint.ids, joint.leaving), seen)
         which, position = self.positions(belief, others)
         direction = directions(position, self.pose(belief))
         others, direction = (each[~self.camera.visible(direction)] for each in (others[which], direction))
-        if others.size < self.most // 4:
-            return others[:0]
         order = np.argsort(direction[:, 2] / np.linalg.norm(direction, axis=1), kind="stable")
-        away = others[order[: held.size - self.most // 2]]
-        points = joint.are(away, Point(3))
-        joint.put_away(away[points])
-        joint.remove(away[~points])
-        return away
+        return joint.make_room(others[order])
 
     def is_unsure(self, joint: JointMap) -> bool:
         """Whether a joint map is so unsure of its frame's place that what was seen at first cannot be looked for."""

@@ -179,8 +179,8 @@ class ImageSensor(Sensor):
     def observe(self, frame: Measurement, belief: Belief) -> Sequence[Observations]:
         """What is found of the features that should be seen."""
         started = time.perf_counter()
-        if self.features.most is not None:
-            self._follow_sub_maps(belief)
+        if isinstance(belief.map, JointMap):
+            self._follow_sub_maps(belief.map, self.features.pose(belief))
         if frame.known_px is not None:
             rows, px = np.arange(frame.known_px.shape[0]), frame.known_px
             frame.used = self._features(frame.stamp_ns, rows, px)
@@ -203,7 +203,7 @@ class ImageSensor(Sensor):
         if trusted.all():
             return list(self.features.observe(used, belief))
         of_trusted, others = (self.features.observe(used.take(rows), belief) for rows in (trusted, ~trusted))
-        if self.features.most is not None:
+        if isinstance(belief.map, JointMap):
             return list(of_trusted)
         only_map = [replace(group, updates=MAP) for group in others if Part.LANDMARK in group.updates]
         return [*of_trusted, *only_map]
@@ -237,11 +237,9 @@ class ImageSensor(Sensor):
         frame.seconds_new_landmarks = time.perf_counter() - started
         return new_landmarks
 
-    def _follow_sub_maps(self, belief: Belief) -> None:
-        """Looks for what a joint map holds; asks it for old points that should be in view."""
-        joint, table = belief.map, self.table
-        assert isinstance(joint, JointMap) and self.features.most is not None
-        held = joint.ids
+    def _follow_sub_maps(self, joint: JointMap, pose: np.ndarray) -> None:
+        """Looks for what a joint map holds; asks it for old points that should be in view from a pose (7,)."""
+        table, held, most = self.table, joint.ids, joint.submap or 0
         table.alive[:] = False
         table.alive[held] = True
         table.alive[joint.leaving] = False
@@ -252,8 +250,8 @@ class ImageSensor(Sensor):
         table.position[old[away]] = np.insert(places[away], 3, 1.0, axis=1)
         wanted = np.zeros(len(table), dtype=bool)
         wanted[old[away & ~table.failing(old, self.config) & self.features.expected(joint, old)]] = True
-        rows, _ = self.search.in_view(self.features.pose(belief), wanted)
-        joint.bring_back(rows[: max(min(self.features.most // 4, 2 * self.features.most - held.size), 0)])
+        rows, _ = self.search.in_view(pose, wanted)
+        joint.bring_back(rows[: max(min(most // 4, 2 * most - held.size), 0)])
 
     def resampled(self, belief: Belief, names: np.ndarray, first_pose: np.ndarray) -> None:
         """Remembers where all features are, and from where (F, 7) on a new path those of names (F,) were seen first."""

@@ -232,7 +232,7 @@ class HandOver:
         assert isinstance(joint, JointMap)
         self.joint = joint
         search = self.config.search
-        sensor.features.become_joint(rays, self.config.submap, search.max_radius_px / search.ellipse_sigmas)
+        sensor.features.become_joint(rays, search.max_radius_px / search.ellipse_sigmas)
         return filter_
 
     def _begin(self, new: Filter, names: np.ndarray, seen: Window, best: Optimum) -> Revision:

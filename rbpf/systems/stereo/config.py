@@ -49,15 +49,16 @@ class MapConfig(Ranged):
 
     used: bool = True  #: whether there is a map; without one the filter is the odometry and its noise.
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one Gaussian
-    #: of the active landmarks and the frame, given the last few updates (joint): an uncertainty that stays true. With it
+    #: of all landmarks and the frame, given the last few updates (joint): an uncertainty that stays true. With it
     #: the odometry is the proposal, linearised once, and all candidates weigh, whatever odometry.role, proposal and
     #: map.weigh say. It needs a likelihood that is a density, and more new landmarks than particles do.
     kind: Literal["particles", "joint"] = "particles"
     #: of a joint map: updates sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.
     window: Count = 5
-    #: of a joint map: landmarks held, at most; of those not in the pair the ones that were seen least often are dropped.
-    active: Count = 300
+    #: of a joint map: landmarks beyond which a sub-map ends; those in the pair, and of the others those seen last up to half
+    #: of these, go over into the next one, and old ones come back when they are seen again. No landmark is dropped.
+    submap: Annotated[Count, Formerly("active")] = 300
     #: whether candidates, no landmarks yet, weigh the particles, too; in the map they are in any case.
     weigh: Literal["landmarks", "all"] = "landmarks"
     limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors of a feature and a landmark.

@@ -19,8 +19,8 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import integers, numbers, read
-from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
-from rbpf.core.particles import Prior
+from rbpf.core.models import NULL, Belief, Landmark, Map, NewLandmarks, Observations, Sensor
+from rbpf.core.particles import Particles, Prior
 from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
@@ -33,7 +33,7 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
 from rbpf.sensors.descriptors import DescriptorStore, gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.landmark_management import LandmarkManager, surplus
+from rbpf.sensors.landmark_management import LandmarkManager
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
@@ -51,6 +51,7 @@ _PLACES = {"place": numbers("landmarks", 3), "seen_from": numbers("landmarks", 3
 _NAMES = {
     "held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
     "observations": integers("landmarks", least=1),
+    "unseen_for": integers("landmarks", least=0),
 }
 
 
@@ -114,6 +115,10 @@ class Landmarks(Sensor, ABC, Generic[F]):
     def associate(self, pair: Pair[F], belief: Belief) -> np.ndarray:
         """Landmark (K,) of each feature, NULL where it has none."""
 
+    def put_away(self, pair: Pair[F], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
+        """Landmark (K,) of some features, (K,) bool, of those that a joint map has put away; else, as by default, NULL."""
+        return np.full(len(pair), NULL, dtype=np.int64)
+
     @abstractmethod
     def seen_again(self) -> np.ndarray:
         """(M,) landmarks that were found again where the map has them: these stand still, and tell a place."""
@@ -170,8 +175,7 @@ class Landmarks(Sensor, ABC, Generic[F]):
         rows = np.flatnonzero(np.isin(ids, self.seen_again()))
         if rows.size < config.min_matches:
             return None
-        features, records = pair.features.take(rows), belief.read_mode(ids[rows])
-        place, cov = records.mean[0], records.cov[0]
+        features, (place, cov) = pair.features.take(rows), places_of(belief, ids[rows])
         middle = np.median(place, axis=0)
         far = np.linalg.norm(place - middle, axis=1).max()
         world_from_view = SE3.identity()
@@ -272,32 +276,39 @@ class Places:
     Landmarks go by their rows in the store of descriptors.
     """
 
+    place: np.ndarray  #: (M, 3) in the world of the heaviest particle.
+
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
         self.rig, self.config = rig, config
-        self._place, self._seen_from = np.zeros((2, 0, 3))
+        self.place, self._seen_from = np.zeros((2, 0, 3))
 
     def put(self, rows: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
         """Landmarks (k,), held or new, are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,)."""
-        room = np.zeros((int((rows >= len(self._place)).sum()), 3))
-        self._place, self._seen_from = (np.concatenate([one, room]) for one in (self._place, self._seen_from))
-        self._place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
+        room = np.zeros((int((rows >= len(self.place)).sum()), 3))
+        self.place, self._seen_from = (np.concatenate([one, room]) for one in (self.place, self._seen_from))
+        self.place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
+
+    def move(self, rows: np.ndarray, place: np.ndarray) -> None:
+        """Landmarks (k,) are at places (k, 3) as the map is bent now, and were seen from as far."""
+        self._seen_from[rows] += place - self.place[rows]
+        self.place[rows] = place
 
     def remove(self, rows: np.ndarray) -> None:
-        self._place, self._seen_from = (np.delete(one, rows, axis=0) for one in (self._place, self._seen_from))
+        self.place, self._seen_from = (np.delete(one, rows, axis=0) for one in (self.place, self._seen_from))
 
     def in_view(self, world_from_camera: np.ndarray, std_direction_rad: float = 0.0) -> np.ndarray:
         """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""
         camera = self.rig.camera
         margin = self.config.margin_px + min(SIGMAS * camera.fx * std_direction_rad, 0.5 * camera.width)
         # In both images, or nearly; most are far from it.
-        local = SE3.inverse_transform(world_from_camera, self._place)
+        local = SE3.inverse_transform(world_from_camera, self.place)
         across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
         down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
         x, y, z = local.T
         rows = np.flatnonzero((z > 0.0) & (np.abs(x) <= across * z) & (np.abs(y) <= down * z))
         rows = rows[self.rig.visible(local[rows], -margin)]
-        then = self._place[rows] - self._seen_from[rows]
-        now = self._place[rows] - SE3.translation(world_from_camera)
+        then = self.place[rows] - self._seen_from[rows]
+        now = self.place[rows] - SE3.translation(world_from_camera)
         lengths = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
         cosine = (then * now).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
         ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
@@ -305,11 +316,32 @@ class Places:
         return np.asarray(rows[alike & (ratio <= np.log(self.config.max_scale_change))])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {"places/place": self._place, "places/seen_from": self._seen_from}
+        return {"places/place": self.place, "places/seen_from": self._seen_from}
 
     def restore(self, arrays: dict[str, np.ndarray], count: int) -> None:
         """The inverse of `arrays`, of so many landmarks; errors as `rbpf.core.checkpoint.read`."""
-        self._place, self._seen_from = read(arrays, _PLACES, "places/", landmarks=count).values()
+        self.place, self._seen_from = read(arrays, _PLACES, "places/", landmarks=count).values()
+
+
+def places_of(belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Landmarks (k,) as the heaviest particle has them (k, 3), with covariances (k, 3, 3), none of those that are put away."""
+    held, place, cov = belief.map.holds(ids), np.empty((ids.size, 3)), np.zeros((ids.size, 3, 3))
+    if held.any():
+        records = belief.read_mode(ids[held])
+        place[held], cov[held] = records.mean[0], records.cov[0]
+    if isinstance(belief.map, JointMap) and not held.all():
+        world = dict(zip(*(each.tolist() for each in belief.map.old.places()), strict=True))
+        frame = belief.map.world(SE3.identity((1,)), np.array([belief.mode]))
+        place[~held] = SE3.inverse_transform(frame, np.array([world[name] for name in ids[~held].tolist()]))
+    return place, cov
+
+
+def make_room(held: Map, landmarks: np.ndarray, unseen_for: np.ndarray) -> None:
+    """Where a joint map is full, puts landmarks (M,) away that were not seen for longest, (M,) pairs; none of this one."""
+    if isinstance(held, JointMap) and held.is_full:
+        unseen_for = np.where(held.holds(landmarks) & ~np.isin(landmarks, held.leaving), unseen_for, 0)
+        order = np.argsort(-unseen_for, kind="stable")
+        held.make_room(landmarks[order[: np.count_nonzero(unseen_for)]])
 
 
 class AssociationGate(ABC):
@@ -413,10 +445,6 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
                     noise = group.cov[sure] / self.noise.factor(ids)[:, None, None]
                     self.noise.learn(ids, group.z[sure] - mean, cov, noise)
         dropped = self.manager.observe(seen)
-        if self.config.kind == "joint":
-            more = surplus(self.manager.names, self.manager.observations, seen, self.config.active)
-            self.manager.remove(more)
-            dropped = np.concatenate([dropped, more])
         if dropped.size:
             belief.map.remove(dropped)
             self.places.remove(self.store.rows(dropped))
@@ -431,6 +459,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             place = self.landmark.homogeneous(records.mean, records.const)[0]
             place = place[:, :3] / place[:, 3:]
             self.places.put(self.store.rows(seen), SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
+        # Candidates that are not seen again are dropped anyway.
+        confirmed = self.manager.confirmed
+        make_room(belief.map, self.manager.names[confirmed], self.manager.unseen_for[confirmed])
         if frame.uncertain:
             return []
         # Those whose depth is known well enough for a Gaussian in space, and which the manager chooses.
@@ -468,6 +499,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             products = features.descriptors @ store.descriptors[near].T
             near = near[products.max(axis=0) >= 1.0 - 0.5 * most**2]
         ids = store.ids[near]
+        ids = ids[belief.map.holds(ids)]
         if pair.uncertain:
             ids = ids[np.isin(ids, self.seen_again())]
         if not (ids.size and rows.size):
@@ -479,6 +511,35 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         agreed = self._agreed(
             expected.take(np.searchsorted(ids, taken)), features.take(found.first), pair.uncertain, belief.rng
         )
+        out[rows[found.first[agreed]]] = taken[agreed]
+        return out
+
+    def put_away(self, pair: Pair[StereoFeatures], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
+        """By their descriptors, where they may be seen from anywhere that the camera may be in the world.
+
+        Those that are not about where the present sub-map begins must agree on one motion: with them all is solved for.
+        """
+        (old, places), store, prior = joint.old.places(), self.store, belief.prior
+        away, rows = ~joint.holds(old), np.flatnonzero(pair.for_map & free)
+        out, features = np.full(len(pair), NULL, dtype=np.int64), pair.features.take(rows)
+        self.places.move(store.rows(old[away]), places[away])
+        camera, spread = joint.estimate(Particles(prior.predicted(), belief.log_weights)), prior.spread(prior.mean)[-1]
+        cov = camera.cov + spread @ spread.T
+        at = self.places.in_view(camera.mean, float(np.sqrt(np.diagonal(cov)[:3].max())))
+        at = at[np.isin(store.ids[at], old[away])]
+        if not (at.size and len(features)):
+            return out
+        px = self.model.predict(camera.mean, self.places.place[at])
+        slope = self.model.jacobians(camera.mean, self.places.place[at]).state
+        assert slope is not None
+        own = np.tile(self.config.slack_px**2 * np.eye(3), (at.size, 1, 1))
+        expected = Expected(px, symmetrise(slope @ cov @ slope.mT), own, px)
+        near = self.gate.pairs(features, expected)
+        found = match_pairs(features.descriptors, store.descriptors[at], near, self.config.limits)
+        taken = store.ids[at[found.second]]
+        far = np.flatnonzero(~np.isin(taken, joint.old.near))
+        agreed = np.ones(len(found), dtype=bool)
+        agreed[far] = self._agreed(expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng)
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
@@ -558,9 +619,9 @@ class NamedLandmarks(Landmarks[FeatureFrame]):
         self.rig, self.config, self.model, self.landmark = rig, config.map, StereoPoint(rig), Point(3)
         self.ids = np.zeros(0, dtype=np.int64)
         self._sensor = NamedLandmarkSensor(self.model, self.landmark, config.likelihood.build())
-        # (M,) landmarks of the map, ascending, and how often each was seen.
+        # (M,) landmarks of the map, ascending, how often each was seen, and for how many pairs it has not been.
         self._held = np.zeros(0, dtype=np.int64)
-        self._observations = np.zeros(0, dtype=np.int64)
+        self._observations, self._unseen_for = np.zeros((2, 0), dtype=np.int64)
 
     def observe(self, frame: Pair[FeatureFrame], belief: Belief) -> Sequence[Observations]:
         self.ids = np.where(frame.for_map, frame.features.landmarks, NULL)
@@ -572,27 +633,29 @@ class NamedLandmarks(Landmarks[FeatureFrame]):
         shown = frame.features.take(frame.for_map)
         started = self._sensor.new_landmarks(shown, belief, observed)
         held = np.union1d(self._held, shown.landmarks)
-        observations = np.isin(held, shown.landmarks).astype(np.int64)
-        observations[np.searchsorted(held, self._held)] += self._observations
-        if self.config.kind == "joint":
-            dropped = surplus(held, observations, shown.landmarks, self.config.active)
-            if dropped.size:
-                belief.map.remove(dropped)
-            kept = ~np.isin(held, dropped)
-            held, observations = held[kept], observations[kept]
-        self._held, self._observations = held, observations
+        before, seen = np.searchsorted(held, self._held), np.isin(held, shown.landmarks)
+        observations, unseen_for = np.zeros((2, held.size), dtype=np.int64)
+        observations[before], unseen_for[before] = self._observations, self._unseen_for + 1
+        self._held, self._observations = held, observations + seen
+        self._unseen_for = np.where(seen, 0, unseen_for)
+        make_room(belief.map, held, self._unseen_for)
         return started
 
     def associate(self, pair: Pair[FeatureFrame], belief: Belief) -> np.ndarray:
         """By their names; where the view is uncertain, only those that were observed more than once."""
         known, names = self.seen_again() if pair.uncertain else self._held, pair.features.landmarks
-        return np.where(pair.for_map & np.isin(names, known), names, NULL)
+        return np.where(pair.for_map & np.isin(names, known) & belief.map.holds(names), names, NULL)
+
+    def put_away(self, pair: Pair[FeatureFrame], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
+        names = pair.features.landmarks
+        return np.where(pair.for_map & free & np.isin(names, joint.old.ids) & ~joint.holds(names), names, NULL)
 
     def seen_again(self) -> np.ndarray:
         return self._held[self._observations >= SEEN_AGAIN]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {"names/held": self._held, "names/observations": self._observations}
+        counted = self._held, self._observations, self._unseen_for
+        return {f"names/{name}": array for name, array in zip(_NAMES, counted, strict=True)}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._held, self._observations = read(arrays, _NAMES, "names/").values()
+        self._held, self._observations, self._unseen_for = read(arrays, _NAMES, "names/").values()

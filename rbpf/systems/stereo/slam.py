@@ -136,7 +136,9 @@ class StereoSlam(System):
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
-        joint = JointMap(SE3, compiled=config.compiled) if config.map.kind == "joint" else None
+        joint = None
+        if config.map.kind == "joint":
+            joint = JointMap(SE3, compiled=config.compiled, submap=config.map.submap, passed_on=True)
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
@@ -451,18 +453,36 @@ class StereoSlam(System):
         if landmarks.seen_again().size < least:
             return motion, ""
         after = f"after {at.assumed} pair{'s'[: at.assumed > 1]} whose motion was only assumed"
-        belief = self.filter.expect(motion, view.stamp_ns)
-        count = int((landmarks.associate(view, belief) != NULL).sum())
+        _, count = self._associated(view, motion)
         if count < least:
+            belief = self.filter.expect(motion, view.stamp_ns)
             place = landmarks.relocalised(view, belief, self.config.odometry.estimate)
             if place is not None:
                 count, heaviest = place[1], self.filter.particles.state[belief.mode]
                 motion = Odometry(SE3.between(heaviest, place[0]), motion.cov)
+                self._associated(view, motion)
         if count >= least:
             return motion, f"the camera is found again by {count} landmarks of the map, {after}"
         if at.waiting >= self.config.recovery.patience:
             return motion, f"the camera is not found again in the map, which goes on from here, {after}"
         return None, ""
+
+    def _associated(self, view: Pair[Any], moved: Odometry) -> tuple[Pair[Any], int]:
+        """The view with the landmark of each feature, and how many have one.
+
+        What a joint map has put away of these it holds again, for which its window ends. Of what it cannot hold yet, too few
+        from afar, the features are left out.
+        """
+        landmarks, belief = self.front_end.landmarks, self.filter.expect(moved, view.stamp_ns)
+        ids, away = landmarks.associate(view, belief), np.zeros(len(view), dtype=bool)
+        if self.joint is not None:
+            found = landmarks.put_away(view, belief, self.joint, ids == NULL)
+            away = found != NULL
+            if self.joint.bring_back(np.append(ids[ids != NULL], found[away])):
+                self.filter.consolidate()
+                ids = landmarks.associate(view, self.filter.expect(moved, view.stamp_ns))
+                away &= ids == NULL
+        return replace(view, landmarks=ids, for_map=view.for_map & ~away), int((ids != NULL).sum())
 
     def _proposed(self, view: Pair[Any], moved: Odometry) -> tuple[Pair[Any], Odometry, Proposal | None]:
         """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
@@ -471,9 +491,8 @@ class StereoSlam(System):
         the odometry moves the particles.
         """
         assert self.filter.stamp_ns is not None
-        ids = self.front_end.landmarks.associate(view, self.filter.expect(moved, view.stamp_ns))
-        view = replace(view, landmarks=ids)
-        if (ids != NULL).sum() < self.config.map.min_agreeing:
+        view, count = self._associated(view, moved)
+        if count < self.config.map.min_agreeing:
             return view, moved, None
         dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
         prior = self._constrained(self.visual_odometry.prior.increment(self.reckoning.velocity_at_update, dt))
