@@ -9,7 +9,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import KnownPixels
-from rbpf.systems.mono.known_start import (
+from rbpf.systems.mono.start.known import (
     ISOTROPIC,
     TRIANGULATED,
     KnownStart,

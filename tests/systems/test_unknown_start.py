@@ -12,9 +12,9 @@ from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
-from rbpf.systems.mono.adjustment import SCALE_STD, Linearised, Structure, Window, optimum
+from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, optimum
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
-from rbpf.systems.mono.unknown_start import UnknownStart
+from rbpf.systems.mono.start.unknown import UnknownStart
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known

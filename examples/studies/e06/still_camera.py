@@ -11,7 +11,7 @@ from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
 from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
-from rbpf.systems.mono.known_start import world_of
+from rbpf.systems.mono.start.known import world_of
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.simulation.images import Imaging
 

@@ -29,7 +29,7 @@ from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
-from rbpf.systems.mono.adjustment import (
+from rbpf.systems.mono.start.adjustment import (
     MIN_FRAMES,
     Adjusted,
     FirstFrames,
@@ -44,7 +44,7 @@ from rbpf.systems.mono.adjustment import (
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.known_start import world_of
+from rbpf.systems.mono.start.known import world_of
 from rbpf.systems.system import Revision
 
 LINEARISATIONS = 3

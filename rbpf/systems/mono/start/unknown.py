@@ -3,7 +3,7 @@
 Before a camera has moved, nothing tells the depth of what it sees, and of a scene that is nearly flat two shapes with
 two motions look alike. Particles decide too early: each image alone tells little, those that happen to fit it survive,
 and what later images say comes too late. All first images together tell it well. So while depths are unknown, the
-frames until now are adjusted in one piece now and then ({py:mod}`rbpf.systems.mono.adjustment`), whole paths are drawn
+frames until now are adjusted in one piece now and then ({py:mod}`rbpf.systems.mono.start.adjustment`), whole paths are drawn
 from the Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
 S. Sénécal, 2006).
 """
@@ -20,7 +20,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.systems.mono.adjustment import (
+from rbpf.systems.mono.start.adjustment import (
     MIN_FRAMES,
     Adjusted,
     FirstFrames,
