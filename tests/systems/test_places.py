@@ -84,7 +84,7 @@ def test_a_lost_camera_is_found_in_an_old_sub_map():
     ]
     poses = SE3.retract(SE3.identity(), np.stack(shake, axis=-1))
     search = SearchConfig(measurements=15, min_in_view=20)
-    config = MonoConfig(map="joint", particles=30, starting_particles=30, settled_frames=4, submap=24, search=search)
+    config = MonoConfig(map="joint", particles=30, settled_frames=4, submap=24, search=search)
     slam, held = MonoSlam(CAMERA, config, known_points()), 0
     for frame in Pictures(
         texture(), poses, lambda t, image: np.zeros_like(image) if away <= t < dark else image
