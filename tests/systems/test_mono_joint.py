@@ -10,9 +10,9 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.systems.mono.start.adjustment import FirstFrames
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.slam import MonoSlam
+from rbpf.systems.mono.start.adjustment import FirstFrames
 from tests.systems.mono_logs import desk, errors, nees, without_known
 from tests.systems.plane_sequences import CAMERA, sequence
 

@@ -12,8 +12,8 @@ from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
-from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, optimum
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
+from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, optimum
 from rbpf.systems.mono.start.unknown import UnknownStart
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known

@@ -29,6 +29,9 @@ from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
+from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
+from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.start.adjustment import (
     MIN_FRAMES,
     Adjusted,
@@ -41,9 +44,6 @@ from rbpf.systems.mono.start.adjustment import (
     optimum,
     tangents,
 )
-from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
-from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
-from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.start.known import world_of
 from rbpf.systems.system import Revision
 

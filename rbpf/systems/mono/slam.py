@@ -34,16 +34,16 @@ from rbpf.sensors.readers.images.calibration import camera_text
 from rbpf.systems.anchoring import Anchored, relative_estimate
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.active_search import OutlierGate
-from rbpf.systems.mono.start.adjustment import FirstFrames
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
 from rbpf.systems.mono.joint import NUMBERS, HandOver
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
-from rbpf.systems.mono.start.known import KnownStart, constellation, constellation_records, require_texture, world_of
 from rbpf.systems.mono.places import Places
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
+from rbpf.systems.mono.start.adjustment import FirstFrames
+from rbpf.systems.mono.start.known import KnownStart, constellation, constellation_records, require_texture, world_of
 from rbpf.systems.mono.start.unknown import UnknownStart
 from rbpf.systems.system import (
     DIAGNOSTICS,

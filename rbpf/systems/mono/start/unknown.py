@@ -20,6 +20,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.start.adjustment import (
     MIN_FRAMES,
     Adjusted,
@@ -32,8 +34,6 @@ from rbpf.systems.mono.start.adjustment import (
     optimum,
     structure_of,
 )
-from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.system import Revision
 
 DISCONNECTED = (
