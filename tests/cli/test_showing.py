@@ -125,8 +125,12 @@ def test_the_examples_of_the_help_are_commands(capsys, monkeypatch):
     shown = [re.sub(r"^ *\w+( it)?: +", "", line) for line in lines if re.match(r" +(\w+( it)?: +)?rbpf [a-z]", line)]
     examples = [words.split() for line in shown for words in line.split(";") if words.split()[0] == "rbpf"]
     assert len(examples) >= 20
+    called = list[object]()
+    for kind in COMMANDS.values():
+        monkeypatch.setattr(kind, "__call__", lambda self: called.append(self))
     for _, *words in examples:
-        APP.require_known(words, "rbpf")
+        APP.call(words, "rbpf")
+    assert len(called) == len(examples)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

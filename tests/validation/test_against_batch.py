@@ -276,7 +276,7 @@ def test_the_batch_is_moved_as_the_filter_is(moved_run):
     batch = replace(batch, world_from_body=off.transform_poses(truth.poses))
     write_tum(moved_run / "batch.tum", batch)
     in_another_world(moved_run)
-    figure = plots.path_figure(load(moved_run))
+    figure = plots.plot_trajectory(load(moved_run))
     lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
     assert lines["batch optimum"] == pytest.approx(lines["truth"], abs=1e-6)
     assert np.abs(lines["filter"][truth.rows] - lines["truth"]).max() < 1.0

@@ -157,7 +157,8 @@ class Places:
                 if np.isin(seen.landmarks, joint.old.maps[number].ids).sum() < MIN_FITTED
             ]
         for number, sighting in found:
-            if sighting is None:
+            # Evidence alone is not asked of fewer than what a relocalisation takes: its own errors grow as matches get few.
+            if sighting is None or (image is not None and len(sighting.agreeing[0]) < self.config.min_inliers):
                 continue
             filter_.consolidate()
             prior = joint.old.relative(number, joint.finished())
