@@ -98,8 +98,8 @@ def test_the_batch_optimum_of_them_lies_beside(finished):
 def test_the_posterior_over_paths(finished):
     with np.load(finished / "posterior.npz") as archive:
         paths, log_weights, stamps = (archive[n] for n in ("world_from_camera", "log_weights", "stamps_ns"))
-    # Depths are not settled yet: those that begin.
-    assert paths.shape == (FRAMES, 250, 7) and stamps.size == FRAMES
+    # Depths are not settled yet: the particles that begin.
+    assert paths.shape == (FRAMES, 8, 7) and stamps.size == FRAMES
     assert np.exp(log_weights).sum() == pytest.approx(1.0)
     told, filtered = read_tum(finished / "posterior.tum"), read_tum(finished / "trajectory.tum")
     around = SE3.local(told.world_from_body[:, None], paths)

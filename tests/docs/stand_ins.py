@@ -200,9 +200,10 @@ def shortened(arguments: list[str], page: str = "") -> list[str]:
             at = arguments.index(option)
             arguments = arguments[:at] + arguments[at + 2 :]
     given = {word.partition("=")[0] for word in arguments}
-    for start, more in (SHORTER | ({} if page in WHOLE else FEW)).items():
-        if tuple(arguments[: len(start)]) == start:
-            arguments = arguments + [word for word in more if word.partition("=")[0] not in given]
+    for shorter, as_given in ((SHORTER, set[str]()), ({} if page in WHOLE else FEW, given)):
+        for start, more in shorter.items():
+            if tuple(arguments[: len(start)]) == start:
+                arguments = arguments + [word for word in more if word.partition("=")[0] not in as_given]
     return arguments
 
 
