@@ -142,6 +142,8 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
     Innovations (N, K, M, p), their predicted covariances (N, K, M, p, p), the pose's included, and whether the particle holds
     the landmark (N, M), give (N, K): index of a landmark, NEW or NULL.
     """
+    from scipy.optimize import linear_sum_assignment  # a third of the time that all imports take; seldom needed
+
     chol = gaussian.cholesky(cov)
     squared = np.square(gaussian.solve_lower(chol, nu)).sum(axis=-1)
     log_density = -0.5 * (squared + gaussian.log_det(chol) + nu.shape[-1] * np.log(2 * np.pi))
@@ -163,8 +165,6 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
         square = np.full((k, m + k), _FORBIDDEN)
         square[:, :m] = cost[i]
         square[np.arange(k), m + np.arange(k)] = alternative[i]
-        from scipy.optimize import linear_sum_assignment  # a third of the time that all imports take; seldom needed
-
         columns = linear_sum_assignment(square)[1]
         chosen[i] = np.where(columns < m, columns, fallback[i])
     return chosen

@@ -40,7 +40,7 @@ from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageScreen, ImageSensor, Measurement
 from rbpf.systems.mono.joint import NUMBERS, HandOver
 from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_mono_map, known_map_arrays
-from rbpf.systems.mono.places import Places
+from rbpf.systems.mono.place_recognition import PlaceRecognition
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
 from rbpf.systems.mono.start.adjustment import FirstFrames
 from rbpf.systems.mono.start.known import KnownStart, constellation, constellation_records, require_texture, world_of
@@ -67,8 +67,6 @@ LOST = "the camera is lost, its pose is held until the map is seen again"
 FOUND_AGAIN = "the camera is found again"
 FOUND_IN_MAP = "the camera is found in the map"
 COME_BACK = "the camera is back where it was, its way and its map are corrected"
-EXACT = 1e-4
-"""Standard deviation [rad, m] of where a lost camera is in a sub-map that begins where it is."""
 
 
 @final
@@ -174,7 +172,7 @@ class MonoSlam(System):
             self.loss = TrackingLoss(self.sensor, config, known_map.views, known_map.size_m)
         else:
             self.loss = TrackingLoss(self.sensor, config)
-        self.places = Places(self.loss.relocaliser, config.relocalisation)
+        self.place_recognition = PlaceRecognition(self.loss.relocaliser, config)
         is_unknown = points is None and wrapped is None
         self.start = UnknownStart(
             config, self.features, self.first, lambda: self._new_filter(self.features), is_unknown
@@ -260,12 +258,10 @@ class MonoSlam(System):
                 measured.recognised = self.attempt is not None and self.attempt.certain
                 if self.joint is not None and self.attempt is not None and measured.image is not None:
                     pose, cov = self.loss.trusted
-                    trusted, sighting = Estimate(pose, cov + self.loss.drift(stamp_ns)), self.attempt.sighting
-                    if self.attempt.prior is not None and sighting is not None:
-                        measured.recognised |= self.places.is_here(self.joint, sighting, trusted)
-                    elif self.places.recover(self.filter, self.joint, measured.image, trusted):
-                        here, measured.recognised = self.joint.world(SE3.identity((self.filter.n,))), True
-                        prior = PosePrior(here, EXACT**2 * np.eye(6), self.config.velocity.start_std())
+                    lost = Estimate(pose, cov + self.loss.drift(stamp_ns))
+                    asked = self.filter, self.joint, measured.image, self.attempt, lost
+                    is_known, found = self.place_recognition.relocalise(*asked)
+                    measured.recognised, prior = measured.recognised or is_known, found or prior
 
         if prior is not None and self.joint is not None:  # its states are in a frame of its own
             frame_of_states = self.joint.world(SE3.identity((self.filter.n,)))
@@ -323,7 +319,7 @@ class MonoSlam(System):
 
         if self.joint is not None and not sensor.bad_frames:
             image, used = (measured.image, measured.used) if isinstance(measured, Measurement) else (None, measured)
-            if self.places.come_back(self.filter, self.joint, image, used):
+            if self.place_recognition.come_back(self.filter, self.joint, image, used):
                 messages.append(COME_BACK)
                 self.loss.trust(self.filter, image)
                 estimate = self.joint.estimate(self.filter.particles)

@@ -8,7 +8,7 @@ from rbpf.core.particles import Estimate
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
-from rbpf.systems.mono.places import RISK, WRONG, log_likelihood, log_odds
+from rbpf.systems.mono.place_recognition import RISK, WRONG, log_likelihood, log_odds
 from rbpf.systems.mono.relocalisation import CORNER_PX
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.system import TrackingState

@@ -20,11 +20,12 @@ from rbpf.core.particles import Estimate, Particles, uniform_log_weights
 from rbpf.lie import SE3, skew
 from rbpf.maps.joint.solution import Given
 from rbpf.maps.joint_map import JointMap
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.resection import resect_consensus
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.systems.mono.config import RelocalisationConfig
-from rbpf.systems.mono.relocalisation import CORNER_PX, MIN_FITTED, SCALES, Relocaliser, Sighting
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.relocalisation import CORNER_PX, MIN_FITTED, SCALES, Attempt, Relocaliser, Sighting
 
 WRONG = 0.5
 """Matches that are wrong by what is expected beforehand, as a fraction, and may be anywhere in the image."""
@@ -40,6 +41,8 @@ ASKED = 2
 """Old sub-maps that are asked in a frame."""
 VOTERS = 150
 """Corners of an image that say which ones."""
+EXACT = 1e-4
+"""Standard deviation [rad, m] of where a lost camera is in a sub-map that begins where it is."""
 ROUNDS = 8
 DEPTH_RATIO = 10.0
 """Standard deviation of the range of what a single image shows, which has none, as a fraction of what is assumed."""
@@ -130,11 +133,12 @@ def log_odds(
 
 
 @final
-class Places:
+class PlaceRecognition:
     """Asks the old sub-maps of a joint map where the camera is."""
 
-    def __init__(self, relocaliser: Relocaliser, config: RelocalisationConfig) -> None:
-        self.relocaliser, self.sensor, self.config = relocaliser, relocaliser.sensor, config
+    def __init__(self, relocaliser: Relocaliser, config: MonoConfig) -> None:
+        self.relocaliser, self.sensor, self.config = relocaliser, relocaliser.sensor, config.relocalisation
+        self._std_velocity = config.velocity.start_std()
         self.features = self.sensor.features
         self._described: dict[int, np.ndarray] = {}  # by row: how a landmark looked at first
 
@@ -169,13 +173,23 @@ class Places:
                 return True
         return False
 
-    def is_here(self, joint: JointMap, sighting: Sighting, lost: Estimate) -> bool:
-        """Whether a camera that is lost, and was sighted among what the present sub-map holds, is there but for a risk."""
-        here = Place.of(joint)
-        prior = Estimate(SE3.between(here.world_from_place, lost.mean), FURTHER**2 * lost.cov)
-        return self._odds(joint, here, sighting, prior)[0] >= -np.log(RISK_LOST)
+    def relocalise(
+        self, filter_: Filter, joint: JointMap, image: np.ndarray, attempt: Attempt, lost: Estimate
+    ) -> tuple[bool, PosePrior | None]:
+        """Whether a lost camera is recognised, and its pose where that is in an old sub-map, from which another one begins.
 
-    def recover(self, filter_: Filter, joint: JointMap, image: np.ndarray, lost: Estimate) -> bool:
+        An attempt was made to find it in the present one; `lost` says where it may be.
+        """
+        if attempt.prior is None or attempt.sighting is None:
+            if not self._recover(filter_, joint, image, lost):
+                return False, None
+            here = joint.world(SE3.identity((filter_.n,)))
+            return True, PosePrior(here, EXACT**2 * np.eye(6), self._std_velocity)
+        present = Place.of(joint)
+        prior = Estimate(SE3.between(present.world_from_place, lost.mean), FURTHER**2 * lost.cov)
+        return self._odds(joint, present, attempt.sighting, prior)[0] >= -np.log(RISK_LOST), None
+
+    def _recover(self, filter_: Filter, joint: JointMap, image: np.ndarray, lost: Estimate) -> bool:
         """Whether a lost camera is found in an old sub-map, and begins another one there; `lost` says where it may be."""
         y = SE3.between(joint.world(SE3.identity((1,)), slice(1))[0], lost.mean)
         for number in self._ask(joint, image) if joint.old.maps else []:
