@@ -21,7 +21,6 @@ from dataclasses import replace
 from typing import final
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
@@ -43,6 +42,7 @@ from rbpf.core.particles import Estimate, Information, Particles, Prior, take, u
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
+from rbpf.maps.joint.present import Present
 from rbpf.maps.joint.rows import (
     Group,
     Reading,
@@ -145,6 +145,9 @@ class JointMap(Map):
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
         self.held = JointColumns(self.space, self._first, self.held.kinds)
+        self._leave_step()
+
+    def _leave_step(self) -> None:
         self._in_step = False  # from prediction to correction: what is observed is associated with what is held
         self._gain: np.ndarray | None = None
         self._reading: Reading | None = None  # of what is observed in this step
@@ -224,8 +227,7 @@ class JointMap(Map):
 
     def consolidate(self, particles: Particles) -> Particles:
         """Ends the window: the frame moves to the robot; what the particles differ by enters the common covariance."""
-        self.origin, self.held.clones, mean, self.cov = self._consolidated(particles)
-        self.mean = np.repeat(mean[None], self.n, axis=0)
+        self._take(self._consolidated(particles))
         if self.submap is not None:
             if self.leaving.size or self._returning.size:
                 self._exchange()
@@ -281,25 +283,24 @@ class JointMap(Map):
         observed = np.isin(leaving, self._observed)
         self._returning, self.leaving, leaving = leaving[:0], leaving[observed], leaving[~observed]
         far = int((~np.isin(returning, self.old.near)).sum()) >= FEWEST
+        present = self._present()
         if leaving.size or far:
-            self._pass_on(leaving, returning if far else None)
-        self._bring_in(returning[np.isin(returning, self.old.near)])
-
-    def _bring_in(self, returning: np.ndarray) -> None:
-        """Points (K,) about the start are held again."""
-        if returning.size:
-            present = self.finished()
-            seen, slope, rest = self.old.brought_back(returning, present)
-            columns = np.append(np.arange(self.space.dim), self.held.of_one_kind(present.ids).columns)
-            cross = slope @ self.cov[columns]
-            self.held.add(returning, self.point, np.full(returning.size, -1), self.held.clones[:0])
-            self.mean = np.concatenate([self.mean, np.tile(seen.ravel(), (self.n, 1))], axis=1)
-            self.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
-            self._given_ids = np.union1d(self._given_ids, returning)
+            present.pass_on(self.old, leaving, returning if far else None)
+        present.bring_in(self.old, returning[np.isin(returning, self.old.near)])
+        self._take(present)
 
     def finished(self) -> SubMap:
         """The present sub-map as it would be if it ended here, when a window has just done so."""
-        return self._finished(self.origin, self.mean[0], self.cov)
+        return self._present().finished(self.old)
+
+    def _present(self) -> Present:
+        """The present sub-map, when a window has just ended and all particles are alike."""
+        return Present(self.origin, self.held, self.mean[0], self.cov, self._given_ids)
+
+    def _take(self, present: Present) -> None:
+        """All particles are as the present sub-map is."""
+        self.origin, self.held, self.cov, self._given_ids = present.origin, present.held, present.cov, present.given
+        self.mean = np.repeat(present.mean[None], self.n, axis=0)
 
     def recognise(self, seen: Given, tied: bool = True) -> None:
         """Points of old sub-maps are seen again from the frame, when a window has just ended: a loop is closed.
@@ -308,53 +309,16 @@ class JointMap(Map):
         held again. Not `tied`, what is seen is a sub-map of its own, as how the robot came here is not known: the substate
         alone is held on.
         """
-        none = seen.ids[:0]
+        present = self._present()
         if tied:
-            self._pass_on(none, seen.ids, seen)
-            self._bring_in(seen.ids)
+            present.pass_on(self.old, seen.ids[:0], seen.ids, seen)
+            present.bring_in(self.old, seen.ids)
         else:
-            own, here = slice(self.space.dim, self._first), np.eye(self.space.dim)
-            substate = self.mean[:, own], self.cov[own, own]
-            self.old.join(self.finished())
-            sighting = SubMap(self.space.identity(), none, seen.points[:0], here, tied=False).seeing(seen)
-            self.old.join(sighting, True, seen.ids)
-            self._begin_submap()
-            self.mean[:, own], self.cov[own, own] = substate
-            # From where the next one begins, they are what all sub-maps say of them.
-            known = self.old.given(seen.ids)
-            assert known is not None
-            self.held.add(seen.ids, self.point, np.full(seen.ids.size, -1), self.held.clones[:0])
-            self.mean = np.concatenate([self.mean, np.tile(known.points.ravel(), (self.n, 1))], axis=1)
-            self.cov = block_diag(self.cov, known.cov)
-            self._given_ids, self.leaving, self._returning = seen.ids, none, none
+            present.begin_again(self.old, seen)
+            self.leaving = self._returning = seen.ids[:0]
+            self._leave_step()
+        self._take(present)
         self.old.look_from(self.finished())
-
-    def _pass_on(self, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:
-        """Ends the present sub-map; what does not leave goes over into the next one as it is, and what is `seen` does not."""
-        d, dim, seams = self.space.dim, self.point.dim, self._seams
-        # What drives the motion ties the two as landmarks do: as it is here it is held on, in numbers taken for places.
-        count = -(-self._substate[0].size // dim)
-        names = -1 - np.arange(count) - count * len(self.old.maps)
-        taken = np.append(np.arange(self.mean.shape[1]), np.arange(d, self._first))
-        self.mean, self.cov = self.mean[:, taken], self.cov[np.ix_(taken, taken)]
-        if more := count * dim - self._substate[0].size:
-            self.mean = np.pad(self.mean, ((0, 0), (0, more)))
-            self.cov = np.pad(self.cov, ((0, more), (0, more)))
-            self.cov[-more:, -more:] = np.eye(more)
-        self.held.add(names, self.point, np.full(count, -1), self.held.clones[:0])
-        finished = self.finished()
-        self.old.join(finished if seen is None else finished.seeing(seen), wanted is not None, wanted)
-        self._keep(self.held.drop(self.held.rows_of(np.append(leaving, seams))))
-        self.origin = self.space.identity()
-        self.mean[:, :d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0
-        self._given_ids = self.held.table.ids[self.held.table.kind == 0]
-        if (known := self.old.given(self._given_ids)) is not None:
-            # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
-            columns = self.held.of_one_kind(known.ids).columns.ravel()
-            own = self.cov[np.ix_(columns, columns)]
-            gain = np.linalg.solve(own, self.cov[columns]).T
-            self.mean = self.mean + gain @ (known.points.ravel() - self.mean[0, columns])
-            self.cov = gaussian.symmetrise(self.cov + gain @ (known.cov - own) @ gain.T)
 
     def widened(self) -> "JointMap":
         """With the landmarks of old sub-maps that are next to the frame: what may be expected, and nothing is done with it."""
@@ -377,31 +341,7 @@ class JointMap(Map):
 
     def landmarks(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Names (M,) of all landmarks, means (M, D) and covariances (M, D, D) in the world."""
-        origin, clones, mean, cov = self._consolidated(particles)
-        d, dim, held, names = self.space.dim, self.point.dim, copy(self.held), self.held.table.ids
-        held.clones, rays = clones, self.held.table.kind != 0
-        if self.old.maps:
-            present = self._finished(origin, mean, cov)
-            whole = self.old.landmarks(present)
-            if not rays.any():
-                return whole
-            here, cov = self.old.end(present), cov.copy()
-            origin, cov[:d], cov[:, :d] = here.mean, 0.0, 0.0
-            cov[:d, :d] = here.cov
-        turn = self.space.rotation(origin)
-        means, covs = np.empty((names.size, dim)), np.empty((names.size, dim, dim))
-        for kind in held.by_kind():
-            points, slope = held.points(kind, mean)
-            # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
-            columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
-            blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
-            by_all = turn @ np.concatenate([self.space.transform_jacobian(points), slope], axis=-1)
-            means[kind.rows] = self.space.transform(origin, points)
-            covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
-        if self.old.maps:
-            of_rays = names[rays], means[rays], covs[rays]
-            names, means, covs = (np.concatenate(pair) for pair in zip(whole, of_rays, strict=True))
-        return names.copy(), means, covs
+        return self._consolidated(particles).landmarks(self.old)
 
     def moments(self, particles: Particles, of: Part | np.ndarray = Part.LANDMARK) -> tuple[np.ndarray, np.ndarray]:
         """As `Belief.moments`; the substate stays in the robot's frame."""
@@ -420,12 +360,6 @@ class JointMap(Map):
             return gaussian.mixture_moments(particles.weights, self.mean[:, own], self.cov[own, own][None])
         return self.landmarks(particles)[1:]
 
-    def _finished(self, origin: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> SubMap:
-        points = self.held.table.ids[self.held.table.kind == 0]
-        columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self._given_ids, points)
-        used = np.append(np.arange(self.space.dim), columns)
-        return SubMap(origin, points, mean[columns], cov[np.ix_(used, used)], given=self.old.given(given))
-
     def world(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
         """World_from_robot (n, E) of some particles, without what is uncertain about each one's frame."""
         if self.old.frame is None:
@@ -438,8 +372,8 @@ class JointMap(Map):
         frame = self.space.retract(self.origin, self.mean[particles, : self.space.dim])
         return self.space.compose(frame, state)
 
-    def _consolidated(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """World_from_frame, clones, mean and covariance in a frame at the robot, Mathematics (consolidation)."""
+    def _consolidated(self, particles: Particles) -> Present:
+        """The present sub-map in a frame at the robot, Mathematics (consolidation)."""
         space, weights, state = self.space, particles.weights, particles.state
         d = space.dim
         world = self._from_start(state)
@@ -453,18 +387,19 @@ class JointMap(Map):
             if not kind.landmark.anchored:
                 moved[:, kind.columns] = kind.landmark.seen_from(space, state[:, None], self.mean[:, kind.columns])[0]
                 blocks.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
-        clones = self.held.clones
+        held, clones = copy(self.held), self.held.clones
         if len(clones):
             # Mathematics (clone), with K' what the mean of the particles sees.
             at = self.held.clone_columns(np.arange(len(clones)))
             poses = space.retract(clones, self.mean[:, at])
-            clones = space.between(centre, space.retract(clones, before[at]))
+            held.clones = clones = space.between(centre, space.retract(clones, before[at]))
             moved[:, at] = space.local(clones, space.between(state[:, None], poses))
         mean = weighted_mean(moved, weights)
         if len(clones):
             blocks.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
         mean[:d] = 0.0  # the mean of all worlds is the origin
-        return origin, clones, mean, plus_gram(turned(self.cov, blocks), apart(moved, weights))
+        cov = plus_gram(turned(self.cov, blocks), apart(moved, weights))
+        return Present(origin, held, mean, cov, self._given_ids)
 
     def _turn(self, particles: Particles) -> np.ndarray:
         """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
@@ -504,11 +439,6 @@ class JointMap(Map):
     @property
     def ids(self) -> np.ndarray:
         return self.held.table.ids[self.held.table.ids >= 0]
-
-    @property
-    def _seams(self) -> np.ndarray:
-        """Names of what drove the motion where the present sub-map began."""
-        return self.held.table.ids[self.held.table.ids < 0]
 
     @property
     def stored_fraction(self) -> float:

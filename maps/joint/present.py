@@ -1,0 +1,125 @@
+"""The sub-map that a joint map is making, where all its particles are alike, and what it exchanges with finished ones.
+
+That is whenever a window has ended: what leaves goes over exactly, and comes back with all that is known of it,
+Mathematics (passed-on).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from rbpf import gaussian
+from rbpf.maps.joint.columns import JointColumns
+from rbpf.maps.joint.rows import diagonal_blocks
+from rbpf.maps.joint.solution import Given, SubMap
+from rbpf.maps.joint.submaps import SubMaps
+
+
+@dataclass
+class Present:
+    """One Gaussian of frame, substate, landmarks and clones; what is done with finished sub-maps changes it in place."""
+
+    origin: np.ndarray  #: (E,) the frame's mean pose, as seen from where the sub-map begins.
+    held: JointColumns  #: which landmarks and clones there are, and in which columns.
+    mean: np.ndarray  #: (n,).
+    cov: np.ndarray  #: (n, n).
+    given: np.ndarray  #: (K,) landmarks of which finished sub-maps have told it something.
+
+    def finished(self, old: SubMaps) -> SubMap:
+        """As it would be if it ended here."""
+        points = self.held.table.ids[self.held.table.kind == 0]
+        columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
+        used = np.append(np.arange(self.held.space.dim), columns)
+        return SubMap(self.origin, points, self.mean[columns], self.cov[np.ix_(used, used)], given=old.given(given))
+
+    def pass_on(self, old: SubMaps, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:
+        """Ends it, and begins the next one; what does not leave goes over as it is.
+
+        All are solved for if landmarks are `wanted` from afar. What is `seen` of old landmarks besides stays behind.
+        """
+        held, d = self.held, self.held.space.dim
+        point, dim, driving = held.kinds[0], held.kinds[0].dim, held.first - d
+        seams = held.table.ids[held.table.ids < 0]
+        # What drives the motion ties the two as landmarks do: as it is here it is held on, in numbers taken for places.
+        count = -(-driving // dim)
+        names = -1 - np.arange(count) - count * len(old.maps)
+        taken = np.append(np.arange(self.mean.size), np.arange(d, held.first))
+        self.mean, self.cov = self.mean[taken], self.cov[np.ix_(taken, taken)]
+        if more := count * dim - driving:
+            self.mean, self.cov = np.pad(self.mean, (0, more)), np.pad(self.cov, ((0, more), (0, more)))
+            self.cov[-more:, -more:] = np.eye(more)
+        held.add(names, point, np.full(count, -1), held.clones[:0])
+        ended = self.finished(old)
+        old.join(ended if seen is None else ended.seeing(seen), wanted is not None, wanted)
+        columns = held.drop(held.rows_of(np.append(leaving, seams)))
+        self.mean, self.cov = self.mean[columns], self.cov.take(columns, axis=0).take(columns, axis=1)
+        self.origin = held.space.identity()
+        self.mean[:d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0
+        self.given = held.table.ids[held.table.kind == 0]
+        if (known := old.given(self.given)) is not None:
+            # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
+            columns = held.of_one_kind(known.ids).columns.ravel()
+            own = self.cov[np.ix_(columns, columns)]
+            gain = np.linalg.solve(own, self.cov[columns]).T
+            self.mean = self.mean + gain @ (known.points.ravel() - self.mean[columns])
+            self.cov = gaussian.symmetrise(self.cov + gain @ (known.cov - own) @ gain.T)
+
+    def bring_in(self, old: SubMaps, returning: np.ndarray) -> None:
+        """Landmarks (K,) about the start are held again."""
+        if returning.size:
+            ended = self.finished(old)
+            seen, slope, rest = old.brought_back(returning, ended)
+            columns = np.append(np.arange(self.held.space.dim), self.held.of_one_kind(ended.ids).columns)
+            cross = slope @ self.cov[columns]
+            self._hold(returning, seen)
+            self.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
+
+    def begin_again(self, old: SubMaps, seen: Given) -> None:
+        """Ends it, and begins one about old landmarks that are seen from the frame: how the robot came there is not known.
+
+        The substate alone is held on.
+        """
+        space, first, none = self.held.space, self.held.first, seen.ids[:0]
+        old.join(self.finished(old))
+        sighting = SubMap(space.identity(), none, seen.points[:0], np.eye(space.dim), tied=False).seeing(seen)
+        old.join(sighting, True, seen.ids)
+        self.held, self.origin, self.given = JointColumns(space, first, self.held.kinds), space.identity(), none
+        self.mean, self.cov = self.mean[:first].copy(), self.cov[:first, :first].copy()
+        self.mean[: space.dim], self.cov[: space.dim], self.cov[:, : space.dim] = 0.0, 0.0, 0.0
+        # From where it begins, they are what all sub-maps say of them.
+        known = old.given(seen.ids)
+        assert known is not None
+        self._hold(seen.ids, known.points)
+        self.cov = block_diag(self.cov, known.cov)
+
+    def _hold(self, ids: np.ndarray, points: np.ndarray) -> None:
+        self.held.add(ids, self.held.kinds[0], np.full(ids.size, -1), self.held.clones[:0])
+        self.mean, self.given = np.append(self.mean, points), np.union1d(self.given, ids)
+
+    def landmarks(self, old: SubMaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Names (M,) of all landmarks, finished sub-maps' too, means (M, D) and covariances (M, D, D) in the world."""
+        held, space, cov, origin = self.held, self.held.space, self.cov, self.origin
+        d, dim, names, rays = space.dim, held.kinds[0].dim, held.table.ids, held.table.kind != 0
+        if old.maps:
+            ended = self.finished(old)
+            whole = old.landmarks(ended)
+            if not rays.any():
+                return whole
+            here, cov = old.end(ended), cov.copy()
+            origin, cov[:d], cov[:, :d] = here.mean, 0.0, 0.0
+            cov[:d, :d] = here.cov
+        turn = space.rotation(origin)
+        means, covs = np.empty((names.size, dim)), np.empty((names.size, dim, dim))
+        for kind in held.by_kind():
+            points, slope = held.points(kind, self.mean)
+            # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
+            columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
+            blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
+            by_all = turn @ np.concatenate([space.transform_jacobian(points), slope], axis=-1)
+            means[kind.rows] = space.transform(origin, points)
+            covs[kind.rows] = gaussian.symmetrise(by_all @ blocks @ np.swapaxes(by_all, -1, -2))
+        if old.maps:
+            of_rays = names[rays], means[rays], covs[rays]
+            names, means, covs = (np.concatenate(pair) for pair in zip(whole, of_rays, strict=True))
+        return names.copy(), means, covs
