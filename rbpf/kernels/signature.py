@@ -23,7 +23,6 @@ MATRIX = types.Array(float64, 2, "C")
 CUBE = types.Array(float64, 3, "C")
 HYPERCUBE = types.Array(float64, 4, "C")
 READ_ONLY = types.Array(float64, 2, "C", readonly=True)  #: A matrix that is not written: the caller's may be locked.
-READ_ONLY_CUBE = types.Array(float64, 3, "C", readonly=True)
 INDICES = types.Array(int64, 1, "C")
 INDEX_MATRIX = types.Array(int64, 2, "C")
 MASK = types.Array(types.boolean, 2, "C")
