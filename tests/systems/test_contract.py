@@ -114,7 +114,11 @@ RESUMED = {
         stereo, lambda: list(pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames()), (0, 5, 6, 9)
     ),
     "pairs, joint map": Case(
-        lambda: stereo(map=MapConfig(kind="joint", submap=30)), lambda: list(pairs(12).frames()), (0, 5, 7)
+        lambda: stereo(
+            map=MapConfig(kind="joint", submap=30), likelihood=replace(StereoConfig().likelihood, kind="outliers")
+        ),
+        lambda: list(pairs(12).frames()),
+        (0, 5, 7),
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
     "robot, joint map": Case(

@@ -133,9 +133,11 @@ def test_wrong_pixels_in_a_joint_map():
     assert nees[0] < 2.0 and nees[1] > 10.0
 
 
-def test_the_odometry_as_proposal_needs_landmarks_that_weigh(log):
+def test_settings_that_do_not_go_together_are_refused(log):
     with pytest.raises(InputError, match=r"odometry\.role=proposal needs proposal\.kind=ekf and map\.weigh=all"):
         filtered(log, replace(CONFIG, odometry=OdometryConfig(role="proposal")))
+    with pytest.raises(InputError, match=r"a likelihood that is a density, and likelihood\.kind=truncated is none"):
+        filtered(log, replace(CONFIG, likelihood=StereoConfig().likelihood, map=MapConfig(kind="joint")))
 
 
 def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:

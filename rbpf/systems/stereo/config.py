@@ -51,7 +51,8 @@ class MapConfig(Ranged):
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one Gaussian
     #: of all landmarks and the frame, given the last few updates (joint): an uncertainty that stays true. With it
     #: the odometry is the proposal, linearised once, and all candidates weigh, whatever odometry.role, proposal and
-    #: map.weigh say. It needs a likelihood that is a density, and more new landmarks than particles do.
+    #: map.weigh say. It needs a likelihood that is a density (likelihood.kind=outliers), and more new landmarks than
+    #: particles do.
     kind: Literal["particles", "joint"] = "particles"
     #: of a joint map: updates sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.

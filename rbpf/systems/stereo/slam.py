@@ -138,6 +138,11 @@ class StereoSlam(System):
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
         joint = None
         if config.map.kind == "joint":
+            if not config.likelihood.build().normalised:
+                raise InputError(
+                    f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
+                    "none: set likelihood.kind=outliers"
+                )
             joint = JointMap(SE3, compiled=config.compiled, submap=config.map.submap, passed_on=True)
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
