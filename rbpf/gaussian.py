@@ -108,7 +108,7 @@ def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n 
                 chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
                 if np.isfinite(chol).all():
                     return chol
-        chol, definite = _cholesky_batch(cov, 0.0)
+        chol, definite = _factored(cov, 0.0)
     _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
     return chol
 
@@ -126,7 +126,7 @@ def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch 
         _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
         skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
         _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
-    factor, definite = _cholesky_one(cov, _SINGULAR) if cov.ndim == 2 else _cholesky_batch(cov, _SINGULAR)
+    factor, definite = _factored(cov, _SINGULAR)
     if not definite.all():
         singular = ~definite
         negative = np.zeros_like(singular)
@@ -207,6 +207,13 @@ def unscented_transform(
 def _distinct(cov: Array) -> Array:
     # One of each axis of the batch along which all are the same entries in memory: they are factored once.
     return cov[tuple(slice(None) if stride else slice(1) for stride in cov.strides[:-2])]
+
+
+def _factored(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
+    if math.prod(cov.shape[:-2]) != 1:
+        return _cholesky_batch(cov, floor)
+    chol, definite = _cholesky_one(cov.reshape(cov.shape[-2:]), floor)
+    return chol.reshape(cov.shape), definite.reshape(cov.shape[:-2])
 
 
 def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:

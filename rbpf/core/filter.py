@@ -42,6 +42,7 @@ from rbpf.core.particles import (
     effective_sample_size,
     mixture_estimate,
     reweight,
+    take,
     uniform_log_weights,
 )
 from rbpf.core.proposals import EkfProposal
@@ -244,7 +245,7 @@ class Filter:
         log_w2 = densities.after_sampling
         if proposal.exact:
             # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
-            log_w1 = proposed.log_w1[parents]
+            log_w1 = take(proposed.log_w1, parents)
             log_w2 = densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
         log_before = log_weights
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")

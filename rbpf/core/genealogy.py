@@ -13,6 +13,7 @@ from rbpf.arrays import Int
 from rbpf.core.checkpoint import integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.kernels import forest
+from rbpf.kernels.forest import CHILDREN, GENERATION, ROW
 from rbpf.ranges import require_memory
 
 #: Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time.
@@ -20,6 +21,8 @@ _FIRST_CHECK = 4
 _MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
 DUE = integers("due", 2, least=0)  #: Of a `Schedule`.
 
+_COLUMNS = "parent", "children", "generation", "row"
+_NO_NODE = np.array([-1, 0, -1, 0])
 _FOREST = {
     "parent": integers("nodes", least=-1, below="nodes"),
     "children": integers("nodes", least=0),
@@ -46,8 +49,7 @@ class Lineage:
         self._oldest = 0
         self._allocate(4 * n)
         self._leaves = np.arange(n)
-        self._generation[:n], self._row[:n] = 0, np.arange(n)
-        self._children[:n] = 1
+        self._nodes[:n, CHILDREN], self._nodes[:n, GENERATION], self._nodes[:n, ROW] = 1, 0, np.arange(n)
         self._free = np.arange(4 * n - 1, n - 1, -1)
         self._n_free = self._free.size
         self._free = np.concatenate([self._free, np.zeros(n, dtype=np.int64)])
@@ -60,15 +62,16 @@ class Lineage:
 
     @property
     def nodes(self) -> int:
-        return self._parent.size - self._n_free
+        return len(self._nodes) - self._n_free
 
     def advance(self, ancestors: Int[np.ndarray, " N"]) -> None:
         """Starts a generation in which particle i descends from particle ancestors[i] (N,)."""
         if self._n_free < self.n:
             self._make_room()
         self.generation += 1
-        nodes = self._parent, self._children, self._generation, self._row, self._free, self._n_free, self._leaves
-        self._n_free = forest.advance(*nodes, np.ascontiguousarray(ancestors, dtype=np.int64), self.generation)
+        ancestors = np.ascontiguousarray(ancestors, dtype=np.int64)
+        begun = self._leaves, ancestors, self.generation
+        self._n_free = forest.advance(self._nodes, self._free, self._n_free, *begun)
         self._cache.clear()
 
     def rows(self, generation: int) -> Int[np.ndarray, " N"]:
@@ -80,8 +83,8 @@ class Lineage:
                 rows = np.full(self.n, self._settled[generation])
             else:
                 self._mark += 1
-                nodes = self._parent, self._generation, self._row, self._leaves
-                rows = np.asarray(forest.rows_at(*nodes, generation, self._found, self._stamp, self._mark))
+                scratch = self._found, self._stamp, self._mark
+                rows = np.asarray(forest.rows_at(self._nodes, self._leaves, generation, *scratch))
                 if (rows == rows[0]).all():
                     self._settled[generation] = int(rows[0])
             self._cache[generation] = rows
@@ -97,11 +100,11 @@ class Lineage:
             return self._identity.copy()
         nodes = self._members.get(generation)
         if nodes is None:
-            nodes = np.flatnonzero(self._generation == generation)
-            nodes = nodes[np.argsort(self._row[nodes])]
+            nodes = np.flatnonzero(self._nodes[:, GENERATION] == generation)
+            nodes = nodes[np.argsort(self._nodes[nodes, ROW])]
         # A node that died is free, or serves a later generation.
-        nodes = self._members[generation] = nodes[self._generation[nodes] == generation]
-        return np.asarray(self._row[nodes])
+        nodes = self._members[generation] = nodes[self._nodes[nodes, GENERATION] == generation]
+        return np.asarray(self._nodes[nodes, ROW])
 
     def distinct(self, generation: int) -> int:
         """Number of particles of a retained generation that still have descendants."""
@@ -127,8 +130,8 @@ class Lineage:
             self._members.pop(generation, None)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        names = ("parent", "children", "generation", "row", "leaves", "free")
-        arrays = {f"lineage/{name}": getattr(self, f"_{name}") for name in names}
+        arrays = {f"lineage/{name}": self._nodes[:, column].copy() for column, name in enumerate(_COLUMNS)}
+        arrays |= {"lineage/leaves": self._leaves, "lineage/free": self._free}
         arrays["lineage/now"] = np.array([self.generation, self._n_free])
         return arrays
 
@@ -140,8 +143,8 @@ class Lineage:
         now, n_free = read_one(arrays, "lineage/now", integers(2, least=0)).tolist()
         found = read(arrays, _FOREST, "lineage/", n=self.n, generations=now + 1)
         self._allocate(len(found["parent"]))
-        for name, array in found.items():
-            setattr(self, f"_{name}", array)
+        self._nodes[:] = np.column_stack([found[name] for name in _COLUMNS])
+        self._leaves, self._free = found["leaves"], found["free"]
         self.generation, self._n_free = now, n_free
         self._require_forest()
         self._retained.clear()
@@ -151,47 +154,43 @@ class Lineage:
 
     def _require_forest(self) -> None:
         """Refuses what is no forest: parents are older than their children, and what is free is nobody's ancestor."""
-        alive, children = np.zeros(self._parent.size, dtype=bool), np.zeros(self._parent.size, dtype=np.int64)
+        size = len(self._nodes)
+        alive, children = np.zeros(size, dtype=bool), np.zeros(size, dtype=np.int64)
+        parent, its_children, generation, _ = self._nodes.T
         nodes = np.unique(self._leaves)
-        sound = nodes.size == self.n and self._n_free <= self._parent.size <= self._free.size
+        sound = nodes.size == self.n and self._n_free <= size <= self._free.size
         children[nodes] = 1
         self._oldest = 0
         while sound and nodes.size:
             alive[nodes] = True
-            parents = self._parent[nodes]
+            parents = parent[nodes]
             if (parents < 0).any():
-                self._oldest = max(self._oldest, int(self._generation[nodes[parents < 0]].max()))
+                self._oldest = max(self._oldest, int(generation[nodes[parents < 0]].max()))
             older = parents >= 0
-            sound = bool((self._generation[parents[older]] < self._generation[nodes[older]]).all())
-            sound = sound and bool((self._generation[nodes] >= 0).all())
+            sound = bool((generation[parents[older]] < generation[nodes[older]]).all())
+            sound = sound and bool((generation[nodes] >= 0).all())
             np.add.at(children, parents[older], 1)
             nodes = np.unique(parents[older & ~alive[parents]])
         free = self._free[: self._n_free]
-        sound = sound and np.unique(free).size == self._parent.size - int(alive.sum()) == free.size
-        if not (sound and not alive[free].any() and np.array_equal(children[alive], self._children[alive])):
+        sound = sound and np.unique(free).size == size - int(alive.sum()) == free.size
+        if not (sound and not alive[free].any() and np.array_equal(children[alive], its_children[alive])):
             raise InputError("the particles' ancestry is no forest")
 
     def _allocate(self, size: int) -> None:
-        self._parent = np.full(size, -1)
-        self._children = np.zeros(size, dtype=np.int64)
-        self._generation = np.full(size, -1)
-        self._row = np.zeros(size, dtype=np.int64)
-        self._found = np.zeros(size, dtype=np.int64)
-        self._stamp = np.zeros(size, dtype=np.int64)
+        self._nodes = np.tile(_NO_NODE, (size, 1))
+        self._found, self._stamp = np.zeros((2, size), dtype=np.int64)
 
     def _make_room(self) -> None:
         """Splices chains that nobody needs out of the forest, and doubles it where that is not enough."""
-        needed = np.isin(self._generation, list(self._retained))
+        needed = np.isin(self._nodes[:, GENERATION], list(self._retained))
         self._mark += 1
-        nodes = self._parent, self._children, self._generation, self._free, self._n_free, self._leaves
-        self._n_free = forest.splice(*nodes, needed, self._stamp, self._mark)
-        old = self._parent.size
+        scratch = self._leaves, needed, self._stamp, self._mark
+        self._n_free = forest.splice(self._nodes, self._free, self._n_free, *scratch)
+        held, old = self._nodes, len(self._nodes)
         if self._n_free >= old // 2:
             return
-        empty = {"parent": -1, "children": 0, "generation": -1, "row": 0, "found": 0, "stamp": 0}
-        for name, value in empty.items():
-            extra = np.full(old, value, dtype=np.int64)
-            setattr(self, f"_{name}", np.concatenate([getattr(self, f"_{name}"), extra]))
+        self._allocate(2 * old)
+        self._nodes[:old] = held
         free = np.zeros(2 * old + self.n, dtype=np.int64)
         free[: self._n_free] = self._free[: self._n_free]
         free[self._n_free : self._n_free + old] = np.arange(2 * old - 1, old - 1, -1)

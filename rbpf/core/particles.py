@@ -43,7 +43,9 @@ def uniform_log_weights(n: int) -> np.ndarray:
 
 
 def reweight(log_weights: np.ndarray, log_factors: np.ndarray, what: str) -> tuple[np.ndarray, float]:
-    """Normalised log-weights times factors, and log Σ W·factor. Raises InputError: a factor is NaN or +∞, or all are zero."""
+    """Normalised log-weights times factors (N or 1,), and log Σ W·factor; InputError: one is NaN or +∞, or all are zero."""
+    if log_factors.size == 1 and math.isfinite(log_factors[0]):
+        return log_weights, float(log_factors[0])
     with np.errstate(invalid="ignore"):  # from a weight of zero times an infinite factor, which is refused
         joint = log_weights + log_factors
     high = joint.max()
@@ -162,7 +164,7 @@ class Proposed:
 
     mean: Float[np.ndarray, "#N r"]  #: (N, r) of u.
     root: Float[np.ndarray, "#N r r"]  #: (N or 1, r, r) upper triangular; the covariance of u is root rootᵀ.
-    log_w1: Float[np.ndarray, " N"]  #: (N,) look-ahead weight.
+    log_w1: Float[np.ndarray, " #N"]  #: (N or 1,) look-ahead weight.
     #: (N,) squared Mahalanobis distance of the joint innovation, None where nothing was linearised.
     nis: Float[np.ndarray, " N"] | None = None
     #: (N,) number of scalar measurements behind it, those that took part in each particle.
@@ -173,13 +175,13 @@ class Proposed:
         ancestors: Int[np.ndarray, " M"],
         rng: np.random.Generator,
         balance: tuple[Float[np.ndarray, " M"], Float[np.ndarray, "M d"]] | None = None,
-    ) -> tuple[Float[np.ndarray, "M r"], Float[np.ndarray, " M"]]:
-        """One u per descendant (N, r), and log p(u) − log q(u) (N,); `balanced` by weights and what is apart already."""
+    ) -> tuple[Float[np.ndarray, "M r"], Float[np.ndarray, " #M"]]:
+        """One u per descendant (N, r), and log p(u) − log q(u) (N or 1,); `balanced` by weights and what is apart already."""
         noise = rng.standard_normal((ancestors.size, self.mean.shape[1]))
         if balance is not None:
             noise = balanced(noise, *balance)
         if self.root.shape[0] == 1 and not self.mean.any() and np.array_equal(self.root[0], np.eye(noise.shape[1])):
-            return noise, np.zeros(noise.shape[0])  # from the prior
+            return noise, np.zeros(1)  # from the prior
         root = take(self.root, ancestors)
         u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)

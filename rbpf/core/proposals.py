@@ -22,8 +22,8 @@ class PriorProposal(Proposal):
     """The bootstrap filter's: q is the motion model, w₁ = 1, w₂ = p(z | x) (S05 §II-A)."""
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
-        n, rank = prior.base.shape[0], prior.factor.shape[2]
-        return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(n))
+        rank = prior.factor.shape[2]
+        return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1))
 
 
 @final

@@ -28,8 +28,12 @@ class Systematic(Resampler):
     """One uniform number, a comb of N teeth."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        n = weights.size
-        return _inverse_cdf(weights, (np.arange(n) + rng.random()) / n)
+        # How many teeth, at k + u, lie before the end of each weight: counted, where other schemes have to search.
+        n, cdf = weights.size, np.cumsum(weights)
+        teeth = np.ceil(cdf * (n / cdf[-1]) - rng.random()).astype(np.int64)
+        teeth[np.flatnonzero(weights)[-1] :] = n
+        teeth[1:] -= teeth[:-1].copy()
+        return np.repeat(np.arange(n), teeth)
 
 
 @final

@@ -1,50 +1,48 @@
 """The forest of ancestors: one node per particle and generation, dead branches freed as soon as they die.
 
-Nodes live in flat arrays: `parent` (-1 at a root), `children` (number of children, plus one for a current particle),
-`generation` and `row` (the particle's index within its generation). P. Jacob, L. Murray, S. Rubenthaler, "Path
-storage in the particle filter" (2015), give the expected size, T + C·N log N nodes.
+A node is a row of four numbers, side by side in memory since all are needed together: PARENT (-1 at a root), CHILDREN
+(number of children, plus one for a current particle), GENERATION and ROW (the particle's index within its generation).
+P. Jacob, L. Murray, S. Rubenthaler, "Path storage in the particle filter" (2015), give the expected size, T + C·N log N nodes.
 """
 
 import numpy as np
 from numba import boolean, int64, njit, types
 
-from rbpf.kernels.signature import INDICES
+from rbpf.kernels.signature import INDEX_MATRIX, INDICES
 
+PARENT, CHILDREN, GENERATION, ROW = range(4)
 # Compiled as they are loaded, as the other drivers: the first history that is bounded need not wait for it.
-_NODES = (INDICES,) * 4
 _FLAGS = types.Array(boolean, 1, "C")
 
 
-@njit(int64(*_NODES, INDICES, int64, INDICES, INDICES, int64), cache=True)
-def advance(parent, children, generation, row, free, n_free, leaves, ancestors, now):
+@njit(int64(INDEX_MATRIX, INDICES, int64, INDICES, INDICES, int64), cache=True)
+def advance(nodes, free, n_free, leaves, ancestors, now):
     """Makes a node for each descendant and frees the lineages without one; returns the free-list's length."""
     n = leaves.size
     fresh = np.empty(n, np.int64)
     for i in range(n):
         n_free -= 1
-        node = free[n_free]
+        node, above = free[n_free], leaves[ancestors[i]]
         fresh[i] = node
-        parent[node] = leaves[ancestors[i]]
-        children[node] = 1
-        children[parent[node]] += 1
-        generation[node] = now
-        row[node] = i
+        nodes[above, CHILDREN] += 1
+        nodes[node, PARENT], nodes[node, CHILDREN] = above, 1
+        nodes[node, GENERATION], nodes[node, ROW] = now, i
     for i in range(n):
         node = leaves[i]
-        children[node] -= 1
-        while node >= 0 and children[node] == 0:
+        nodes[node, CHILDREN] -= 1
+        while node >= 0 and nodes[node, CHILDREN] == 0:
             free[n_free] = node
             n_free += 1
-            generation[node] = -1
-            node = parent[node]
+            nodes[node, GENERATION] = -1
+            node = nodes[node, PARENT]
             if node >= 0:
-                children[node] -= 1
+                nodes[node, CHILDREN] -= 1
     leaves[:] = fresh
     return n_free
 
 
-@njit(INDICES(INDICES, INDICES, INDICES, INDICES, int64, INDICES, INDICES, int64), cache=True)
-def rows_at(parent, generation, row, leaves, wanted, found, stamp, mark):
+@njit(INDICES(INDEX_MATRIX, INDICES, int64, INDICES, INDICES, int64), cache=True)
+def rows_at(nodes, leaves, wanted, found, stamp, mark):
     """Row of each particle's ancestor in generation `wanted`; each node of the way is climbed once.
 
     `found` and `stamp` are scratch of the forest's size; `mark` is a number that `stamp` does not hold yet.
@@ -52,30 +50,30 @@ def rows_at(parent, generation, row, leaves, wanted, found, stamp, mark):
     out = np.empty(leaves.size, np.int64)
     for i in range(leaves.size):
         node = leaves[i]
-        while generation[node] > wanted and stamp[node] != mark:
-            node = parent[node]
-        out[i] = found[node] if stamp[node] == mark else row[node]
+        while nodes[node, GENERATION] > wanted and stamp[node] != mark:
+            node = nodes[node, PARENT]
+        out[i] = found[node] if stamp[node] == mark else nodes[node, ROW]
         node = leaves[i]
-        while generation[node] > wanted and stamp[node] != mark:
+        while nodes[node, GENERATION] > wanted and stamp[node] != mark:
             found[node] = out[i]
             stamp[node] = mark
-            node = parent[node]
+            node = nodes[node, PARENT]
     return out
 
 
-@njit(int64(INDICES, INDICES, INDICES, INDICES, int64, INDICES, _FLAGS, INDICES, int64), cache=True)
-def splice(parent, children, generation, free, n_free, leaves, needed, stamp, mark):
+@njit(int64(INDEX_MATRIX, INDICES, int64, INDICES, _FLAGS, INDICES, int64), cache=True)
+def splice(nodes, free, n_free, leaves, needed, stamp, mark):
     """Removes nodes with a single child that are not needed themselves; returns the free-list's length."""
     for i in range(leaves.size):
         node = leaves[i]
         while node >= 0 and stamp[node] != mark:
             stamp[node] = mark
-            above = parent[node]
-            while above >= 0 and children[above] == 1 and not needed[above]:
+            above = nodes[node, PARENT]
+            while above >= 0 and nodes[above, CHILDREN] == 1 and not needed[above]:
                 free[n_free] = above
                 n_free += 1
-                generation[above] = -1
-                above = parent[above]
-            parent[node] = above
+                nodes[above, GENERATION] = -1
+                above = nodes[above, PARENT]
+            nodes[node, PARENT] = above
             node = above
     return n_free
