@@ -57,10 +57,10 @@ coverage: $(STAMP) ## all tests, with the fraction of lines that they run
 
 dist: $(STAMP) ## wheel and source distribution into dist/: of one commit always the same bytes (GNU tar)
 	rm -rf dist build
-	export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && $(BIN)/python -m build --no-isolation && cd dist && \
-	  tar -xzf rbpf-*.tar.gz && rm rbpf-*.tar.gz && for folder in rbpf-*/; do name=$${folder%/}; \
-	  tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner --mode=u+rwX,go+rX,go-w -cf - $$name \
-	  | gzip -n9 > $$name.tar.gz && rm -r $$name; done
+	umask 022 && export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && $(BIN)/python -m build --no-isolation --sdist && cd dist && \
+	  tar -xzf rbpf-*.tar.gz && rm rbpf-*.tar.gz && for folder in rbpf-*/; do name=$${folder%/}; chmod -R u=rwX,go=rX $$name && \
+	  tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner -cf - $$name | gzip -n9 > $$name.tar.gz && \
+	  $(abspath $(BIN))/python -m build --no-isolation --wheel --outdir . $$name && rm -r $$name; done
 
 docs: $(STAMP) ## build the documentation into docs/_build
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html

@@ -80,7 +80,7 @@ def paint_plainly(patch: pytest.MonkeyPatch) -> None:
             axes.set_title("")
             if (legend := axes.get_legend()) is not None:
                 legend.remove()
-        savefig(figure, path, format=options.get("format"), dpi=30)
+        savefig(figure, path, format=options.get("format"), dpi=30, metadata=options.get("metadata"))
 
     patch.setattr(Figure, "savefig", plain)
 

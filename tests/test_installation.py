@@ -31,23 +31,27 @@ def package_files() -> set[str]:
     }
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """Folder with a wheel and a source distribution, built from a copy, so that nothing is left in the project."""
-    copy, out = tmp_path_factory.mktemp("source") / "rbpf", tmp_path_factory.mktemp("dist")
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    ).stdout.split("\0")  # fmt: skip
+def distribution(folder: Path) -> Path:
+    """Wheel and source distribution as `make dist` builds them, in a copy, so that nothing is left in the project."""
+    listed = run(["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=ROOT).split("\0")
     for name in filter(None, listed):
-        source, target = ROOT / name, copy / name
+        source, target = ROOT / name, folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_symlink():
             target.symlink_to(os.readlink(source))
         elif source.is_file():
             target.write_bytes(source.read_bytes())
-    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(copy)])
-    return out
+    # The time of the commit is asked of the project; what is installed is that of these tests.
+    git = run(["git", "rev-parse", "--absolute-git-dir"], cwd=ROOT).strip()
+    run(["make", "-C", str(folder), "-o", ".venv/stamp", "dist", f"BIN={Path(sys.executable).parent}"],
+        env={**os.environ, "GIT_DIR": git, "MAKEFLAGS": ""})  # fmt: skip
+    return folder / "dist"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The folder with both."""
+    return distribution(tmp_path_factory.mktemp("source") / "rbpf")
 
 
 def run(command: list[str], **options) -> str:
@@ -70,6 +74,19 @@ def test_the_source_distribution_holds_every_file_of_the_package(built):
         names = {member.name.split("/", 1)[1] for member in files.getmembers() if member.isfile()}
     assert {name for name in names if name.startswith("rbpf/")} == package_files()
     assert {"pyproject.toml", "README.md", "LICENSE"} <= names
+
+
+@pytest.mark.slow
+def test_a_commit_is_always_built_to_the_same_bytes(built, tmp_path):
+    """In another folder, at another time, by somebody whose new files are nobody else's to read."""
+    before = os.umask(0o077)
+    try:
+        again = distribution(tmp_path / "elsewhere")
+    finally:
+        os.umask(before)
+    assert {path.name: path.read_bytes() for path in built.iterdir()} == {
+        path.name: path.read_bytes() for path in again.iterdir()
+    }
 
 
 def hand_over_compiled_kernels(site: Path) -> None:

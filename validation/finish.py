@@ -56,7 +56,7 @@ def finish_run(
     entries = write_run(run, out, dict(sources) | {name: False for name, asked in wanted.items() if not asked})
     (out / BATCH).unlink(missing_ok=True)
     for path in out.glob(f"{COMPARISON}*.json"):  # of an earlier run, with their pictures
-        for old in (path, *out.glob(f"{path.stem.removeprefix(COMPARISON)}_*.png")):
+        for old in (path, *out.glob(f"{path.stem.removeprefix(COMPARISON)}_*.p[nd][gf]")):
             old.unlink()
     if batch:
         try:

@@ -11,7 +11,8 @@ diagnostics.csv          the system's figures of every frame: sample size, evide
 config.yaml              everything needed to repeat the run
 checkpoint.npz           what --resume goes on from
 summary.json             the figures
-*.png, annotated.mp4     pictures; every frame with what was looked for in it
+*.png, *.pdf             pictures, as pixels and as vectors
+annotated.mp4            every frame with what was looked for in it
 report.html              one page with all figures and pictures
 
 What else a system leaves stands in its `files`; of the monocular one and the laser's

@@ -7,7 +7,7 @@ error.png       error of the position along the truth's axes beside what the fil
 tracking.png    what was looked for and found, effective sample size, innovations (a robot's: ess.png)
 timings.png     time per frame by stage
 
-All are drawn in one world, the truth's where the recording has one (`World`).
+All are drawn in one world, the truth's where the recording has one (`World`), each as vectors, too (.pdf), for print.
 A further figure of every run is one function from `RunFolder` to a matplotlib figure, entered into `FIGURES`.
 """
 
@@ -29,6 +29,8 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 
 SIGMAS = 3.0
+VECTORS = "pdf"  #: Ending of a figure's second file: the same without pixels, but where thousands of curves are in it.
+_MANY = 2000  #: So many curves are pixels in a vector format, too: else its file is larger than all others.
 COLOURS = {
     "filter": "tab:blue",
     "truth": "black",
@@ -50,7 +52,7 @@ _NOT_COUNTS = {
 }  # fmt: skip
 
 
-def draw_run(found: RunFolder, out: Path | None = None, formats: Sequence[str] = ("png",)) -> list[str]:
+def draw_run(found: RunFolder, out: Path | None = None, formats: Sequence[str] = ("png", VECTORS)) -> list[str]:
     """Draws all figures of a run into a folder, by default its own; returns their file names."""
     drawn = {name: draw(found) for name, draw in FIGURES.items()}
     if found.system == "range-bearing":
@@ -61,7 +63,7 @@ def draw_run(found: RunFolder, out: Path | None = None, formats: Sequence[str] =
 
 
 def plot_trajectory(*runs: RunFolder, ax: Any = None) -> Any:
-    """The path, beside the truth, the odometry and the batch optimum.
+    """The path, beside what there is of truth, odometry and batch optimum.
 
     Of several runs it is their paths, in one world. Returns the figure: seen from above and, in space, from the side. Into
     the axes `ax`, if they are given, only the view from above is drawn.
@@ -103,9 +105,10 @@ def other_paths(found: RunFolder, world: "World") -> list[tuple[str, str, np.nda
 
 
 def plot_map(found: RunFolder, ax: Any = None) -> Any:
-    """Path and map: points with 3σ ellipses, rays, known points; of a laser scanner the occupancy grid.
+    """Path and map.
 
-    Returns the figure, and takes axes, as `plot_trajectory`.
+    Points with 3σ ellipses, rays, known points; of a laser scanner the occupancy grid. Returns the figure, and takes axes,
+    as `plot_trajectory`.
     """
     world = World.of(found)
     path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
@@ -142,9 +145,10 @@ def draw_map(
     for axes, plane in shown:
         right, up = plane
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="path")
-        axes.plot(mean[:, right], mean[:, up], ".", color="black", ms=3, label=f"landmarks, {SIGMAS:g}σ")
+        dense: Any = {"color": "black", "rasterized": len(mean) > _MANY}
+        axes.plot(mean[:, right], mean[:, up], ".", ms=3, label=f"landmarks, {SIGMAS:g}σ", **dense)
         ellipses = outline(mean[near][:, plane], cov[near][:, plane][:, :, plane])
-        axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color="black", lw=0.5, alpha=0.5)
+        axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, lw=0.5, alpha=0.5, **dense)
         if landmarks.ray_ends is not None and landmarks.is_ray().any():
             ends = landmarks.ray_ends[landmarks.is_ray()]
             lines = axes.plot(ends[..., right].T, ends[..., up].T, color=COLOURS["map"], lw=0.7, alpha=0.7)
@@ -231,6 +235,8 @@ def error_figure(found: RunFolder) -> Any | None:
         batch_error = fit(how, batch.positions, true.positions).transform(batch.positions) - true.positions
     lost = lost_frames(found)
     for axes, axis in zip(panels, used, strict=True):
+        # A band that leaps for some frames runs out of the picture, errors do not.
+        reach = 1.1 * unit * max(np.abs(error[:, axis]).max(), 1.2 * np.quantile(band[:, axis], 0.95))
         low, high = -unit * band[:, axis], unit * band[:, axis]
         label_ = f"{SIGMAS:g}σ of the filter"
         axes.fill_between(rows, low, high, color=COLOURS["filter"], alpha=0.2, lw=0, label=label_)
@@ -238,7 +244,7 @@ def error_figure(found: RunFolder) -> Any | None:
             axes.plot(at_batch, unit * batch_error[:, axis], color=COLOURS["batch"], lw=1.0, label="error of the batch")
         axes.plot(rows, unit * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error of the filter")
         axes.axhline(0.0, color="black", lw=0.5)
-        axes.set_ylabel(f"{'xyz'[axis]} [{word}]")
+        axes.set(ylabel=f"{'xyz'[axis]} [{word}]", ylim=(-reach, reach) if reach > 0.0 else None)
         shade(axes, lost)
     panels[0].legend(loc="best", fontsize="small")
     panels[-1].set_xlabel("frame")
@@ -254,7 +260,7 @@ def plot_error(*runs: RunFolder, ax: Any = None) -> Any:
         raise InputError(f"{runs[0].folder} has no ground truth to draw errors from")
     world = World.of(*runs)
     assert world.truth is not None
-    figure, axes = new_axes(f"{runs[0].name}: error in {world.name}", "error [m]", "frame", False, 4.0, ax)
+    figure, axes = new_axes(f"{runs[0].name}: error in {world.name}", "error [m]", "frame", False, ax)
     for run in runs:
         moved = world.brought(run.trajectory)
         at, true = associate(moved, world.truth, 0)
@@ -266,20 +272,22 @@ def plot_error(*runs: RunFolder, ax: Any = None) -> Any:
 
 
 def tracking_figure(found: RunFolder) -> Any:
-    """What was looked for and found, effective sample size, innovations, frame by frame."""
+    """What was measured, effective sample size and innovations, frame by frame."""
     table = found.table("diagnostics.csv")
     counts = {name: values for name, values in table.items() if name not in _NOT_COUNTS}
+    shares = {name: counts.pop(name) for name, values in list(counts.items()) if (np.mod(values, 1.0) > 0.0).any()}
     # What stands behind the column `updated` is of the update, where there was one.
     updated, names = np.flatnonzero(table.get("updated", np.ones(table["step"].size))), list(table)
     of_update = names[names.index("updated") :] if "updated" in names else names
-    rows = (["counts"] if counts else []) + ["ess"] + (["nis"] if (table["nis_dof"] > 0).any() else [])
+    rows = (["number"] if counts else []) + (["share"] if shares else []) + ["ess"]
+    rows += ["nis"] if (table["nis_dof"] > 0).any() else []
     figure, panels = stacked_axes(len(rows), f"{found.name}: observations and filter")
     for axes, row in zip(panels, rows, strict=True):
-        if row == "counts":
-            for name, values in counts.items():
+        if row in ("number", "share"):
+            for name, values in (counts if row == "number" else shares).items():
                 at = updated if name in of_update else np.arange(values.size)
                 axes.plot(at, values[at], lw=1.0, label=name.replace("_", " "))
-            axes.set(ylabel="number", ylim=(0, None))
+            axes.set(ylabel=row, ylim=(0, None))
         elif row == "ess":
             label_ = "effective sample size"
             axes.plot(updated, table["ess"][updated], color=COLOURS["filter"], lw=0.8, label=label_)
@@ -428,7 +436,7 @@ class Views:
         if ax is not None:
             label(ax, title, f"{'xyz'[self.top[0]]} [m]", f"{'xyz'[self.top[1]]} [m]", equal=True)
             return ax.figure, [(ax, list(self.top))]
-        figure = blank(6.5 * len(planes), 6.0)
+        figure = blank(7.0 * len(planes), 5.6 if len(planes) == 1 else 6.3)
         figure.suptitle(title)
         panels = figure.subplots(1, len(planes), squeeze=False)[0]
         shown = [(axes, list(plane)) for axes, plane in zip(panels, planes, strict=True)]
@@ -448,16 +456,23 @@ def shade(axes: Any, lost: np.ndarray) -> None:
         )  # fmt: skip
 
 
-def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
-    """Saves figures by file name, whose ending is the format, each whole or not at all; returns the names."""
+def save_figures(figures: Mapping[str, Any], out: Path, *also: str) -> list[str]:
+    """Saves figures by file name, whose ending is the format, each whole or not at all; returns the names.
+
+    `also` are endings of further files of each.
+    """
     for name, figure in figures.items():
         # A name with dollars in it is no formula; the numbers at logarithmic axes are.
         for axes in figure.axes:
             legend = axes.get_legend()
             for text in (axes.title, *(() if legend is None else legend.get_texts())):
                 text.set_parse_math(False)
-        with whole(out / name) as temporary:
-            figure.savefig(temporary, format=Path(name).suffix[1:], dpi=110, bbox_inches="tight")
+        for path in (out / name, *((out / name).with_suffix(f".{ending}") for ending in also)):
+            ending, dpi = path.suffix[1:], 110 if path.suffix == ".png" else 220
+            dated = {"CreationDate": None} if ending == "pdf" else None  # the same figure, the same bytes
+            with whole(path) as temporary:
+                figure.savefig(temporary, format=ending, dpi=dpi, metadata=dated)
+            figure.set_layout_engine("none")  # of the next file it is the same, and takes as long as painting
     return list(figures)
 
 
@@ -475,17 +490,17 @@ def blank(width: float, height: float) -> Any:
 
 
 def new_axes(
-    title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, height: float = 6.0, ax: Any = None
+    title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, ax: Any = None
 ) -> tuple[Any, Any]:
     """A figure of one pair of axes, by default of equal scale; that of `ax`, if it is given."""
-    axes = blank(7.0, height).subplots() if ax is None else ax
+    axes = blank(7.0, 5.6).subplots() if ax is None else ax
     label(axes, title, xlabel, ylabel, equal)
     return axes.figure, axes
 
 
 def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:
     """A figure of pairs of axes one above the other that share what is along them."""
-    figure = blank(9.0, 2.0 + 2.0 * count)
+    figure = blank(7.0 + 0.6 * count, 5.6 + 0.48 * count)  # of the form of all others, beside which it stands
     rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     rows[0].set_title(title)
     for axes in rows:

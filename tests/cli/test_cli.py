@@ -18,7 +18,7 @@ from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.cli.mono_sequences import sentence
-from tests.cli.run_outputs import outputs
+from tests.cli.run_outputs import names, outputs
 
 STEPS = 20
 FILES = {
@@ -55,7 +55,7 @@ def began(log, tmp_path_factory):
 
 
 def test_a_run_leaves_everything(began):
-    assert {path.name for path in began.iterdir()} == FILES
+    assert names(began) == FILES
     summary = json.loads((began / "summary.json").read_text())
     assert summary.keys() >= REQUIRED
     assert (summary["frames"], summary["particles"], summary["seed"]) == (STEPS, 30, 0)

@@ -17,6 +17,7 @@ from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.readers import open_images
 from rbpf.systems.mono.config import MonoConfig
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
+from tests.cli.run_outputs import names
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +48,7 @@ def finished(desk, tmp_path_factory):
 
 
 def test_a_run_leaves_all_files_and_figures(finished):
-    assert {path.name for path in finished.iterdir()} == FILES | BATCH | {"annotated.mp4"}
+    assert names(finished) == FILES | BATCH | {"annotated.mp4"}
     entries = summary(finished)
     assert entries.keys() >= REQUIRED
     assert entries["frames"] == entries["frames_tracked"] == FRAMES
@@ -111,8 +112,7 @@ def test_the_posterior_over_paths(finished):
 def test_a_batch_that_takes_too_long_is_given_up_and_all_else_is_there(desk, tmp_path):
     assert run(desk, tmp_path, "--batch", "--batch-limit", "1") == 0
     assert "given up after 1 iterations" in summary(tmp_path)["batch_problem"]
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == FILES
+    assert names(tmp_path) == FILES
 
 
 def test_the_video_has_every_frame(finished):

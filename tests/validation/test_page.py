@@ -75,6 +75,8 @@ def test_the_page_has_a_head_a_scene_and_no_empty_section(two):
         assert len(re.sub(r"<[^>]+>", "", section.partition("</h2>")[2]).split()) + section.count("<img") > 0
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", text)
     assert len(captions) >= 6 and all(captions)
+    vectors = re.findall(r'<a href="(\w+\.pdf)">PDF</a></figcaption>', text)
+    assert len(vectors) == len(captions) and all((two[0] / name).read_bytes().startswith(b"%PDF") for name in vectors)
     packed = re.search(r'id="plotly">([^<]+)<', text)[1]
     assert packed == program() and b"plotly.js v" in decompress(b64decode(packed))[:200]
     told = json.loads(re.search(r'id="traces">([^<]+)<', text)[1])

@@ -37,7 +37,7 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
         title, others = f"{name}: map over the truth, in {world.name}", {"true landmarks": ("truth", true)}
         views = Views.of(record.system, path)
         figures["groundtruth_map.png"] = draw_map(title, views, path.positions, found.map, others)
-    return ["path.png", "error.png", *save_figures(figures, record.folder)]
+    return ["path.png", "error.png", *save_figures(figures, record.folder, plots.VECTORS)]
 
 
 def draw_beside(runs: Sequence[RunFolder], out: Path, formats: Sequence[str]) -> list[str]:
@@ -76,7 +76,7 @@ def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = N
         )
         ours_there = moved_map(ours.landmarks, motions["filter"])
         figures["gtsam_map.png"] = draw_map(title, views, paths["filter"].positions, ours_there, others)
-    return save_figures(figures, out)
+    return save_figures(figures, out, plots.VECTORS)
 
 
 def plot_against_colmap(found: "ColmapComparison", reference: PathAndMap, out: Path) -> list[str]:
@@ -105,7 +105,7 @@ def plot_against_colmap(found: "ColmapComparison", reference: PathAndMap, out: P
         axes.axvline(float(np.median(found.cloud.surface_m)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
         axes.legend(loc="best", fontsize="small")
         figures["colmap_cloud.png"] = figure
-    return save_figures(figures, out)
+    return save_figures(figures, out, plots.VECTORS)
 
 
 def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
@@ -140,7 +140,7 @@ def consistency_figure(
     title: str, words: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], dim: int, banded: bool, ax: Any = None
 ) -> Any:
     """Normalised squared errors (R,) over the steps (R,) by name, their mean, and where an honest filter's would lie."""
-    (figure, axes), band = new_axes(title, words, "step", equal=False, height=4.0, ax=ax), chi_square_band(dim)
+    (figure, axes), band = new_axes(title, words, "step", equal=False, ax=ax), chi_square_band(dim)
     low = band.low if banded else 0.1
     if banded:
         axes.axhspan(low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")

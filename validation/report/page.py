@@ -16,7 +16,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
-from rbpf.runs.plots import FIGURES, World
+from rbpf.runs.plots import FIGURES, VECTORS, World
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import CONFIGS
@@ -36,7 +36,7 @@ _CAPTIONS = {
     "landmarks": "Distances of the landmarks in σ, beside those of independent ones of an honest filter.",
     "map": "The map over what it is compared with.",
     "cloud": "Distances of the landmarks from the surface of COLMAP's points.",
-    "ess": "What was observed, effective sample size, innovations, frame by frame.",
+    "ess": "Effective sample size and innovations, frame by frame.",
 }
 #: Paths beside the filter's own that figures of summary.json are told of, by the beginning of their names.
 _OTHERS = {"odometry_": "odometry", "vo_": "odometry", "batch_": "batch", "final_": "final"}
@@ -62,6 +62,7 @@ class Picture(NamedTuple):
     data: str  #: PNG, as base64.
     caption: str
     wide: bool
+    vectors: str  #: Name of the file beside the page with the same as vectors; "" where there is none.
 
 
 def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
@@ -84,7 +85,8 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         problems.append(f"{error}.")
     verdict = verdicts.verdict_of(record, comparisons)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
-    own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
+    own = {path.name for path in folder.glob("*.png")} - drawn
+    ordered = [name for name in FIGURES if name in own] + sorted(own - FIGURES.keys())
     try:
         world = World.of(record)
     except InputError:
@@ -105,7 +107,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         for comparison in comparisons
     ]
     beside, alone = _beside(record.summary)
-    sections.append({"title": "The run", "beside": beside, "figures": alone, "images": _images(folder, own)})
+    sections.append({"title": "The run", "beside": beside, "figures": alone, "images": _images(folder, ordered)})
     loader = PackageLoader("rbpf.validation.report", "templates")
     environment = Environment(loader=loader, autoescape=select_autoescape(), trim_blocks=True, lstrip_blocks=True)
     environment.filters["digits"], environment.filters["share"] = digits, share
@@ -150,7 +152,9 @@ def _images(folder: Path, names: list[str]) -> list[Picture]:
             bare = path.stem.rpartition("_")[2]
             drawn = FIGURES.get(name) or (None if bare in _CAPTIONS else FIGURES.get(f"{bare}.png"))
             caption = _CAPTIONS.get(bare, "") if drawn is None else (drawn.__doc__ or "").splitlines()[0]
-            found.append(Picture(path.stem, base64.b64encode(data).decode(), caption, width > _WIDE * height))
+            beside = path.with_suffix(f".{VECTORS}")
+            vectors = beside.name if beside.is_file() else ""
+            found.append(Picture(path.stem, base64.b64encode(data).decode(), caption, width > _WIDE * height, vectors))
     return found
 
 
