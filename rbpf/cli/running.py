@@ -74,6 +74,7 @@ class PartOptions(RunOptions):
     start: NotNegative = 0.0  #: use the frames from so many seconds after the first on; of a log without times, steps.
     end: RealPositive = None  #: use the frames until so many seconds after the first; by default all.
     every: Count = 1  #: of these use each so many-th.
+    rerun: Where = None  #: also write a recording (.rrd) for the Rerun viewer, with its layout; by default none.
 
     def part(self, resize: int | None = None) -> "Part":
         """What is used of the recording."""
@@ -93,7 +94,6 @@ class ImageRunOptions(PartOptions):
     #: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
     image_topic: Text = None
     truth_topic: Text = None  #: of a ROS bag, the topic of the camera's true poses; by default none.
-    rerun: Where = None  #: also write a recording (.rrd) for the Rerun viewer; by default none.
     batch: bool = True  #: also adjust the same measurements in batch with GTSAM.
     #: iterations after which the batch adjustment is given up, the run's results stay; by default so many that thirty
     #: million sightings are linearised.
@@ -102,7 +102,7 @@ class ImageRunOptions(PartOptions):
 
     def over_images(self, recording: "Recording", config: Any, video: bool) -> None:
         """Filters images, with what can be left out as it is asked for."""
-        more: dict[str, Any] = {"rerun": self.rerun, "batch": self.batch, "most_iterations": self.batch_limit}
+        more: dict[str, Any] = {"batch": self.batch, "most_iterations": self.batch_limit}
         _run(self, recording, config, video=video, **more)
 
 
@@ -270,7 +270,7 @@ def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
 
 
 def _run(
-    options: RunOptions,
+    options: PartOptions,
     recording: "Recording",
     config: Any,
     filtered: "Callable[[Run], None]" = lambda run: None,
@@ -283,7 +283,7 @@ def _run(
     from rbpf.runs.files import holds_run, numbered, own_folder
     from rbpf.runs.recordings import filter_recording
 
-    if options.view or made.get("rerun") is not None:
+    if options.view or options.rerun is not None:
         from rbpf.validation.report.live import require_rerun, viewer
 
         require_rerun()
@@ -315,7 +315,11 @@ def _run(
         from rbpf.validation.finish import finish_run
 
         solving = bar("batch")
-        made |= {"on_frame": bar("drawing"), "on_iteration": lambda count, _error: solving(count, None)}
+        made |= {
+            "rerun": options.rerun,
+            "on_frame": bar("drawing"),
+            "on_iteration": lambda count, _error: solving(count, None),
+        }
         try:
             entries = finish_run(run, out, recording.sources(), **made)
         except KeyboardInterrupt as error:

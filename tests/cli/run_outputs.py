@@ -4,6 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
 TIMED_FILES = {"timings.csv", "timings.png", "timings.pdf", "report.html", "checkpoint.npz"}
 TIMED_ENTRIES = {"ms_per_frame", "ms_per_update", "peak_memory_mb", "finished"}
 
@@ -20,6 +23,19 @@ def names(folder: Path) -> set[str]:
     pictures, vectors = ({name[:-4] for name in found if name.endswith(ending)} for ending in (".png", ".pdf"))
     assert pictures == vectors
     return {name for name in found if not name.endswith(".pdf")}
+
+
+def layout(recording: Path) -> tuple[set[str], np.ndarray, np.ndarray]:
+    """Of a recording for the Rerun viewer the names of its views, where the world is looked at from, and to."""
+    reader = pytest.importorskip("rerun.chunk").RrdReader(recording)
+    views, eye = set(), {}
+    for batch in (chunk.to_record_batch() for store in reader.blueprints() for chunk in reader.stream(store=store)):
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            if name == "ViewBlueprint:display_name":
+                views |= set(values.to_pylist()[0])
+            elif name.startswith("EyeControls3D:"):
+                eye[name.partition(":")[2]] = np.array(values.to_pylist()[0][0])
+    return views, eye["position"], eye["look_target"]
 
 
 def outputs(folder: Path) -> dict[str, bytes]:

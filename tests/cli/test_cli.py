@@ -18,7 +18,7 @@ from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.cli.mono_sequences import sentence
-from tests.cli.run_outputs import names, outputs
+from tests.cli.run_outputs import layout, names, outputs
 
 STEPS = 20
 FILES = {
@@ -64,6 +64,13 @@ def test_a_run_leaves_everything(began):
     with np.load(began / "map.npz") as archive:
         assert archive["mean"].shape == (summary["landmarks"], 2)
         assert (np.linalg.eigvalsh(archive["cov"]) > 0).all()
+
+
+@pytest.mark.slow
+def test_a_robot_s_run_is_recorded_for_the_viewer(log, tmp_path):
+    assert run(log, tmp_path / "run", "--rerun", str(tmp_path / "run.rrd")) == 0
+    views, eye, target = layout(tmp_path / "run.rrd")
+    assert views == {"path and map", "effective sample size", "NIS per degree of freedom"} and eye[2] > target[2]
 
 
 def test_config_repeats_the_run(log, tmp_path):

@@ -17,7 +17,7 @@ from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.readers import open_images
 from rbpf.systems.mono.config import MonoConfig
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
-from tests.cli.run_outputs import names
+from tests.cli.run_outputs import layout, names
 
 pytestmark = pytest.mark.slow
 
@@ -138,8 +138,13 @@ def test_a_rerun_recording_is_written(desk, tmp_path):
     pytest.importorskip("rerun")
     recording = tmp_path / "run.rrd"
     assert run(desk, tmp_path / "run", "--rerun", str(recording)) == 0
-    assert recording.read_bytes()[:4] == b"RRF2"
     assert recording.stat().st_size > 20_000
+    views, eye, target = layout(recording)
+    assert views == {"path and map", "image", "effective sample size", "NIS per degree of freedom", "tracking"}
+    # Seen from there, all of the path is in the picture.
+    there = read_tum(tmp_path / "run" / "trajectory.tum").positions - eye
+    cosines = there @ (target - eye) / np.linalg.norm(there, axis=1) / np.linalg.norm(target - eye)
+    assert np.rad2deg(np.arccos(cosines)).max() < 35.0
 
 
 def test_a_missing_rerun_is_said_before_the_run(desk, tmp_path, monkeypatch, capsys):

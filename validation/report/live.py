@@ -21,7 +21,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder, whole
-from rbpf.runs.plots import SIGMAS, outline
+from rbpf.runs.plots import SIGMAS, near_box, outline
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import fit, in_space
 from rbpf.systems.laser.slam import LaserSlam
@@ -100,10 +100,8 @@ class RunView:
             positions = in_space(stamps, poses).positions
             stream.log(f"world/{name}", rr.LineStrips3D([positions], colors=[colour]), static=static)
         if isinstance(run.system, LaserSlam):
-            picture = run.system.picture()
-            walls = picture.corner + picture.cell_m * (np.argwhere(picture.log_odds > 0.0)[:, ::-1] + 0.5)
-            places = rr.Points3D(np.pad(walls, ((0, 0), (0, 1))), radii=0.5 * picture.cell_m)
-            stream.log("world/map/walls", places, static=static)
+            walls = rr.Points3D(_places(run), radii=0.5 * run.system.picture().cell_m)
+            stream.log("world/map/walls", walls, static=static)
             return
         found = run.system.map()
         stream.log("world/map/points", ellipsoids(rr, found.points()), static=static)
@@ -112,8 +110,9 @@ class RunView:
             stream.log("world/map/rays", rays, static=static)
 
     def finish(self, run: Run) -> None:
-        """The whole path and the last map; and the truth, in the run's own world."""
+        """The whole path and the last map, all of it in view; and the truth, in the run's own world."""
         self.map(run, static=True)
+        self.stream.send_blueprint(blueprint(run))
         if run.truth is not None:
             stamps = run.log.stamps_ns[run.truth.rows]
             true, ours = (in_space(stamps, poses) for poses in (run.truth.poses, run.log.poses[run.truth.rows]))
@@ -138,19 +137,43 @@ class RunView:
         known = getattr(run.system, "known_points", None)
         if known is not None:
             stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
+        for name, colour in DRAWN.get(run.system.name, (None, {}))[1].items():
+            stream.log(f"plots/tracking/{name}", rr.SeriesLines(colors=[colour], names=[name]), static=True)
         self._next = 1
 
 
 def blueprint(run: Run) -> Any:
-    """What the viewer shows where: the world, beside it the image if there is one, and the figures."""
+    """What the viewer shows where: the world, beside it the image if there is one, and the figures.
+
+    The world is looked at from behind and above the first pose, so that the path and what of the map is near is seen. By
+    itself the viewer would take in the far ends of rays, beside which all else is a dot.
+    """
     import rerun.blueprint as rrb
 
-    beside = [rrb.TimeSeriesView(origin="plots/filter", name="filter")]
-    if run.system.name in DRAWN:
-        beside.insert(0, rrb.Spatial2DView(origin="world/camera/image", name="image"))
-        beside.append(rrb.TimeSeriesView(origin="plots/tracking", name="tracking"))
-    world = rrb.Spatial3DView(origin="world", name="path and map")
-    return rrb.Blueprint(rrb.Horizontal(world, rrb.Vertical(*beside), column_shares=[3, 2]), collapse_panels=True)
+    curves = {"plots/filter/ess": "effective sample size", "plots/filter/nis_per_dof": "NIS per degree of freedom"}
+    if isinstance(run.system, LaserSlam):
+        del curves["plots/filter/nis_per_dof"]  # a scan is no Gaussian innovation
+    images = [rrb.Spatial2DView(origin="world/camera/image", name="image")] if run.system.name in DRAWN else []
+    curves |= {"plots/tracking": "tracking"} if images else {}
+    beside = [*images, *(rrb.TimeSeriesView(origin=origin, name=name) for origin, name in curves.items())]
+    path = in_space(run.log.stamps_ns, run.log.poses)
+    first, (_, low, high) = SE3.rotation(path.world_from_body[0]), near_box(_places(run), path.positions)
+    camera = _lens(run.system) is not None
+    up, ahead = (-first[:, 1], first[:, 2]) if camera else (first[:, 2], first[:, 0])
+    middle, size = 0.5 * (low + high), max(float((high - low).max()), 10.0 * AXIS_M)
+    eye = rrb.EyeControls3D(position=middle + size * (0.8 * up - 0.8 * ahead), look_target=middle, eye_up=up)
+    world = rrb.Spatial3DView(origin="world", name="path and map", eye_controls=eye, line_grid=False)
+    column = rrb.Vertical(*beside, row_shares=[2] * len(images) + [1] * len(curves))
+    return rrb.Blueprint(rrb.Horizontal(world, column, column_shares=[3, 2]), collapse_panels=True)
+
+
+def _places(run: Run) -> np.ndarray:
+    """(M, 3) of the map as it is now: of a scanner the middles of walls' cells, else the points of known depth."""
+    if not isinstance(run.system, LaserSlam):
+        return run.system.map().points().in_space()[0]
+    picture = run.system.picture()
+    walls = picture.corner + picture.cell_m * (np.argwhere(picture.log_odds > 0.0)[:, ::-1] + 0.5)
+    return np.pad(walls, ((0, 0), (0, 1)))
 
 
 def _pose_in_space(tracked: Tracked) -> np.ndarray:
@@ -266,8 +289,8 @@ def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], po
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
 
 
-#: By the system's name, what logs what a frame showed, and which figures are plotted besides those of every filter.
-DRAWN: Mapping[str, tuple[Callable[..., None], tuple[str, ...]]] = {
-    "mono": (_log_search, ("searched", "found", "lost")),
-    "stereo": (_log_pair, ("features", "agreeing", "observed")),
+#: By the system's name, what logs what a frame showed, and figures that only it has, with the colours of their curves.
+DRAWN: Mapping[str, tuple[Callable[..., None], Mapping[str, tuple[int, int, int]]]] = {
+    "mono": (_log_search, {"searched": ODOMETRY, "found": FOUND, "lost": MISSED}),
+    "stereo": (_log_pair, {"features": ODOMETRY, "agreeing": PATH, "observed": FOUND}),
 }
