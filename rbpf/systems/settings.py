@@ -59,7 +59,9 @@ def load_settings(
     values.update(given)
     _refuse_unknown(values, kind, "")
     try:
-        return msgspec.convert(_over(asdict(kind()), values), kind, strict=False)
+        # A system's defaults may depend on what is asked for.
+        defaults = kind() if (chosen := getattr(kind, "defaults", None)) is None else chosen(values)
+        return msgspec.convert(_over(asdict(defaults), values), kind, strict=False)
     except msgspec.ValidationError as error:
         # "Expected `int`, got `str` - at `$.search.measurements`", or a range's own words and the group's place.
         words, _, place = str(error).partition(" - at `$")

@@ -1,6 +1,6 @@
 """Settings that are given go over the system's own defaults, not over those of a group's class."""
 
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 
 import pytest
 
@@ -26,6 +26,12 @@ def test_the_rest_of_a_group_keeps_the_systems_defaults():
 def test_nothing_given_is_the_default():
     for kind in (MonoConfig, StereoConfig):
         assert asdict(load_settings(kind, "any", None, [], {})) == asdict(kind())
+
+
+def test_a_joint_map_of_two_cameras_brings_its_own_defaults_and_what_is_set_wins():
+    joint = load_settings(StereoConfig, "stereo", None, ["map.kind=joint"], {"particles": 20})
+    assert joint == replace(StereoConfig.joint(), particles=20) and joint.likelihood.build().normalised
+    assert not load_settings(StereoConfig, "stereo", None, ["map.window=3"], {}).likelihood.build().normalised
 
 
 def test_a_group_can_be_nothing():

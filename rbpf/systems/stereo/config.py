@@ -1,7 +1,8 @@
 """Every setting of stereo SLAM, with its default, its unit and what it does."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
@@ -51,8 +52,8 @@ class MapConfig(Ranged):
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one Gaussian
     #: of all landmarks and the frame, given the last few updates (joint): an uncertainty that stays true. With it
     #: the odometry is the proposal, linearised once, and all candidates weigh, whatever odometry.role, proposal and
-    #: map.weigh say. It needs a likelihood that is a density (likelihood.kind=outliers), and more new landmarks than
-    #: particles do.
+    #: map.weigh say. It needs a likelihood that is a density: `StereoConfig.joint` has the defaults that go with it, as do
+    #: the settings of a run that asks for it.
     kind: Literal["particles", "joint"] = "particles"
     #: of a joint map: updates sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.
@@ -144,3 +145,18 @@ class StereoConfig(Ranged):
     #: what is done after a motion that was only assumed.
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
+
+    @classmethod
+    def joint(cls) -> Self:
+        """The defaults that go with a joint map: a likelihood that is a density, and fifty particles."""
+        return cls(
+            particles=50,
+            map=MapConfig(kind="joint"),
+            likelihood=LikelihoodConfig("outliers", outlier_volume=OUTLIER_VOLUME_PX3),
+        )
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> Self:
+        """The defaults that go with settings that are given, by name."""
+        group = given.get("map")
+        return cls.joint() if isinstance(group, dict) and group.get("kind") == "joint" else cls()

@@ -141,7 +141,7 @@ class StereoSlam(System):
             if not config.likelihood.build().normalised:
                 raise InputError(
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
-                    "none: set likelihood.kind=outliers"
+                    "none: begin with StereoConfig.joint(), or set likelihood.kind=outliers"
                 )
             joint = JointMap(SE3, compiled=config.compiled, submap=config.map.submap, passed_on=True)
         self._once = joint is not None or config.odometry.role == "proposal"
