@@ -1,6 +1,8 @@
 """Wheel and source distribution hold the whole package, and it works from where nothing of this folder is."""
 
+import importlib.util
 import os
+import pkgutil
 import shutil
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+import rbpf
 from rbpf.cli import main
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
@@ -61,19 +64,13 @@ def run(command: list[str], **options) -> str:
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_every_file_of_the_package(built):
-    (wheel,) = built.glob("*.whl")
-    names = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("rbpf/")}
-    assert names == package_files()
-
-
-@pytest.mark.slow
-def test_the_source_distribution_holds_every_file_of_the_package(built):
-    (archive,) = built.glob("*.tar.gz")
+def test_wheel_and_source_distribution_hold_every_file_of_the_package(built):
+    (wheel,), (archive,) = built.glob("*.whl"), built.glob("*.tar.gz")
     with tarfile.open(archive) as files:
-        names = {member.name.split("/", 1)[1] for member in files.getmembers() if member.isfile()}
-    assert {name for name in names if name.startswith("rbpf/")} == package_files()
-    assert {"pyproject.toml", "README.md", "LICENSE"} <= names
+        source = {member.name.split("/", 1)[1] for member in files.getmembers() if member.isfile()}
+    for names in (set(zipfile.ZipFile(wheel).namelist()), source):
+        assert {name for name in names if name.startswith("rbpf/")} == package_files()
+    assert {"pyproject.toml", "README.md", "LICENSE"} <= source
 
 
 @pytest.mark.slow
@@ -133,3 +130,72 @@ def test_an_installed_package_simulates_and_reports(built, finished, tmp_path):
     report.unlink()
     run([*rbpf, "report", str(finished)], cwd=tmp_path, env=environment)
     assert report.stat().st_size > 10_000
+
+
+# Importing the package imports hardly anything else, and needs neither the optimisers nor image processing.
+
+HEAVY = ("gtsam", "pycolmap", "cv2")
+FREE_TO_NEED_THEM = ("rbpf.validation", "rbpf.cli")
+
+IMPORTED = """
+import sys
+before = set(sys.modules)
+{statement}
+top = {{name.split(".")[0] for name in set(sys.modules) - before}}
+print(*sorted(name for name in top if name not in sys.stdlib_module_names and not name.startswith("_")))
+"""
+
+IMPORT_WITHOUT = """
+import importlib, sys
+for absent in {absent!r}:
+    sys.modules[absent] = None
+for name in {modules!r}:
+    importlib.import_module(name)
+"""
+
+
+def imported_by(statement: str) -> set[str]:
+    """Packages outside of Python's own library that a statement imports."""
+    return set(run([sys.executable, "-c", IMPORTED.format(statement=statement)]).split())
+
+
+def modules_that_need_no_heavy_import() -> list[str]:
+    found = [module.name for module in pkgutil.walk_packages(rbpf.__path__, "rbpf.", onerror=raise_it)]
+    return [name for name in ["rbpf", *found] if not name.startswith(FREE_TO_NEED_THEM)]
+
+
+def raise_it(name: str) -> None:
+    raise ImportError(name)
+
+
+def test_importing_the_package_imports_hardly_anything_else():
+    """Which is why it takes milliseconds, on a machine however busy."""
+    assert imported_by("import rbpf") == {"rbpf", "lazy_loader"}
+
+
+def test_the_command_line_keeps_blas_on_one_thread_before_numpy_is_there():
+    """Which reads it as it is imported; who has set it otherwise is heeded."""
+    early = "import sys, tyro; assert 'numpy' not in sys.modules"
+    said = "import os, rbpf.cli; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    without = "import os; os.environ.pop('OPENBLAS_NUM_THREADS', None)"
+    given = "import os; os.environ['OPENBLAS_NUM_THREADS'] = '3'"
+    for before, threads in ((f"{without}\n{early}", "1"), (given, "3")):
+        assert run([sys.executable, "-c", f"{before}\n{said}"]).strip() == threads
+
+
+@pytest.mark.slow
+def test_the_public_names_need_neither_pictures_nor_what_only_tests_use():
+    unwanted = {"matplotlib", "PIL", "rich", "tyro", "joblib", "jaxtyping", "pytest", "rerun", *HEAVY}
+    assert not imported_by("from rbpf import *") & unwanted
+
+
+@pytest.mark.slow
+def test_everything_but_validation_imports_without_optimisers_and_image_processing():
+    modules = modules_that_need_no_heavy_import()
+    assert {"rbpf.sensors", "rbpf.motion", "rbpf.maps", "rbpf.systems"} <= set(modules)
+    run([sys.executable, "-c", IMPORT_WITHOUT.format(absent=HEAVY, modules=modules)])
+
+
+def test_heavy_imports_are_there_to_be_blocked():
+    for name in HEAVY:
+        assert importlib.util.find_spec(name) is not None

@@ -9,8 +9,6 @@ import pytest
 
 from examples.studies.file_faults import FILE_FAULTS, damaged_copy
 from rbpf.cli import main
-from rbpf.errors import InputError
-from rbpf.runs.files import whole
 from rbpf.runs.recordings import RobotRecording, filter_opened, filter_recording, open_mono, open_pairs
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers import open_images, open_stereo
@@ -100,15 +98,6 @@ def test_no_room_for_checkpoints(desk, tmp_path):
         assert sum("no checkpoint is kept" in words and "File too large" in words for words in done.messages) == 4
         assert place.read_bytes() == b"the last one"
         assert [path.name for path in place.parent.iterdir()] == ["checkpoint.npz"]
-
-
-def test_a_place_that_cannot_be_written_to(tmp_path):
-    (tmp_path / "file.txt").write_text("before")
-    refused = pytest.raises(InputError, match=r"file\.txt cannot be written: File too large")
-    with refused, full_disk(10), whole(tmp_path / "file.txt") as temporary:
-        temporary.write_text("x" * 100)
-    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
-    assert (tmp_path / "file.txt").read_text() == "before"
 
 
 def test_a_stereo_run_is_finished_once(desk, tmp_path, monkeypatch):

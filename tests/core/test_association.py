@@ -1,5 +1,6 @@
 """Association by maximum likelihood against trying out every explanation."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -8,8 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
+from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import ExistenceModel, Gates, associate
-from rbpf.core.models import NEW, NULL
+from rbpf.core.models import NEW, NULL, Records, Resampler
+from rbpf.core.resampling import EssTriggered, Systematic
+from rbpf.lie import SE2
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import OdometryMotion
+from rbpf.sensors.range_bearing import RangeBearing
+from tests.core.scripted import Scripted, ids_of, seen
+from tests.core.worlds import MAX_RANGE, Recipe, Sightings, World, anonymous, drive, planar_world
 
 
 def problem(rng: np.random.Generator, n: int, k: int, m: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -83,3 +93,123 @@ def test_where_clutter_is_impossible_nothing_is_forced_on_a_landmark():
 def test_log_odds_of_existence(log_odds, seen, expected, after):
     model = ExistenceModel(hit=1.0, miss=0.5, limit=3.0, drop=-1.0)
     assert model.updated(np.array([[log_odds]]), np.array([[seen]]), np.array([[expected]])) == after
+
+
+# A small world without names, with and without clutter, against the run that knows the names.
+
+STEPS, LANDMARKS = 80, 12
+NOTHING = Sightings(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+def position_error(world: World, reports) -> float:
+    means = np.array([report.estimate.mean for report in reports])
+    return float(np.sqrt(np.square(means[:, 1:] - world.truth[:, 1:]).sum(axis=1).mean()))
+
+
+def held(filter_: Filter) -> dict[int, float]:
+    """Share of the weight in which each landmark more probably exists than not."""
+    landmark_map = filter_.belief().map
+    present = landmark_map.log_odds(landmark_map.ids) > 0
+    return dict(zip(landmark_map.ids.tolist(), filter_.particles.weights @ present, strict=True))
+
+
+def nearest(filter_: Filter, world: World, ids: list[int]) -> np.ndarray:
+    """Distance of each landmark's mean to the nearest true one."""
+    records = filter_.belief().map.read(np.array(ids))
+    mean = np.einsum("n,nkd->kd", filter_.particles.weights, records.mean)
+    return np.linalg.norm(mean[:, None] - world.landmarks, axis=-1).min(axis=1)
+
+
+@pytest.mark.parametrize("clutter", [0.0, 1.0])
+def test_map_and_accuracy_are_those_of_the_run_that_knows_the_names(clutter):
+    """And landmarks started by clutter leave the map: about one in a frame, which lives while in view, and four misses."""
+    world = planar_world(STEPS, LANDMARKS, 3, clutter)
+    named = replace(world, frames=[without_clutter(frame) for frame in world.frames])
+    filter_, reference = Recipe(n=40, known=False).build(), Recipe(n=40).build()
+    started, sizes = set(), []
+
+    def count(t, report):
+        started.update(report.new_landmarks.tolist())
+        sizes.append(filter_.belief().map.ids.size)
+
+    error = position_error(world, drive(filter_, world, after=count))
+    assert error < 1.5 * position_error(world, drive(reference, named)) + 0.01
+    seen = {name for frame in named.frames for name in frame.landmarks.tolist()}
+    accepted = [landmark for landmark, fraction in held(filter_).items() if fraction > 0.5]
+    assert len(accepted) == len(seen)
+    assert nearest(filter_, world, accepted).max() < 0.3
+    assert (len(started) > 0.8 * STEPS) == (clutter > 0.0)
+    assert max(sizes) < 3 * LANDMARKS
+    assert np.mean(sizes[-20:]) < 1.1 * np.mean(sizes[40:60])
+
+
+def without_clutter(frame: Sightings) -> Sightings:
+    true = frame.landmarks >= 0
+    return Sightings(frame.landmarks[true], frame.z[true], frame.cov_z[true])
+
+
+@pytest.fixture
+def filter_() -> Filter:
+    """Five particles that are never resampled."""
+    sensor = anonymous(RangeBearing(SE2, max_range=MAX_RANGE - 0.5))
+    never, held = EssTriggered(Systematic(), 0.0), LandmarkMap(SE2, evidence=True)
+    return Filter(OdometryMotion(SE2), sensor, held, resampler=never, n=5, rng=np.random.default_rng(0))
+
+
+def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> Sightings:
+    return Sightings(np.zeros(1, dtype=int), np.array([[distance, bearing]]), np.diag([0.01, 0.001])[None])
+
+
+def test_life_of_a_landmark(filter_):
+    """Sightings and misses are counted; nothing seen of nothing is no miss."""
+    landmark_map = filter_.belief().map
+    report = filter_.step(NOTHING)
+    assert report.new_landmarks.size == 0 and report.log_evidence == pytest.approx(0.0)
+    report = filter_.step(one_sighting())
+    assert report.new_landmarks.tolist() == [0]
+    assert (ids_of(report) == NEW).all()
+    np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 0.0)
+    report = filter_.step(one_sighting())
+    assert (ids_of(report) == 0).all()
+    np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 1.0)
+    # Beside it: neither near enough to be it nor far enough to be another one.
+    report = filter_.step(one_sighting(distance=3.65))
+    assert (ids_of(report) == NULL).all()
+    before = landmark_map.log_odds(np.array([0]))
+    for misses in (1, 2, 3):
+        filter_.step(NOTHING)
+        np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), before - 0.5 * misses)
+    for _ in range(3):
+        filter_.step(NOTHING)
+    assert landmark_map.ids.size == 0
+
+
+def test_what_is_out_of_sight_is_not_missed(filter_):
+    filter_.step(one_sighting(distance=MAX_RANGE - 0.3))
+    for _ in range(5):
+        filter_.step(NOTHING)
+    np.testing.assert_array_equal(filter_.belief().map.log_odds(np.array([0])), 0.0)
+
+
+class Fixed(Resampler):
+    """Always the same ancestors."""
+
+    def __init__(self, ancestors: list[int]) -> None:
+        self.chosen = np.array(ancestors)
+
+    def ancestors(self, weights, rng):
+        return self.chosen
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_descendants_inherit_the_association_of_their_parent(compiled):
+    landmark_map = LandmarkMap(SE2, compiled=compiled)
+    resampler = Fixed([3, 3, 4, 4, 5, 5])
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), landmark_map, resampler=resampler, n=6)
+    mean = np.broadcast_to([[3.0, 0.6], [3.0, 0.7]], (6, 2, 2))
+    landmark_map.add_records(Records(mean, np.broadcast_to(np.eye(2), (6, 2, 2, 2))), Point(2))
+    ids = np.array([[0], [0], [0], [1], [1], [0]])
+    report = filter_.step(seen(RangeBearing(SE2), one_sighting().z, one_sighting().cov_z, ids=ids))
+    assert ids_of(report).tolist() == [[1], [1], [1], [1], [0], [0]]
+    trace = np.trace(landmark_map.read(np.array([0, 1])).cov, axis1=2, axis2=3)
+    assert (trace < 0.1).tolist() == [[False, True]] * 4 + [[True, False]] * 2

@@ -10,6 +10,7 @@ import pytest
 from rbpf import gaussian
 from rbpf.conformance import Example, check_model
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis, squared_mahalanobis
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import (
     FusedKernel,
     Jacobians,
@@ -27,15 +28,22 @@ from rbpf.core.models import (
 from rbpf.errors import InputError
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.lie import SE2, SE3, Euclidean, Product
+from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
-from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
+from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from tests.core.scripted import Polar, says
 from tests.core.worlds import Recipe, drive, planar_world
 from tests.exactness.models import Frame, Scripted
+from tests.sensors.camera_scenes import CAMERAS
 
 RING = 24
 COUNTS = iter(range(10**9))
+CORNERS = np.random.default_rng(0).normal(size=(4, 3))
 MOUNTED = SE3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
 
 
@@ -152,6 +160,26 @@ SOUND: list[tuple[Any, Any, Example | None]] = [
     (Speed(), None, Example(substate=3)),
     *((landmark, SE2, None) for landmark in (Point(2), AnchoredPoint(SE2), MixturePoint(4, 2))),
     *((landmark, SE3, None) for landmark in (Point(3), AnchoredPoint(SE3), MixturePoint(4, 3))),
+    (OdometryMotion(SE3, 0.01, CAMERA_PLANE), None, Example(control=Odometry(MOUNTED, 0.01 * np.eye(6)))),
+    *(
+        (motion, None, Example(control=prior and replace(prior, std_velocity=forgotten)))
+        for motion in (MarginalVelocity(0.5), SampledVelocity(0.5), SampledVelocity(0.1, "paper"))
+        for prior, forgotten in (
+            (None, None),
+            (PosePrior(MOUNTED, np.eye(6)), None),
+            (PosePrior(MOUNTED, np.eye(6)), 0.3),
+        )
+    ),
+    *((CameraPoint(camera), SE3, None) for camera in CAMERAS.values()),
+    *(
+        (ray(camera), SE3, Example(landmark=InverseDepth()))
+        for camera in CAMERAS.values()
+        for ray in (CameraRay, EpipolarRay)
+    ),
+    *((landmark, SE3, None) for landmark in (InverseDepth(), Constellation(CORNERS))),
+    (UncertainConstellation(CORNERS, np.tile(1e-4 * np.eye(3), (4, 1, 1))), SE3, None),
+    (LandmarkMap(SE2), None, None),
+    (KalmanSubstate(SE2, np.zeros(1), np.eye(1), moves=lambda dt: (np.eye(1), np.zeros(1), np.eye(1))), None, None),
     (Gaussian(), None, None),
     (TruncatedMahalanobis(), None, None),
     (GaussianWithOutliers(0.1, 20.0), None, None),

@@ -171,11 +171,6 @@ GROUPS = Example(groups=[Observations.raw(0.4, MODE)])
 
 def test_sound_parts():
     assert check_model(Modes(), Euclidean(1), example=GROUPS) == []
-    assert check_model(LandmarkMap(SE2)) == []
-    assert (
-        check_model(KalmanSubstate(SE2, np.zeros(1), np.eye(1), moves=lambda dt: (np.eye(1), np.zeros(1), np.eye(1))))
-        == []
-    )
 
 
 class Hasty(Modes):

@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from rbpf import gaussian
-from rbpf.conformance import check_model
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Records
 from rbpf.errors import InputError
@@ -28,11 +27,6 @@ def shape_and_records(n: int, seed: int, scale: float = 0.01) -> tuple[Uncertain
     half = rng.normal(scale=0.003, size=(12, 14))
     cov = np.broadcast_to(half @ half.T, (n, 1, 12, 12))
     return UncertainConstellation(POINTS, COVS), Records(points.reshape(n, 1, 12), cov)
-
-
-@pytest.mark.parametrize("group", [Constellation(POINTS), UncertainConstellation(POINTS, COVS)])
-def test_sound_parametrisation(group):
-    assert check_model(group, SE3) == []
 
 
 def test_only_so_many_points_have_errors():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from rbpf import gaussian
-from rbpf.conformance import check_model
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -29,10 +28,6 @@ def euclidean(mean: np.ndarray, const: np.ndarray) -> np.ndarray:
     """The point (u, v, 1)/q in the anchor's frame, told in the world."""
     ray = np.concatenate([mean[..., :2], np.ones((*mean.shape[:-1], 1))], axis=-1)
     return SE3.transform(const, ray / mean[..., 2:])
-
-
-def test_sound_parametrisation():
-    assert check_model(LANDMARK, SE3) == []
 
 
 def test_homogeneous_is_the_point():

@@ -5,9 +5,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.core.models import Landmark, Records
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import NEW, NULL, Belief, Landmark, ObservationModel, Observations, Part, Records
+from rbpf.core.particles import Prior
 from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.maps.rows import Plan, Row, make_plan
 from rbpf.maps.store import Columns, Layout
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 
 
 class Free(Landmark):
@@ -154,3 +163,191 @@ def test_memory_follows_what_is_held():
 def test_ids_that_cannot_be(ids):
     with pytest.raises(InputError, match="comes twice"):
         Columns().restore(np.array(ids), 9)
+
+
+# Which rows are independent and which belong together.
+
+N = 4
+NUMBERS = np.array([0, 0, 0, 1, 1, 2, -1])
+PLAIN = np.array([True, True, False])
+HELD = [0, 1, 2, 3, 4, 5]
+
+
+def kinds(ids):
+    """Numbers of parametrisations; beyond them there is no landmark."""
+    return np.where(ids < NUMBERS.size, NUMBERS[np.minimum(ids, NUMBERS.size - 1)], -1)
+
+
+class Anything(ObservationModel):
+    """A model that is not called."""
+
+    dim = 1
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        raise AssertionError
+
+
+def group(ids, **options) -> Observations:
+    ids = np.array(ids)
+    return Observations(np.zeros((ids.shape[-1], 1)), np.ones((ids.shape[-1], 1, 1)), Anything(), ids=ids, **options)
+
+
+def rows_of(plan: Plan) -> list[Row]:
+    """Every row of a plan, batches taken apart."""
+    rows = [row for rows in plan.joint for row in rows] + list(plan.mixtures)
+    for batch in plan.batches:
+        for j, (k, landmark) in enumerate(zip(batch.ks.tolist(), batch.ids.tolist(), strict=True)):
+            mask = None if batch.mask is None else batch.mask[:, j]
+            rows.append(Row(batch.group, k, landmark, mask))
+    return rows
+
+
+def matrix(rows: list[Row], count: int, groups: int) -> np.ndarray:
+    """Ids (groups, N, count) that rows speak of, −1 elsewhere."""
+    out = np.full((groups, N, count), NULL)
+    for row in rows:
+        mask = np.ones(N, dtype=bool) if row.mask is None else row.mask
+        assert (out[row.group, mask, row.k] == NULL).all()
+        out[row.group, mask, row.k] = row.landmark
+    return out
+
+
+@st.composite
+def id_arrays(draw):
+    """Ids (K,) or (N, K); a landmark may be named several times."""
+    count = draw(st.integers(1, 4))
+    one = st.sampled_from([NULL, NEW, *HELD])
+    per_particle = draw(st.booleans())
+    shape = (N, count) if per_particle else (count,)
+    flat = draw(st.lists(one, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))
+    return np.array(flat).reshape(shape)
+
+
+@given(st.lists(id_arrays(), min_size=1, max_size=3))
+def test_every_row_appears_once_and_overlaps_are_stacked(all_ids):
+    plan = make_plan([group(ids) for ids in all_ids], N, kinds, PLAIN)
+    count = max(ids.shape[-1] for ids in all_ids)
+    found = matrix(rows_of(plan), count, len(all_ids))
+    for g, ids in enumerate(all_ids):
+        expected = np.broadcast_to(np.where(ids >= 0, ids, NULL), (N, ids.shape[-1]))
+        np.testing.assert_array_equal(found[g, :, : ids.shape[-1]], expected)
+    for batch in plan.batches:
+        assert np.unique(kinds(batch.ids)).size == 1
+        assert PLAIN[kinds(batch.ids[:1])[0]]
+    assert all(not PLAIN[kinds(np.array([row.landmark]))[0]] for row in plan.mixtures)
+    together = {rows[0].landmark for rows in plan.joint}
+    assert all(len({row.landmark for row in rows}) == 1 for rows in plan.joint)
+    for landmark in HELD[:5]:
+        per_particle = (found == landmark).sum(axis=(0, 2))
+        assert (landmark in together) == bool((per_particle > 1).any())
+
+
+def test_impossible_clutter_only_counts_where_there_is_some():
+    plan = make_plan([group([[NULL], [0], [0], [0]], log_clutter=-np.inf)], N, kinds, PLAIN)
+    assert plan.log_factor.tolist() == [-np.inf, 0.0, 0.0, 0.0]
+
+
+def test_the_common_case_is_one_batch_without_masks():
+    plan = make_plan([group([2, NULL, 0, 1])], N, kinds, PLAIN)
+    assert len(plan.batches) == 1
+    assert plan.batches[0].ids.tolist() == [2, 0, 1]
+    assert plan.batches[0].ks.tolist() == [0, 2, 3]
+    assert plan.batches[0].mask is None
+    same_in_all = make_plan([group([[2, 0]] * N)], N, kinds, PLAIN)
+    assert [batch.mask for batch in same_in_all.batches] == [None]
+    nothing = make_plan([group(np.zeros(0, dtype=int))], N, kinds, PLAIN)
+    assert (nothing.batches, nothing.joint, nothing.mixtures) == ([], [], [])
+
+
+@pytest.mark.parametrize("ids", [[6], [7], [[0]] * (N - 1) + [[6]]])
+def test_landmarks_that_are_not_held(ids):
+    with pytest.raises(InputError, match=r"names landmark [67], which the map does not hold"):
+        make_plan([group(ids)], N, kinds, PLAIN)
+
+
+# Reading and projecting by drivers against the store's own columns and the models in NumPy.
+
+CAMERA = Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.1, 0.02, 0.001, -0.001, 0.0))
+
+
+def grown(n: int, rng: np.random.Generator) -> tuple[LandmarkMap, Lineage, np.ndarray, np.ndarray]:
+    """A map of points and rays of several generations, the first of which have gone cold."""
+    lineage, landmark_map = Lineage(n), LandmarkMap(SE3)
+    landmark_map.begin(n, lineage)
+    points, rays = [], []
+    for _ in range(6):
+        spread = 0.02 * rng.normal(size=(n, 2, 3, 3))
+        cov = spread @ np.swapaxes(spread, -1, -2)
+        mean = rng.uniform([-1, -1, 3], [1, 1, 5], (2, 3)) + 0.02 * rng.normal(size=(n, 2, 3))
+        points.append(landmark_map.add_records(Records(mean, cov), Point(3)))
+        anchor = SE3.exp(0.02 * rng.normal(size=(n, 2, 6)))
+        bearing = np.array([0.1, -0.1, 0.3]) + 0.02 * rng.normal(size=(n, 2, 3))
+        rays.append(landmark_map.add_records(Records(bearing, cov, anchor), InverseDepth()))
+        ancestors = np.sort(rng.integers(0, n, n))
+        lineage.advance(ancestors)
+        landmark_map.resample(ancestors)
+    return landmark_map, lineage, np.concatenate(points), np.concatenate(rays)
+
+
+@pytest.mark.parametrize("n", [7, 300])
+def test_records_are_the_columns(n):
+    landmark_map, _, points, rays = grown(n, np.random.default_rng(0))
+    for ids, landmark in ((points[-6:], Point(3)), (rays[-6:], InverseDepth())):
+        assert landmark_map.store.is_warm(ids[-2:])
+        for chosen in (ids[-2:], ids):
+            read = landmark_map.read(chosen)
+            layout = landmark_map.layouts[0 if isinstance(landmark, Point) else 1]
+            plain = layout.unpack(np.array([landmark_map.store.read(int(i)) for i in chosen]))
+            np.testing.assert_array_equal(read.mean, plain.mean)
+            np.testing.assert_array_equal(read.cov, plain.cov)
+            if plain.const is not None:
+                np.testing.assert_array_equal(read.const, plain.const)
+
+
+@pytest.mark.parametrize("some", [slice(3, 4), slice(2, 6), np.array([5, 0, 5])], ids=str)
+def test_records_of_some_particles(some):
+    landmark_map, _, points, rays = grown(7, np.random.default_rng(1))
+    for ids in (points[-2:], rays[-2:], points, rays):
+        part, whole = landmark_map.read(ids, some), landmark_map.read(ids)
+        np.testing.assert_array_equal(part.mean, whole.mean[some])
+        np.testing.assert_array_equal(part.cov, whole.cov[some])
+        if whole.const is not None:
+            np.testing.assert_array_equal(part.const, whole.const[some])
+
+
+@pytest.mark.parametrize("camera_model", [CameraPoint, CameraRay, EpipolarRay])
+def test_innovations_in_the_heaviest_particle_equal_numpys(camera_model):
+    rng, n, k = np.random.default_rng(4), 7, 4
+    landmark_map, _, points, rays = grown(n, rng)
+    ids = (points if camera_model is CameraPoint else rays)[-k:]
+    state = SE3.exp(0.05 * rng.normal(size=(n, 6)))
+    prior = Prior(SE3, state, np.zeros((1, 6)), np.zeros((1, 6, 6)))
+    log_weights = np.log(np.arange(1.0, n + 1.0) / 28.0)
+    belief = Belief(log_weights, prior, {Part.LANDMARK: landmark_map})
+    model, z = camera_model(CAMERA), rng.uniform([200, 100], [400, 300], (k, 2))
+    found = belief.innovations(model, z, ids)
+    landmark_map.compiled = False
+    for part, expected in zip(found, belief.innovations(model, z, ids), strict=True):
+        assert part.shape == expected.shape
+        np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("n", [7, 300])
+@pytest.mark.parametrize("shared", [True, False], ids=["one factor", "own factors"])
+def test_projections_equal_numpys(n, shared):
+    rng = np.random.default_rng(2)
+    landmark_map, _, points, rays = grown(n, rng)
+    factor = 0.01 * rng.normal(size=(1 if shared else n, 6, 6))
+    prior = Prior(SE3, SE3.exp(0.02 * rng.normal(size=(n, 6))), 0.01 * rng.normal(size=(n, 6)), factor, centred=False)
+    weights = rng.uniform(size=n)
+    belief = Belief(np.log(weights / weights.sum()), prior, {Part.LANDMARK: landmark_map})
+    # A constraint is projected by its prediction.
+    assert not landmark_map.is_compiled(EpipolarRay(CAMERA), rays[-2:])
+    for model, ids in ((CameraPoint(CAMERA), points[-2:]), (CameraRay(CAMERA), rays[-2:])):
+        assert landmark_map.is_compiled(model, ids)
+        mean, cov = belief.project(model, ids)
+        landmark_map.compiled = False
+        expected_mean, expected_cov = belief.project(model, ids)
+        landmark_map.compiled = True
+        np.testing.assert_allclose(mean, expected_mean, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(cov, expected_cov, rtol=1e-10, atol=1e-10)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.conformance import Example, check_model
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import POSE_AND_VELOCITY, MarginalVelocity, PosePrior, SampledVelocity, velocity_walk
@@ -114,15 +113,6 @@ def test_a_prior_places_the_body(mode, std_velocity, dt):
     factor, zero = transition.noise_factor[0], np.zeros((6, 6))
     expected = np.block([[PRIOR.cov, zero], [zero, of_velocity]])
     np.testing.assert_allclose(factor @ factor.T, expected, atol=1e-14)
-
-
-FORGETTING = PosePrior(PRIOR.mean, PRIOR.cov, WALK)
-
-
-@pytest.mark.parametrize("control", [None, PRIOR, FORGETTING])
-@pytest.mark.parametrize("motion", [MarginalVelocity(WALK), SampledVelocity(WALK), SampledVelocity(0.1, "paper")])
-def test_sound_models(motion, control):
-    assert check_model(motion, example=Example(control=control)) == []
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rbpf.conformance import Example, check_model
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
@@ -73,12 +72,6 @@ def test_three_degrees_of_freedom_drop_the_others():
     expected = (MEASURED.cov + 0.01 * np.eye(6))[np.ix_(PLANAR, PLANAR)]
     np.testing.assert_allclose(found.cov[np.ix_(PLANAR, PLANAR)], expected)
     np.testing.assert_array_equal(found.cov[OTHER], 0.0)
-
-
-@pytest.mark.parametrize("free", [None, CAMERA_PLANE])
-def test_it_is_a_sound_model(free):
-    state = SE3.exp(np.random.default_rng(3).normal(size=(5, 6)))
-    assert check_model(OdometryMotion(SE3, 0.01, free), example=Example(state, control=MEASURED)) == []
 
 
 def test_chained_covariance_against_samples():

@@ -1,5 +1,6 @@
 """A robot among landmarks without names, on a joint map."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,19 @@ import pytest
 
 from examples.studies.hypotheses import come_back, corridor
 from examples.studies.soak import held_bytes
+from rbpf.core.filter import Filter
+from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
-from rbpf.runs.recordings import filter_opened, open_robot_log
+from rbpf.lie import SE2, SE3
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.runs.recordings import filter_opened, open_robot_log, part_of_log
+from rbpf.runs.truth import poses_at
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.sensors.readers import Frame, Part, RobotLog
+from rbpf.systems.anchoring import Anchored, StartAnchor, relative_estimate
 from rbpf.systems.range_bearing.config import AssociationConfig, RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
@@ -79,3 +91,182 @@ def test_measurements_that_are_none_are_refused_before_anything_moves():
     with pytest.raises(InputError, match="not finite"):
         slam.take(replace(log.frames[1], z=log.frames[1].z * np.nan))
     assert slam.filter.steps == 1
+
+
+# The robot's system: wrong readings after a blind turn and as the first one of a landmark, many readings at once.
+
+WORLD = RobotWorld(
+    steps=330, landmarks=40, radius_m=2.0, extent_m=5.0, max_range_m=6.0, half_field_of_view_deg=30.0,
+    std_range_m=0.12, std_angle_deg=1.1, std_translation_m=0.01, std_rotation_deg=1.1,
+)  # fmt: skip
+BLIND, LAST, WRONG = (100, 260), 310, 0.03
+"""Steps without a reading, the last step, and the fraction of wrong readings."""
+
+
+def blind_turn(seed: int) -> RobotLog:
+    """One or two landmarks a step, after the turn new ones alone: the heading by odometry has σ of 14° there."""
+    log, rng = simulated_log(WORLD, seed), np.random.default_rng(seed)
+    before, after = part_of_log(log, Part(end_s=BLIND[0])).frames, part_of_log(log, Part(BLIND[1], LAST)).frames
+    gap = part_of_log(log, Part(BLIND[0], BLIND[1], BLIND[1] - BLIND[0])).frames[1]
+    known = {name for frame in before for name in frame.landmarks.tolist()}
+
+    def seen(frame: Frame) -> Frame:
+        again = np.isin(frame.landmarks, list(known)) & (frame.stamp_ns >= BLIND[1])
+        rows = rng.permutation(np.flatnonzero(~again))[: rng.integers(1, 3)]
+        z = frame.z[rows]
+        wrong = rng.random(len(z)) < WRONG
+        z[wrong] = rng.uniform([1.0, -0.5], [6.0, 0.5], (int(wrong.sum()), 2))
+        return replace(frame, landmarks=frame.landmarks[rows], z=z, cov_z=frame.cov_z[rows])
+
+    frames = [*before, gap, *after[1:]]
+    return replace(log, frames=[seen(frame) for frame in frames], misread=True)
+
+
+def headings(seed: int, config: RangeBearingConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Error and σ of the heading (T,) after the turn."""
+    log = blind_turn(seed)
+    run = filter_opened(open_robot_log(log, replace(config, seed=seed)))
+    _, truth = poses_at(SE2, log.truth.stamps_ns, log.truth.poses, run.log.stamps_ns)
+    after = run.log.stamps_ns >= BLIND[1]
+    return SE2.between(truth, run.log.poses)[after, 0], np.sqrt(run.log.covs[after, 0, 0])
+
+
+@pytest.mark.slow
+def test_wrong_readings_do_not_choose_the_heading():
+    """NEES over the seeds; by a Gaussian likelihood it is 8, for the first wrong reading leaves one heading of many."""
+    found = [headings(seed, RangeBearingConfig()) for seed in range(8)]
+    assert np.mean([np.square(error / sigma).mean() for error, sigma in found]) < 3.0
+
+
+@pytest.mark.parametrize("first", [0, 1], ids=["first frame", "later"])
+def test_a_landmark_is_begun_anew_when_its_second_reading_contradicts_the_first(first):
+    """Else all that is seen of it later would be taken for wrong, and a start for known that is not."""
+    log = simulated_log(RobotWorld(steps=40), 0)
+    names = [frame.landmarks.tolist() for frame in log.frames]
+    step = next(t for t, seen in enumerate(names) if t >= first and set(seen) - set().union(*names[:t]))
+    name = sorted(set(names[step]) - set().union(*names[:step]))[0]
+    z = log.frames[step].z.copy()
+    z[names[step].index(name)] += [2.0, 0.5]
+    log.frames[step] = replace(log.frames[step], z=z)
+    run = filter_opened(open_robot_log(replace(log, misread=True), RangeBearingConfig()))
+    found = run.system.map()
+    error = found.mean[found.ids == name][0] - run.truth.landmarks[name]
+    assert np.linalg.norm(error) < 0.15
+    assert np.linalg.norm(run.log.poses[:, 1:] - run.truth.poses[:, 1:], axis=1).max() < 0.2
+
+
+def test_many_first_sightings_in_one_frame_take_time_in_proportion_to_their_number():
+    """30,000 names, the last one twice: the second time tells nothing in the frame that starts the landmark."""
+    count = 30_000
+    rng = np.random.default_rng(0)
+    z = np.stack([rng.uniform(1.0, 100.0, count), rng.uniform(-3.0, 3.0, count)], axis=1)
+    cov_z = np.broadcast_to(np.diag([1e-2, 1e-3]), (count, 2, 2))
+    names = np.minimum(np.arange(count), count - 2)
+    slam = RangeBearingSlam(RangeBearingConfig(particles=2, map="particles"))
+    started = time.process_time()
+    used = slam.track(z, cov_z, names).observed["landmarks"]
+    assert time.process_time() - started < 2.0  # 0.3 s; 4 s if each is compared with all before it
+    assert used.tolist() == [*range(count - 1), -1]
+    assert slam.track(z[-2:], cov_z[-2:], names[-2:]).observed["landmarks"].tolist() == [count - 2] * 2
+
+
+# The start re-estimated in each particle's world, and poses relative to it.
+
+COV_Z = np.diag([0.04, 0.09])
+LANDMARKS = np.array([[4.0, 1.0], [3.0, -2.0], [6.0, 0.5], [5.0, 3.0]])
+
+
+def frame(rng, pose, stamp_ns):
+    z = SE2.inverse_transform(pose, LANDMARKS) + rng.multivariate_normal(np.zeros(2), COV_Z, len(LANDMARKS))
+    names = np.arange(len(LANDMARKS))
+    return Frame(stamp_ns, None, None, names, z, np.repeat(COV_Z[None], len(LANDMARKS), axis=0))
+
+
+def started(n):
+    model, own = RelativePosition(SE2), LandmarkMap(SE2)
+    sensor, anchor = NamedLandmarkSensor(model, Point(2)), StartAnchor(own, model, 1)
+    filter_ = Filter(OdometryMotion(SE2), sensor, [own, anchor], EkfProposal(), n=n, rng=np.random.default_rng(0))
+    return filter_, anchor
+
+
+CONTROL = Odometry(np.array([0.1, 0.5, 0.0]), np.diag([0.02, 0.1, 0.1]) ** 2)
+
+
+def drive(steps):
+    rng = np.random.default_rng(100)
+    filter_, anchor = started(50)
+    pose = SE2.identity()
+    for t in range(steps):
+        control = CONTROL if t else None
+        if t:
+            pose = SE2.retract(SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3))
+        report = filter_.step(frame(rng, pose, t * 10**9), control, t * 10**9)
+        anchored = anchor.after_step(report)
+    return filter_, anchor, anchored
+
+
+def test_law_of_the_start_equals_the_joint_gaussian():
+    """Against a plain information-form solution: odometry from x_0 to x_1, first frame against the rest of the map."""
+    filter_, anchor, _ = drive(4)
+    anchored = anchor.estimate()
+    records = filter_.belief().read(np.arange(len(LANDMARKS)))
+    x1, z0 = anchor._second, anchor._z
+    model = RelativePosition(SE2)
+    for i in (0, 17, 49):
+        start = SE2.compose(x1[i], SE2.inverse(CONTROL.delta))
+        adjoint = SE2.adjoint(CONTROL.delta)
+        prior_info = np.linalg.inv(adjoint @ CONTROL.cov @ adjoint.T)
+        x, origin = start, start
+        for _ in range(2):
+            offset = SE2.local(origin, x)
+            info, vector = prior_info.copy(), -prior_info @ offset
+            for k in range(len(LANDMARKS)):
+                info_map = np.linalg.inv(records.cov[i, k])
+                j0 = model.jacobians(np.zeros(3), records.mean[i, k]).landmark
+                without = np.linalg.inv(info_map - j0.T @ np.linalg.inv(COV_Z) @ j0)
+                gap = z0[k] - model.predict(np.zeros(3), records.mean[i, k])
+                mean = records.mean[i, k] - without @ j0.T @ np.linalg.inv(COV_Z) @ gap
+                jac = model.jacobians(x, mean)
+                h = jac.state @ SE2.right_jacobian(offset)
+                s = np.linalg.inv(jac.landmark @ without @ jac.landmark.T + COV_Z)
+                info += h.T @ s @ h
+                vector += h.T @ s @ (z0[k] - model.predict(x, mean))
+            step = np.linalg.solve(info, vector)
+            x = SE2.retract(origin, offset + step)
+        np.testing.assert_allclose(anchored.mean[i], x, atol=1e-9)
+        factor = anchored.factor[i]
+        np.testing.assert_allclose(factor @ factor.T, np.linalg.inv(info), atol=1e-9)
+
+
+def test_zero_period_is_refused():
+    with pytest.raises(InputError, match="every 1, 2"):
+        StartAnchor(LandmarkMap(SE2), RelativePosition(SE2), 0)
+
+
+# Poses relative to a frame that each particle knows in its own world, up to a covariance.
+
+every_space = pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+
+
+def draw(space, n: int, spread: float, seed: int = 0):
+    """Weighted particles whose own worlds differ much more than their poses relative to the frame."""
+    rng = np.random.default_rng(seed)
+    frames = space.exp(rng.normal(size=(n, space.dim)))
+    relative = space.retract(space.exp(np.full(space.dim, 0.7)), spread * rng.normal(size=(n, space.dim)))
+    factor = 0.02 * rng.normal(size=(n, space.dim, space.dim + 1))
+    log_weights = np.log(rng.dirichlet(np.ones(n)))
+    return Anchored(frames, factor), space.compose(frames, relative), relative, log_weights
+
+
+@every_space
+def test_covariance_of_the_frame_is_turned_into_the_poses_chart(space):
+    """Against samples of x_0 = mean Exp(F e) of one particle."""
+    anchored, state, _, _ = draw(space, 1, 0.0)
+    found = relative_estimate(space, anchored, state, np.zeros(1))
+    n, factor = 100_000, anchored.factor[0]
+    noise = np.random.default_rng(1).standard_normal((n, factor.shape[1]))
+    moved = space.between(space.retract(anchored.mean, noise @ factor.T), state)
+    errors = space.local(found.mean, moved)
+    scale = np.sqrt(np.outer(np.diag(found.cov), np.diag(found.cov)))
+    assert (np.abs(np.cov(errors.T) - found.cov) / scale).max() < 0.05
+    assert (np.abs(factor @ factor.T - found.cov) / scale).max() > 0.1

@@ -6,15 +6,23 @@ import numpy as np
 import pytest
 
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, RoomWorld, simulate_features
+from rbpf.core.linearisation import numeric_jacobians
+from rbpf.core.models import Part
+from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import CameraPoint, CameraRay
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, SearchConfig, VelocityConfig
+from rbpf.systems.mono.place_recognition import RISK, WRONG, log_likelihood, log_odds
+from rbpf.systems.mono.relocalisation import CORNER_PX
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.mono.start.adjustment import FirstFrames
+from rbpf.systems.system import TrackingState
 from tests.systems.mono_logs import desk, errors, nees, without_known
-from tests.systems.plane_sequences import CAMERA, sequence
+from tests.systems.plane_sequences import CAMERA, Pictures, known_points, sequence, texture
 
 JOINT = MonoConfig(map="joint", settled_frames=4)
 
@@ -110,6 +118,145 @@ def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     assert len(missing) < 3
 
 
-def test_what_is_refused():
-    with pytest.raises(InputError, match=r"set velocity\.mode=marginal, not paper"):
-        MonoSlam(CAMERA, replace(JOINT, velocity=VelocityConfig("paper")))
+# Whether a place is one that was seen before is a matter of evidence: where it may be, and how well everything fits.
+
+HERE = SE3.exp(np.array([0.02, 0.05, -0.03, 0.1, 0.05, -0.1]))
+COV = 1e-4 * np.eye(3)
+
+
+def seen(count: int, wrong: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (M, 3) with covariances, and where a camera sees them, the last ones anywhere."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0], (count, 3))
+    px = CAMERA.project(SE3.inverse_transform(HERE, points)) + CORNER_PX * rng.normal(size=(count, 2))
+    px[count - wrong :] = rng.uniform(0.0, [CAMERA.width, CAMERA.height], (wrong, 2))
+    return points, np.tile(COV, (count, 1, 1)), px
+
+
+def prior(off_m: float, std_m: float = 1.0) -> Estimate:
+    return Estimate(
+        SE3.compose(HERE, SE3.exp(np.array([0.1, -0.05, 0.1, off_m, 0.0, 0.0]))), np.diag([0.01] * 3 + [std_m**2] * 3)
+    )
+
+
+def test_the_likelihood_is_the_integral_over_the_pose():
+    """By importance sampling."""
+    (points, cov, px), here = seen(9, 2), prior(0.5, 0.5)
+    found, mode = log_likelihood(CAMERA, HERE, points, cov, px, here)
+    rng, std = np.random.default_rng(1), np.repeat([0.02, 0.06], 3)
+    away = std * rng.standard_normal((100_000, 6))
+    poses = SE3.retract(mode, away)
+    off = SE3.local(here.mean, poses)
+    total = (
+        -0.5 * np.square(off / np.sqrt(np.diagonal(here.cov))).sum(axis=1) - 0.5 * np.log(np.diagonal(here.cov)).sum()
+    )
+    total += 0.5 * np.square(away / std).sum(axis=1) + np.log(std).sum()
+    for point, place in zip(points, px, strict=True):
+        near = SE3.inverse_transform(poses, np.broadcast_to(point, (len(poses), 3)))
+        by_point = CAMERA.jacobian(near) @ np.swapaxes(SE3.rotation(poses), 1, 2)
+        spread = by_point @ COV @ np.swapaxes(by_point, 1, 2) + CORNER_PX**2 * np.eye(2)
+        miss = place - CAMERA.project(near)
+        squared = np.einsum("ni,nij,nj->n", miss, np.linalg.inv(spread), miss)
+        density = np.exp(-0.5 * squared) / (2.0 * np.pi * np.sqrt(np.linalg.det(spread)))
+        total += np.log((1.0 - WRONG) * CAMERA.width * CAMERA.height * density + WRONG)
+    np.testing.assert_allclose(found, np.logaddexp.reduce(total) - np.log(len(total)), atol=0.2)
+
+
+@pytest.mark.parametrize("count", [20, 200])
+def test_it_is_no_matter_of_counts(count):
+    """However many matches fit: a camera 8 m from there, known to a metre, sees a place that looks alike."""
+    size, enough = np.array([15.0, 15.0, 3.0]), -np.log(RISK)
+    assert log_odds(CAMERA, HERE, *seen(count, count // 2), prior(1.0), size)[0] > enough
+    assert log_odds(CAMERA, HERE, *seen(count, count // 2), prior(8.0), size)[0] < -enough
+    assert log_odds(CAMERA, HERE, *seen(count, count), prior(1.0), size)[0] < -enough
+
+
+@pytest.mark.slow
+def test_a_lost_camera_is_found_in_an_old_sub_map():
+    """It has left the first wall of a gallery when the light goes out, and is back there when it comes on again."""
+    away, dark, end = 90, 130, 150
+    frames = np.arange(end)
+    side = np.where(
+        frames < away, 2.4 * np.sin(np.pi / 2 * frames / away) ** 2, np.maximum(2.4 - 0.055 * (frames - away), 0.2)
+    )
+    shake = [
+        0.03 * np.sin(0.2 * frames),
+        0.0 * side,
+        0.05 * np.sin(0.13 * frames),
+        side,
+        0.1 * np.sin(0.09 * frames),
+        -0.05 * side,
+    ]
+    poses = SE3.retract(SE3.identity(), np.stack(shake, axis=-1))
+    search = SearchConfig(measurements=15, min_in_view=20)
+    config = MonoConfig(map="joint", particles=30, settled_frames=4, submap=24, search=search)
+    slam, held = MonoSlam(CAMERA, config, known_points()), 0
+    for frame in Pictures(
+        texture(), poses, lambda t, image: np.zeros_like(image) if away <= t < dark else image
+    ).frames(0):
+        found = slam.take(frame)
+        held = max(held, len(slam.joint.old.maps) if slam.joint else 0)
+        if found.state == TrackingState.LOST and slam.attempt is not None:
+            assert slam.attempt.agreeing < config.relocalisation.min_inliers  # the present sub-map does not know it
+    error = SE3.local(found.pose, poses[-1])
+    assert found.state == TrackingState.TRACKED and held > 3
+    assert np.linalg.norm(error[3:]) < 0.05 and error @ np.linalg.solve(found.cov, error) < 20.0
+
+
+@pytest.mark.slow
+def test_a_loop_is_closed_a_metre_off():
+    """Of features with names, once round a room: at once as exact as the map, and as sure as it should be."""
+    log = simulate_features(RoomWorld(frames=310, laps=1.0075, points=3000), Measuring(measurements=12), MONO, 0)
+    run = filter_features(log, MonoConfig(submap=60))
+    off = np.linalg.norm(errors(run)[:, 3:], axis=1)
+    assert off[280] > 0.9 and off[290:300].mean() < 0.1 and nees(run)[290:300].mean() < 6.0 * 6.0
+
+
+# A camera whose focal lengths and distortion are members of the joint map: found while running, and honest about it.
+
+ONLINE = MonoConfig(calibrate="online", particles=30, settled_frames=15)
+BENT = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
+FISHEYE = Pinhole(640, 480, 300.0, 310.0, 320.0, 240.0, (0.02, -0.01, 0.002, 0.001), "equidistant")
+
+
+@pytest.mark.parametrize("camera", [BENT, FISHEYE], ids=["radial-tangential", "equidistant"])
+def test_slopes_by_the_calibration(camera):
+    """Of what is seen, of what is started, and that the linear model is the tuned camera's to the second order."""
+    rng = np.random.default_rng(0)
+    point, state = rng.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 4.0], (6, 3)), SE3.exp(0.1 * rng.normal(size=6))
+    about, tuned = np.zeros(10), np.concatenate([rng.normal(size=6), [0.02, 0.01, 0.01, -0.02]])
+    model = CameraPoint(camera, about=about)
+    slope = model.jacobians(state, point, None, about).substate
+    numeric = numeric_jacobians(model, SE3, state, point, None, np.tile(about, (6, 1)), frozenset({Part.SUBSTATE}))
+    np.testing.assert_allclose(slope, numeric.substate, atol=1e-4)
+    seen = CameraPoint(camera.tuned(tuned[6:])).predict(state, point)
+    predicted = model.predict(state, point, None, tuned)
+    assert np.abs(predicted - seen).max() < 0.05 * np.abs(seen - model.predict(state, point)).max()
+    ray, step = CameraRay(camera, about=about), 1e-6
+    for k in range(4):
+        one, other = (camera.tuned(sign * step * np.eye(4)[k]).unproject(seen) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(ray.new_by_substate(seen)[:, :2, 6 + k], (one - other) / (2 * step), atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+def test_a_focal_length_that_is_too_long_is_found(known):
+    """By a camera over a desk; it is nearer than it was, by more than chance, and within what is stated."""
+    log = desk(3, frames=60, measurements=20)
+    log = replace(log if known else without_known(log), camera=MONO.tuned(np.array([0.05, 0.05, 0.0, 0.0])))
+    run = filter_features(log, ONLINE)
+    camera, std = run.system.hand_over.calibration(run.system.filter)
+    assert abs(np.log(camera.fx / MONO.fx)) < min(3.0 * std[0], 0.02)
+    assert std[0] < 0.01
+    entries = run.system.summary(run.log)["calibration"]
+    assert entries["fx"] == camera.fx and entries["std_fx"] == pytest.approx(camera.fx * std[0])
+    assert f"fx: {float(camera.fx)!r}" in run.system.files(run.log)["camera.yaml"]
+    assert run.system.measurements("desk", run.log).camera == camera
+
+
+@pytest.mark.parametrize("options", [{"map": "particles"}, {"known": "points"}, {"lag": 5}, {}], ids=repr)
+def test_what_is_refused(options):
+    refused = replace(ONLINE, **options) if options else replace(JOINT, velocity=VelocityConfig("paper"))
+    told = "calibrate=online holds the camera in a joint map" if options else r"set velocity\.mode=marginal, not paper"
+    with pytest.raises(InputError, match=told):
+        MonoSlam(MONO, refused)

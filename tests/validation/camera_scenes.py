@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints, Truth
-from tests.validation.numeric import shrunk, slope_of
+from tests.validation.worlds import shrunk, slope_of
 
 PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)
 BENT = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.0))

@@ -38,7 +38,7 @@ from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.validation.camera_scenes import scene
-from tests.validation.linear_worlds import linear_log
+from tests.validation.worlds import linear_log
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
 from rbpf.validation.gtsam.robot import CHUNK, solve, solve_online
-from tests.validation.numeric import assert_same_covariances
-from tests.validation.worlds import seen, solve_by_scipy, world
+from tests.validation.worlds import assert_same_covariances, seen, solve_by_scipy, world
 
 WORLDS = [
     (2, "range_bearing", False),

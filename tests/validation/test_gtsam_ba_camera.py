@@ -15,7 +15,7 @@ from rbpf.validation.gtsam.camera_graph import CameraProblem, adjust
 from rbpf.validation.gtsam.observations import known_by_name, observation_table
 from rbpf.validation.gtsam.solvers import marginals_by_schur
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
-from tests.validation.numeric import assert_same_covariances
+from tests.validation.worlds import assert_same_covariances
 
 CAMERAS = [PLAIN, BENT, WHOLE, FISHEYE, STEREO]
 

@@ -14,8 +14,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.gtsam import path_sampling
 from rbpf.validation.gtsam.path_sampling import draw_posterior
 from rbpf.validation.gtsam.robot import solve
-from tests.validation.linear_worlds import linear_log
-from tests.validation.worlds import seen, world
+from tests.validation.worlds import linear_log, seen, world
 
 
 def drawn(m, draws=400, seed=0):

@@ -23,7 +23,7 @@ from rbpf.validation.consistency.comparison import (
     verdict_of,
 )
 from rbpf.validation.consistency.statistic import coverage, step_ratio, variance_ratio, whitened_errors
-from tests.validation.fixes import Receiver, Walk
+from tests.validation.worlds import Receiver, Walk
 
 ALIKE = {
     "sensor noise × 2", "sensor noise ÷ 3", "odometry noise × 3", "nothing, another world", "the same in another world",

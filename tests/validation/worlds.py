@@ -1,5 +1,6 @@
 """Small worlds with a tilted sensor, and their batch solution by SciPy in another parametrisation."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -8,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from rbpf import gaussian
-from rbpf.lie import SE2, SE3, Array
+from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
+from rbpf.lie import SE2, SE3, Array, Euclidean
+from rbpf.sensors.readers import Frame, RobotLog, Truth
 from rbpf.sensors.readers.measurements import Kind, Measurements
-from tests.validation.numeric import shrunk, slope_of
 
 Index = NDArray[np.int64]
 
@@ -136,3 +138,87 @@ def _thin_factor(cov: Array) -> Array:
     values, vectors = np.linalg.eigh(cov)
     kept = values > 1e-12 * values[-1]
     return vectors[:, kept] * np.sqrt(values[kept])
+
+
+# A robot whose heading is known, and that measures positions: a linear-Gaussian world for every optimiser.
+
+TURN_STD = 1e-4
+MOVE_STD, SEEN_STD = 0.1, 0.15
+
+
+def linear_log(steps: int = 12, landmarks: int = 5, seed: int = 0) -> RobotLog:
+    """Steps of half a metre along x; every landmark is seen in two of three steps."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([0.0, -3.0], [0.5 * steps, 3.0], (landmarks, 2))
+    cov_delta = np.diag([TURN_STD, MOVE_STD, MOVE_STD]) ** 2
+    at, path, frames = np.zeros(2), [], []
+    for step in range(steps):
+        delta = np.array([0.0, 0.5, 0.0])
+        if step:
+            at = at + delta[1:] + MOVE_STD * rng.normal(size=2)
+        path.append(np.array([0.0, *at]))
+        names = np.flatnonzero((rng.random(landmarks) < 2 / 3) | (step == 0))
+        z = points[names] - at + SEEN_STD * rng.normal(size=(len(names), 2))
+        cov = np.repeat(SEEN_STD**2 * np.eye(2)[None], len(names), axis=0)
+        moved, cov_moved = (delta, cov_delta) if step else (None, None)
+        frames.append(Frame(step, moved, cov_moved, names.astype(np.int64), z, cov))
+    truth = Truth(np.arange(steps), np.array(path), dict(enumerate(points)))
+    return RobotLog("linear world", SE2, "position", SE2.identity(), frames, truth=truth)
+
+
+# Numeric derivatives and robust weights that the tests of batch optimisers compare with.
+
+
+def slope_of(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, step: float = 1e-5) -> np.ndarray:
+    """∂function/∂x (m, n) by central differences, of a function (…, n) → (…, m) of many places at once."""
+    moves = step * np.eye(len(x))
+    return ((function(x + moves) - function(x - moves)) / (2 * step)).T
+
+
+def shrunk(whitened: np.ndarray, robust: float | None) -> np.ndarray:
+    """Residuals (…, p) of which half the square is Huber's loss with this bound; None leaves them."""
+    if robust is None:
+        return whitened
+    norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
+    beyond = np.maximum(norm, robust)
+    return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
+
+
+def assert_same_covariances(found: Iterable[np.ndarray], expected: Iterable[np.ndarray], tolerance: float) -> None:
+    """One by one, each up to a fraction of its largest entry."""
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * np.abs(other).max())
+
+
+# A walk in the plane and fixes of it: a linear-Gaussian model of one's own.
+
+
+class Walk(MotionModel):
+    """A random walk, by default of 1 m per step."""
+
+    space = Euclidean(2)
+
+    def __init__(self, variance=1.0):
+        self.variance = variance
+
+    def transition(self, state, control, dt):
+        return Transition(state, self.variance * np.eye(2)[None])
+
+
+class Position(ObservationModel):
+    """A position fix."""
+
+    dim, reads = 2, frozenset({Part.STATE})
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return state
+
+
+class Receiver(Sensor):
+    """Fixes with a claimed standard deviation."""
+
+    def __init__(self, std):
+        self.std = std
+
+    def observe(self, frame, belief):
+        return [Observations(frame[None], self.std**2 * np.eye(2)[None], Position())]
