@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow check lowest bench coverage dist docs clean
+.PHONY: help setup demo test fast slow lint check lowest bench coverage dist docs clean
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -35,13 +35,17 @@ test: $(STAMP) ## all tests
 slow: $(STAMP) ## the tests that `make check` leaves out
 	$(PYTEST) $(COVER) -m "slow or real_data"
 
-check: $(STAMP) ## format, lint, spelling, types, import rules and the fast tests
+fast: $(STAMP) ## the tests that take less than a second or so each
+	$(PYTEST) $(COVER) -m "not slow and not real_data"
+
+lint: $(STAMP) ## format, lint, spelling, types and import rules
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/typos
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(PYTEST) $(COVER) -m "not slow and not real_data"
+
+check: lint fast ## format, lint, spelling, types, import rules and the fast tests
 
 lowest: ## the fast tests of what is computed, in the lowest versions of what the package needs (minutes)
 	$(PYTHON) -m venv .venv-lowest

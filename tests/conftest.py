@@ -8,6 +8,7 @@ from typing import Any
 # For the processes that xdist starts: two of them, each with as many threads as cores, wait for one another. The small
 # matrices of the tests gain nothing from threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

@@ -9,7 +9,7 @@ import inspect
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
-from functools import wraps
+from functools import cache, wraps
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import FunctionType, ModuleType, SimpleNamespace, UnionType
@@ -24,7 +24,7 @@ COMPILED = "rbpf.kernels"
 """Numba reads these functions itself."""
 
 
-CALLS = 8
+CALLS = 3
 """Of a function that are checked in each test: a filter of thousands of steps would take several times as long else."""
 
 switch = SimpleNamespace(on=True, test=0)
@@ -94,6 +94,7 @@ def _holds_what_it_says(value: Any, kind: type) -> bool:
         return all(fits(getattr(value, name), hint) for name, hint in _fields(kind).items())
 
 
+@cache
 def _fields(kind: type) -> dict[str, Any]:
     """Annotations of a dataclass or a named tuple that have a shape."""
     if not (is_dataclass(kind) or issubclass(kind, tuple)):
