@@ -151,8 +151,8 @@ def blueprint(run: Run) -> Any:
     import rerun.blueprint as rrb
 
     curves = {"plots/filter/ess": "effective sample size", "plots/filter/nis_per_dof": "NIS per degree of freedom"}
-    if isinstance(run.system, LaserSlam):
-        del curves["plots/filter/nis_per_dof"]  # a scan is no Gaussian innovation
+    if len(run.log) > 1 and not (run.log["nis_dof"] > 0.0).any():
+        del curves["plots/filter/nis_per_dof"]  # what is measured is no Gaussian innovation
     images = [rrb.Spatial2DView(origin="world/camera/image", name="image")] if run.system.name in DRAWN else []
     curves |= {"plots/tracking": "tracking"} if images else {}
     beside = [*images, *(rrb.TimeSeriesView(origin=origin, name=name) for origin, name in curves.items())]
@@ -282,7 +282,7 @@ def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], 
 def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
     """Features of the left image by what they were to the map, and where the pair itself has its landmarks."""
     for kind, (name, colour) in FEATURES.items():
-        pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour])
+        pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour], radii=rr.Radius.ui_points(3.0))
         stream.log(f"world/camera/image/{name}", pixels)
     rig = run.system.rig
     places = SE3.transform(pose, rig.triangulate(seen["z"][seen["kind"] == FeatureKind.LANDMARK]))
