@@ -16,7 +16,7 @@ from rbpf import __version__
 from rbpf.cli import cameras, installed, judging
 from rbpf.cli.commands import Commands
 from rbpf.cli.options import Printed
-from rbpf.cli.running import RUN, RunMono, repeated
+from rbpf.cli.running import RUN, ImageResultOptions, RunMono, WorldOptions, repeated
 from rbpf.cli.showing import say
 from rbpf.cli.simulating import SIMULATE, SimulateDesk
 from rbpf.errors import InputError
@@ -50,7 +50,8 @@ class Demo(Printed):
         known = images / "known_points.csv"
         if not known.is_file():
             SimulateDesk(out=images, frames=self.frames)()
-        RunMono(sequence=images, known_points=known, out=self.out / "run", overwrite=True, json=self.json)()
+        made = ImageResultOptions(out=self.out / "run", overwrite=True)
+        RunMono(sequence=images, world=WorldOptions(known_points=known), result=made, json=self.json)()
 
 
 APP.kinds["simulate"] = SIMULATE

@@ -1,9 +1,9 @@
 """A group of commands that knows their names and options: what the parser says of others is long, or beside the point."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import is_dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any, TypeVar, Union, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -47,18 +47,15 @@ class Commands:
         if isinstance(kind, Commands):
             kind.call(arguments, before)
             return
-        options, hints = ["--help"], get_type_hints(kind, include_extras=True)
-        for field in fields(kind):
-            hint, option = hints[field.name], field.name.replace("_", "-")
-            if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
-                options += [f"--{option}", f"--no-{option}"] if hint is bool else [f"--{option}"]
+        options = ["--help", *_options(kind)]
         for word in arguments:
             option = word.partition("=")[0].replace("_", "-")
             if len(option) > 2 and option.startswith("--") and option not in options:
                 raise InputError(f"`{before}` has no option {option}: {_nearest(option, options)}")
         command = tyro.cli(kind, prog=before, args=arguments)
         try:
-            check_ranges(command)
+            for options_of in (command, *filter(is_dataclass, vars(command).values())):
+                check_ranges(options_of)
         except SettingError as error:
             raise InputError(f"--{error.name.replace('_', '-')} {error.words}") from error
         if self._first is not None:
@@ -70,11 +67,22 @@ class Commands:
         parts = []
         for name, kind in self.kinds.items():
             if isinstance(kind, Commands):
-                group = tyro.conf.subcommand(name, description=kind._help, constructor_factory=kind._parsed)
+                first = kind._help.partition("\n")[0]
+                group = tyro.conf.subcommand(name, description=first, constructor_factory=kind._parsed)
                 parts.append(Annotated[Any, group])
             else:
                 parts.append(Annotated[Any, tyro.conf.subcommand(name, constructor=kind)])
         return Annotated[Union[tuple(parts)], tyro.conf.arg(help="")]  # noqa: UP007
+
+
+def _options(kind: Any) -> Iterator[str]:
+    """The options of a dataclass, and of its groups, as they are given."""
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if is_dataclass(bare := get_args(hint)[0] if get_origin(hint) is Annotated else hint):
+            yield from _options(bare)
+        elif tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
+            option = name.replace("_", "-")
+            yield from (f"--{option}", f"--no-{option}") if hint is bool else (f"--{option}",)
 
 
 def _nearest(name: str, names: Iterable[str]) -> str:

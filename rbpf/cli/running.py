@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
 
 import tyro
+from tyro.conf import OmitArgPrefixes as Group  # in the help; its options have no prefix
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
@@ -41,40 +42,48 @@ It is refused when the recording has changed. Further options are those of the r
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(Printed):
-    """Of every `rbpf run`."""
+class ResultOptions:
+    """Where the results go, and what is made of them."""
 
     #: folder for the results; by default run, or run-2, run-3, … where there are runs already; the last of them to
     #: resume or to overwrite.
     out: Where = None
-    particles: WholeCount = None  #: number of particles.
+    resume: Flag = False  #: go on from the checkpoint in the results' folder, if there is one.
+    overwrite: Flag = False  #: write over the run that lies in the results' folder.
+    view: Flag = False  #: show the run in the Rerun viewer while it is made.
+    rerun: Where = None  #: also write a recording (.rrd) for the Rerun viewer, with its layout; by default none.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageResultOptions(ResultOptions):
+    """Where the results go, and what is made of them."""
+
+    batch: bool = True  #: also adjust the same measurements in batch with GTSAM.
+    #: iterations after which the batch adjustment is given up, the run's results stay; by default so many that thirty
+    #: million sightings are linearised.
+    batch_limit: WholeCount = None
+    video: bool = True  #: write the annotated video.
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """What the filter is, and computes with."""
+
     #: of the random generators; by default 0, or as in --config.
     seed: Annotated[Whole, Range(ge=0, le=2**63 - 1)] = None
     config: Where = None  #: YAML file of settings, such as a former run's config.yaml; by default the system's own.
     #: a setting as key=value, such as resampling.scheme=residual; may be given several times.
     set: tyro.conf.UseAppendAction[tuple] = ()
-    resume: Flag = False  #: go on from the checkpoint in the results' folder, if there is one.
-    overwrite: Flag = False  #: write over the run that lies in the results' folder.
     threads: Annotated[Whole, Range(ge=1, le=4096)] = None  #: threads of the kernels; by default all.
-    view: Flag = False  #: show the run in the Rerun viewer while it is made.
-
-    def settings(self, kind: "type[Config]", system: str, *own: str) -> "Config":
-        """The system's settings by --config, --set and options that are settings, of which the system has some of its own."""
-        from rbpf.systems.settings import load_settings
-
-        named = {name: getattr(self, name) for name in ("particles", "seed", *own)}
-        given = {name: value for name, value in named.items() if value is not None}
-        return load_settings(kind, system, self.config, self.set, given)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartOptions(RunOptions):
-    """Of every run over a recording, of which a part may be used."""
+class RecordingOptions:
+    """What of the recording is used."""
 
     start: NotNegative = 0.0  #: use the frames from so many seconds after the first on; of a log without times, steps.
     end: RealPositive = None  #: use the frames until so many seconds after the first; by default all.
     every: Count = 1  #: of these use each so many-th.
-    rerun: Where = None  #: also write a recording (.rrd) for the Rerun viewer, with its layout; by default none.
 
     def part(self, resize: int | None = None) -> "Part":
         """What is used of the recording."""
@@ -84,8 +93,8 @@ class PartOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageRunOptions(PartOptions):
-    """Of every run over images."""
+class ImageOptions(RecordingOptions):
+    """What of the recording is used, and which camera took it."""
 
     #: camera.yaml in place of the sequence's own, of the images before they are resized; by default that one is read.
     calibration: Where = None
@@ -94,21 +103,64 @@ class ImageRunOptions(PartOptions):
     #: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
     image_topic: Text = None
     truth_topic: Text = None  #: of a ROS bag, the topic of the camera's true poses; by default none.
-    batch: bool = True  #: also adjust the same measurements in batch with GTSAM.
-    #: iterations after which the batch adjustment is given up, the run's results stay; by default so many that thirty
-    #: million sightings are linearised.
-    batch_limit: WholeCount = None
-    video: bool = True  #: write the annotated video.
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions:
+    """What is known of the world beforehand: points, a board, or a map of an earlier run."""
+
+    #: table of points of known position that are seen in the first image; by default none: the world is the first
+    #: camera's and its scale is arbitrary.
+    known_points: Where = None
+    #: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6; the
+    #: world is then the board's; by default none.
+    board: Text = None
+    square: RealPositive = None  #: side of its squares, m; by default none.
+    #: in place of known points, a board of so many ArUco markers, as 5x7, of which some are seen in the first image;
+    #: the world is then the board's; by default none.
+    aruco: Text = None
+    marker: RealPositive = None  #: side of a marker, its black border included, m; by default none.
+    gap: NotNegative = 0.01  #: between two markers, m.
+    dictionary: str = "4x4_50"  #: of the markers' patterns, as 4x4_50 or 6x6_250.
+    #: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
+    map: Where = None
+    localize: Flag = False  #: the map is known: the start is found by recognition, and the map is not changed.
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(Printed):
+    """Of every `rbpf run`, in the groups of its help."""
+
+    particles: WholeCount = None  #: number of particles.
+    result: Group[ResultOptions] = ResultOptions()
+    filter: Group[FilterOptions] = FilterOptions()
+    recording: Group[RecordingOptions] = RecordingOptions()
+
+    def settings(self, kind: "type[Config]", system: str, **own: Any) -> "Config":
+        """The system's settings by --config, --set and options that are settings, of which the system has some of its own."""
+        from rbpf.systems.settings import load_settings
+
+        named = {"particles": self.particles, "seed": self.filter.seed, **own}
+        given = {name: value for name, value in named.items() if value is not None}
+        return load_settings(kind, system, self.filter.config, self.filter.set, given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRunOptions(RunOptions):
+    """Of every run over images."""
+
+    result: Group[ImageResultOptions] = ImageResultOptions()
+    recording: Group[ImageOptions] = ImageOptions()
 
     def over_images(self, recording: "Recording", config: Any, video: bool) -> None:
         """Filters images, with what can be left out as it is asked for."""
-        more: dict[str, Any] = {"batch": self.batch, "most_iterations": self.batch_limit}
+        more: dict[str, Any] = {"batch": self.result.batch, "most_iterations": self.result.batch_limit}
         _run(self, recording, config, video=video, **more)
 
 
 @RUN.add("range-bearing")
 @dataclass(frozen=True, kw_only=True)
-class RunRangeBearing(PartOptions):
+class RunRangeBearing(RunOptions):
     """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
 
     #: recording: a folder of an MRCLAM or MRPT log, or a Victoria Park graph.
@@ -129,13 +181,13 @@ class RunRangeBearing(PartOptions):
             if self.batch:
                 say("solving the batch problem with the same measurements …")
 
-        config = self.settings(RangeBearingConfig, "range-bearing", "association")
-        _run(self, RobotRecording(self.log, self.part()), config, tell, batch=self.batch)
+        config = self.settings(RangeBearingConfig, "range-bearing", association=self.association)
+        _run(self, RobotRecording(self.log, self.recording.part()), config, tell, batch=self.batch)
 
 
 @RUN.add("laser")
 @dataclass(frozen=True, kw_only=True)
-class RunLaser(PartOptions):
+class RunLaser(RunOptions):
     """Grid SLAM over a laser scanner's log (Grisetti et al. 2007: scan matching in each particle's own map)."""
 
     #: recording: a CARMEN log (FLASER, ROBOTLASER, RAWLASER with ODOM), plain or packed by gzip, or a ROS bag with
@@ -151,7 +203,7 @@ class RunLaser(PartOptions):
         from rbpf.sensors.readers import LaserOptions
         from rbpf.systems.laser.config import LaserConfig
 
-        told = LaserOptions(self.scanner, self.upside_down, self.max_range, self.part())
+        told = LaserOptions(self.scanner, self.upside_down, self.max_range, self.recording.part())
         _run(self, LaserRecording(self.log, told), self.settings(LaserConfig, "laser"))
 
 
@@ -164,22 +216,7 @@ class RunMono(ImageRunOptions):
     #: camera.yaml beside it, a ROS bag, or the number of a camera at this computer, as 0.
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
     particles: WholeCount = None  #: number of particles; by default 50, or as in --config.
-    #: table of points of known position that are seen in the first image; by default none: the world is the first
-    #: camera's and its scale is arbitrary.
-    known_points: Where = None
-    #: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6; the
-    #: world is then the board's; by default none.
-    board: Text = None
-    square: RealPositive = None  #: side of its squares, m; by default none.
-    #: in place of known points, a board of so many ArUco markers, as 5x7, of which some are seen in the first image;
-    #: the world is then the board's; by default none.
-    aruco: Text = None
-    marker: RealPositive = None  #: side of a marker, its black border included, m; by default none.
-    gap: NotNegative = 0.01  #: between two markers, m.
-    dictionary: str = "4x4_50"  #: of the markers' patterns, as 4x4_50 or 6x6_250.
-    #: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
-    map: Where = None
-    localize: Flag = False  #: the map is known: the start is found by recognition, and the map is not changed.
+    world: Group[WorldOptions] = WorldOptions()
 
     def __call__(self) -> None:
         from rbpf.runs.recordings import MonoRecording
@@ -187,21 +224,22 @@ class RunMono(ImageRunOptions):
         from rbpf.sensors.readers.images.sequence import Topics
         from rbpf.systems.mono.config import MonoConfig
 
+        images, world = self.recording, self.world
         config = self.settings(MonoConfig, "mono")
-        board = given_board(self.board, self.square)
-        if self.localize != (self.map is not None):
+        board = given_board(world.board, world.square)
+        if world.localize != (world.map is not None):
             raise InputError("a camera is found in a known map with both: --map RUN --localize")
-        if (self.aruco is None) != (self.marker is None):
+        if (world.aruco is None) != (world.marker is None):
             raise InputError("a board of markers needs number and side of them: --aruco 5x7 --marker 0.04 --gap 0.01")
         markers = None
-        if self.aruco is not None and self.marker is not None:
-            markers = MarkerBoard.parse(self.aruco, self.marker, self.gap, self.dictionary)
-        topics = Topics.parse(self.image_topic, self.truth_topic)
-        given_files = self.sequence, self.known_points, self.calibration
-        recording = MonoRecording(*given_files, board, self.map, markers, topics, self.part(self.resize))
-        video = self.video
+        if world.aruco is not None and world.marker is not None:
+            markers = MarkerBoard.parse(world.aruco, world.marker, world.gap, world.dictionary)
+        topics = Topics.parse(images.image_topic, images.truth_topic)
+        given_files = self.sequence, world.known_points, images.calibration
+        recording = MonoRecording(*given_files, board, world.map, markers, topics, images.part(images.resize))
+        video = self.result.video
         if recording.live is not None:
-            if self.resume or self.rerun is not None:
+            if self.result.resume or self.result.rerun is not None:
                 raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
             video = False
             say("Ctrl-C ends the recording; the results are written then")
@@ -225,10 +263,11 @@ class RunStereo(ImageRunOptions):
         from rbpf.sensors.readers.images.sequence import Topics
         from rbpf.systems.stereo.config import StereoConfig
 
-        config = self.settings(StereoConfig, "stereo", "dof")
-        topics = Topics.parse(self.image_topic, self.truth_topic)
-        recording = StereoRecording(self.sequence, self.calibration, topics, self.part(self.resize))
-        self.over_images(recording, config, self.video)
+        images = self.recording
+        config = self.settings(StereoConfig, "stereo", dof=self.dof)
+        topics = Topics.parse(images.image_topic, images.truth_topic)
+        recording = StereoRecording(self.sequence, images.calibration, topics, images.part(images.resize))
+        self.over_images(recording, config, self.result.video)
 
 
 def repeated(arguments: list[str]) -> list[str]:
@@ -270,7 +309,7 @@ def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
 
 
 def _run(
-    options: PartOptions,
+    options: RunOptions,
     recording: "Recording",
     config: Any,
     filtered: "Callable[[Run], None]" = lambda run: None,
@@ -283,31 +322,32 @@ def _run(
     from rbpf.runs.files import holds_run, numbered, own_folder
     from rbpf.runs.recordings import filter_recording
 
-    if options.view or options.rerun is not None:
+    result = options.result
+    if result.view or result.rerun is not None:
         from rbpf.validation.report.live import require_rerun, viewer
 
         require_rerun()
     # Threads as asked for, and the folder for the results, which nobody else writes to.
-    if options.resume and options.overwrite:
+    if result.resume and result.overwrite:
         raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
-    kept = options.resume or options.overwrite
-    out = numbered(Path("run"), last=kept) if options.out is None else options.out
-    if options.threads is not None:
+    kept = result.resume or result.overwrite
+    out = numbered(Path("run"), last=kept) if result.out is None else result.out
+    if options.filter.threads is not None:
         import numba
 
-        if not 1 <= options.threads <= numba.config.NUMBA_NUM_THREADS:
-            raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {options.threads}")
-        numba.set_num_threads(options.threads)
+        if not 1 <= options.filter.threads <= numba.config.NUMBA_NUM_THREADS:
+            raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {options.filter.threads}")
+        numba.set_num_threads(options.filter.threads)
     with own_folder(out), progress() as bar:
         if holds_run(out) and not kept:
             raise InputError(
                 f"{out} holds a run already: name another with --out, go on by --resume, or write over it by --overwrite"
             )
-        shown: AbstractContextManager[RunView | None] = viewer(out.name) if options.view else nullcontext()
+        shown: AbstractContextManager[RunView | None] = viewer(out.name) if result.view else nullcontext()
         with patient(bar("filtering")) as report, shown as view:
             listeners: list[Callable[[Run, Tracked], None]] = [_telling(report)]
             listeners += [] if view is None else [view]
-            run = filter_recording(recording, config, out, options.resume, listeners)
+            run = filter_recording(recording, config, out, result.resume, listeners)
             if view is not None:
                 view.finish(run)
         filtered(run)
@@ -316,7 +356,7 @@ def _run(
 
         solving = bar("batch")
         made |= {
-            "rerun": options.rerun,
+            "rerun": result.rerun,
             "on_frame": bar("drawing"),
             "on_iteration": lambda count, _error: solving(count, None),
         }
