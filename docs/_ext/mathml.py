@@ -40,7 +40,7 @@ def visit_block(self: Any, node: nodes.math_block) -> None:
     if not node.get("no-wrap", node.get("nowrap")):
         environment = pick_math_environment(tex)
         tex = f"\\begin{{{environment}}}{tex}\\end{{{environment}}}" if environment != "equation*" else tex
-    self.body.append(mathml(node, tex, block=True) + "</div>")
+    self.body.append(f"<div>{mathml(node, tex, block=True)}</div></div>")
     raise nodes.SkipNode
 
 
