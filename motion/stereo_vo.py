@@ -164,7 +164,7 @@ def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
 
 
 def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Minimum:
-    """By MINPACK's Levenberg-Marquardt (J. Moré 1978), in the right chart at the start."""
+    """By MINPACK's Levenberg-Marquardt (J. Moré 1978), Mathematics (vo-step), in the right chart at the start."""
     from scipy.optimize import leastsq  # takes long to import
 
     @lru_cache(maxsize=1)
