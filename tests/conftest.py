@@ -21,17 +21,18 @@ if os.environ.get("RBPF_SHAPES") != "0":
 DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Long statistics, studies, recordings, pages and damaged files run lines a thousand times that other tests run, too.
+UNCOUNTED = {"docs", "exactness", "examples", "properties", "recordings", "systems"}
 
-    Counting these would take a third of their time; what they alone run counts as not run.
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Long statistics, runs, studies, recordings, pages and damaged files run lines a thousand times that others run, too.
+
+    Counting these would take half as much time again; what they alone run counts as not run.
     """
     if config.pluginmanager.hasplugin("pytest_cov"):
         for item in items:
             folder = item.path.relative_to(Path(__file__).parent).parts[0]
-            if folder in {"docs", "exactness", "examples", "properties", "recordings"} and item.get_closest_marker(
-                "slow"
-            ):
+            if folder in UNCOUNTED and item.get_closest_marker("slow"):
                 item.add_marker("no_cover")
 
 
