@@ -19,6 +19,7 @@ FOLDER = Path(__file__).parent
 BASELINE = FOLDER / "baseline.json"
 NAMES = (
     "start_up",
+    "stereo_memory",  # before others: the peak of a process begins at what its parent holds
     "small_update",
     "many_particles",
     "map_size",
@@ -34,7 +35,6 @@ NAMES = (
     "motion_estimate",
     "stereo_step",
     "stereo_frames",
-    "stereo_memory",
     "bootstrap_peers",
     "mrpt_peer",
 )

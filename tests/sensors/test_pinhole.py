@@ -255,12 +255,17 @@ def test_pixels_beyond_the_fold_have_no_direction():
 def test_every_visible_direction_comes_back(k1, k2, k3, tangential, fraction, angle):
     camera = Pinhole(4000, 4000, 500.0, 500.0, 2000.0, 2000.0, (k1, k2, *tangential, k3))
     length = fraction * min(camera.monotonic_radius, 1.5)
-    ray = np.array([length * np.cos(angle), length * np.sin(angle), 1.0])
-    if camera.visible(ray):
-        again = np.append(camera.unproject(camera.project(ray)), 1.0)
-        np.testing.assert_allclose(camera.project(again), camera.project(ray), rtol=0, atol=1e-8)
-        least = np.linalg.svd(camera.jacobian(ray), compute_uv=False)[-1] / camera.fx
-        np.testing.assert_allclose(again, ray, rtol=0, atol=1e-11 / least)
+    seen = np.array([length * np.cos(angle), length * np.sin(angle), 1.0])
+    if camera.visible(seen):
+        assert_it_comes_back(camera, seen)
+
+
+def assert_it_comes_back(camera: Pinhole, seen: np.ndarray) -> None:
+    """A direction (3,) from its pixel, as exactly as the lens allows there."""
+    again = np.append(camera.unproject(camera.project(seen)), 1.0)
+    np.testing.assert_allclose(camera.project(again), camera.project(seen), rtol=0, atol=1e-8)
+    least = np.linalg.svd(camera.jacobian(again)[:, :2], compute_uv=False)[-1] / camera.fx
+    np.testing.assert_allclose(again, seen / seen[2], rtol=0, atol=1e-11 / least)
 
 
 every_fisheye = pytest.mark.parametrize("camera", FISHEYES.values(), ids=FISHEYES.keys())
@@ -329,6 +334,4 @@ def test_every_visible_direction_of_a_fisheye_comes_back(coefficients, fraction,
     camera = Pinhole(8000, 8000, 262.0, 262.0, 4000.0, 4000.0, coefficients, "equidistant")
     seen = ray(fraction * lens.max_angle, around)
     assert camera.visible(seen)
-    again = np.append(camera.unproject(camera.project(seen)), 1.0)
-    least = np.linalg.svd(camera.jacobian(again)[:, :2], compute_uv=False)[-1] / camera.fx
-    np.testing.assert_allclose(again, seen / seen[2], rtol=0, atol=1e-11 / least)
+    assert_it_comes_back(camera, seen)
