@@ -1,7 +1,8 @@
-"""The motion that most matches of two stereo frames agree with: OpenCV's random sample consensus (RANSAC).
+"""The motion that most matches of two stereo frames agree with, from triples of them (RANSAC).
 
-M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). A triple of the earlier
-frame's points, as the later left image sees them, gives motions of any size (P3P).
+M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). The points of a
+triple are aligned, which gives a motion of any size, and this is refined on their pixels: far points are too uncertain
+in space for the alignment alone.
 """
 
 from dataclasses import dataclass
@@ -9,61 +10,95 @@ from typing import Annotated
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_geometry import Matches, intrinsics, points_from_pixels, squared_distances, times_pixels
+from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, points_from_pixels, times_pixels
 from rbpf.ranges import Formerly, Probability, Range, Ranged
 
-LEAST = 4  #: Matches that OpenCV takes: three have up to four motions, the fourth chooses.
-FARTHEST = 1e4  #: Baselines away at most is a point put.
+REFINEMENTS = 2  #: Gauss-Newton steps on the nine pixels of a triple.
+FARTHEST = 1e4  #: Baselines away at most is a point put for the alignment.
 
 
 @dataclass(frozen=True)
 class RansacConfig(Ranged):
     """How many triples of matches are tried."""
 
-    max_triples: Annotated[int, Range(ge=1, le=1000000), Formerly("most")] = 512  #: at most.
+    batch: Annotated[int, Range(ge=1, le=10000)] = 32  #: tried at a time.
+    max_triples: Annotated[int, Range(ge=1, le=1000000), Formerly("most")] = 512  #: of all batches.
     #: with this probability one triple without a false match is among them, given the fraction of matches that agree
     #: with the best motion so far.
     confidence: Annotated[Probability, Formerly("certainty")] = 0.9999
+
+    def needed(self, fraction: float) -> float:
+        """Triples that it takes where this fraction of the matches is right."""
+        spoilt = 1.0 - min(fraction, 1.0 - 1e-9) ** 3
+        return float(np.log1p(-self.confidence) / np.log(spoilt)) if spoilt < 1.0 else np.inf
 
 
 def consensus(
     matches: Matches, start: Array, gate: float, rng: np.random.Generator, config: RansacConfig | None = None
 ) -> Array:
-    """The motion (7,) of the lowest truncated score Σ min(d², gate), from triples that are drawn by a seed from `rng`.
+    """The motion (7,) of the lowest truncated score Σ min(d², gate), from triples that `rng` draws.
 
     `start` is a guess of the motion; it takes part, and so does standing still. The distances d are Mahalanobis',
-    under both frames' covariances.
+    under the sum of both frames' covariances: enough to tell motions apart.
     """
-    motions = [start, SE3.identity(), *_sampled(matches, gate, int(rng.integers(2**31)), config or RansacConfig())]
-    scores = [np.minimum(squared_distances(matches, motion, "propagated"), gate).sum() for motion in motions]
-    return motions[int(np.argmin(scores))]
+    config, search = config or RansacConfig(), _Search(matches, start)
+    best, lowest, fraction = start, np.inf, 0.0
+    motions = np.stack([start, SE3.identity()])
+    for tried in range(0, config.max_triples, config.batch):
+        if tried > config.needed(fraction):
+            break
+        found = search.candidates(triples(len(matches), config.batch, rng))
+        motions = np.concatenate([motions, found]) if tried == 0 else found
+        scores, fractions = search.scores(motions, gate)
+        if scores.min() < lowest:
+            first = scores.argmin()
+            best, lowest, fraction = motions[first], scores[first], float(fractions[first])
+    return best
 
 
-def _sampled(matches: Matches, gate: float, seed: int, config: RansacConfig) -> list[Array]:
-    """OpenCV's motion; none where it finds none."""
-    import cv2
-
-    if len(matches) < LEAST:
-        return []
-    fx, fy, cx, cy, _ = intrinsics(matches.camera)
-    params = cv2.UsacParams()
-    params.randomGeneratorState, params.maxIterations, params.confidence = seed, config.max_triples, config.confidence
-    # One radius for all matches, that of the usual one's noise; who calls refines on all that agree.
-    variances = np.diagonal(matches.cov_prev + matches.cov_now, axis1=1, axis2=2)
-    params.threshold = float(np.sqrt(gate * np.median(variances[:, :2])))
-    params.score, params.loMethod = cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_NULL
-    params.final_polisher = cv2.NONE_POLISHER
-    matrix, left = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), matches.z_now[:, :2].copy()
-    found, _, turn, shift, _ = cv2.solvePnPRansac(_points(matches), left, matrix, None, params=params)
-    if not (found and np.isfinite(turn).all() and np.isfinite(shift).all()):
-        return []
-    turned = SE3.exp(np.append(turn, np.zeros(3)))
-    return [SE3.inverse(np.append(turned[:4], shift))]
+def triples(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Triples (n, 3) of different numbers below `count`, all equally likely."""
+    first, second, third = rng.integers([count, count - 1, count - 2], size=(n, 3)).T
+    second = second + (second >= first)
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    third = third + (third >= low)
+    return np.stack([first, second, third + (third >= high)], axis=1)
 
 
-def _points(matches: Matches) -> Array:
-    """The earlier frame's points (K, 3), those at infinity and beyond put far away."""
-    raised = times_pixels(points_from_pixels(matches.camera), matches.z_prev)
+class _Search:
+    """What stays the same for all motions."""
+
+    def __init__(self, matches: Matches, start: Array) -> None:
+        self.matches, self.start = matches, np.ascontiguousarray(start, dtype=float)
+        self.before, self.now = (_points(matches, z) for z in (matches.z_prev, matches.z_now))
+        # W = L⁻¹ with L Lᵀ = R⁻ + R.
+        chol = gaussian.cholesky(matches.cov_prev + matches.cov_now)
+        self.white = np.ascontiguousarray(gaussian.solve_lower_matrix(chol, np.eye(3)))
+
+    def candidates(self, rows: np.ndarray) -> Array:
+        """Motions (C, 7) of triples (C, 3): aligned, or the start where that is better, and refined (compiled)."""
+        from rbpf.motion.stereo_kernels import propose
+
+        matches, motions = self.matches, np.empty((len(rows), 7))
+        pixels = (matches.z_prev, matches.z_now, self.white, intrinsics(matches.camera))
+        propose(rows, self.before, self.now, *pixels, self.start, REFINEMENTS, motions)
+        return motions
+
+    def scores(self, motions: Array, gate: float) -> tuple[Array, Array]:
+        """Σ min(d², gate) (C,) of motions (C, 7) over all matches, and the fractions (C,) that agree (compiled)."""
+        from rbpf.motion.stereo_kernels import scores
+
+        matches = self.matches
+        score, agreeing = np.empty(len(motions)), np.empty(len(motions))
+        matrices = homography(matches.camera, motions)
+        scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
+        return score, agreeing / len(matches)
+
+
+def _points(matches: Matches, pixels: Array) -> Array:
+    """Points (K, 3) of pixels (K, 3), those at infinity and beyond put far away."""
+    raised = times_pixels(points_from_pixels(matches.camera), pixels)
     least = 1.0 / (FARTHEST * matches.camera.baseline_m)
     return raised[:, :3] / np.maximum(raised[:, 3:], least)

@@ -1,9 +1,19 @@
-"""Compiled: the innovations of matches, one match at a time."""
+"""Compiled: the innovations of matches, and the score and the proposals of the consensus search; one match at a time.
+
+In the proposals of triples vectors are tuples, and a pose is a quaternion (x, y, z, w) and a translation.
+"""
+
+import math
 
 import numpy as np
 from numba import njit
 
 from rbpf.kernels.dense import factor, solve, solve_lower
+from rbpf.kernels.se3 import cross, exp_pair, multiply, turned, unit
+
+#: Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open.
+STIFFNESS = 1e-9
+FLAT = 1e-12  #: Shortest length that is divided by: points that coincide have no direction.
 
 
 @njit(cache=True, error_model="numpy")
@@ -46,6 +56,33 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
             rows[k] = 0.0
 
 
+@njit(cache=True, error_model="numpy")
+def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
+    """Fills score (C,) with Σ min(d², gate) over the matches and agreeing (C,) with how many have d² ≤ gate.
+
+    Of matrices H (C, 4, 4), pixels z (K, 3) and `white` W (K, 3, 3), with d² = ‖W (z − g)‖².
+    """
+    miss = np.empty(3)
+    for c in range(matrices.shape[0]):
+        matrix, total, count = matrices[c], 0.0, 0
+        for k in range(z_prev.shape[0]):
+            squared = np.inf
+            depth = _raised(matrix, 3, z_prev[k])
+            if depth > 0.0:
+                for i in range(3):
+                    miss[i] = z_now[k, i] - _raised(matrix, i, z_prev[k]) / depth
+                squared = 0.0
+                for i in range(3):
+                    part = _whitened(white[k], miss, i)
+                    squared += part * part
+            if squared <= gate:
+                count += 1
+                total += squared
+            else:
+                total += gate
+        score[c], agreeing[c] = total, count
+
+
 @njit(cache=True, error_model="numpy", inline="always")
 def _raised(matrix, i, pixels):
     return matrix[i, 0] * pixels[0] + matrix[i, 1] * pixels[1] + matrix[i, 2] * pixels[2] + matrix[i, 3]
@@ -81,6 +118,149 @@ def _innovate(k, pixels, seen, slope, z_prev, z_now, cov_prev, cov_now, noisy, r
                     entry += slope[i, m] * gain[m, j]
             chol[i, j] = entry
     factor(chol)
+
+
+@njit(cache=True, error_model="numpy")
+def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motions):
+    """Fills motions (C, 7) with what triples of matches, `rows` (C, 3), propose.
+
+    A triple's points, of those `before` and `now` (K, 3), are aligned; the better of this and `start` (7,) on the triple's
+    pixels z (K, 3) is refined by some `steps` of Gauss-Newton. `white` and `camera` as above.
+    """
+    row, vector, info = np.empty((3, 6)), np.empty(6), np.empty((6, 6))
+    guess = ((start[0], start[1], start[2], start[3]), (start[4], start[5], start[6]))
+    for c in range(rows.shape[0]):
+        triple = rows[c]
+        quat, shift = _align(before, now, triple)
+        aligned = _squared_distance(quat, shift, triple, z_prev, z_now, white, camera)
+        if _squared_distance(guess[0], guess[1], triple, z_prev, z_now, white, camera) < aligned:
+            quat, shift = guess
+        for _ in range(steps):
+            _normal_equations(quat, shift, triple, z_prev, z_now, white, camera, row, vector, info)
+            factor(info)
+            solve(info, vector)
+            turn, way = exp_pair((vector[0], vector[1], vector[2]), (vector[3], vector[4], vector[5]))
+            way = turned(quat, way)
+            quat, shift = multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2])
+        motions[c, 0], motions[c, 1], motions[c, 2], motions[c, 3] = quat
+        motions[c, 4], motions[c, 5], motions[c, 6] = shift
+
+
+@njit(cache=True, error_model="numpy")
+def _difference(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _unit(v):
+    length = max(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), FLAT)
+    return v[0] / length, v[1] / length, v[2] / length
+
+
+@njit(cache=True, error_model="numpy")
+def _frame(points, triple):
+    """A triangle's first edge, the direction across it in its plane, and the plane's normal; and its centre."""
+    a, b, c = points[triple[0]], points[triple[1]], points[triple[2]]
+    edge = _unit(_difference(b, a))
+    normal = _unit(cross(edge, _difference(c, a)))
+    centre = ((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, (a[2] + b[2] + c[2]) / 3.0)
+    return edge, cross(normal, edge), normal, centre
+
+
+@njit(cache=True, error_model="numpy")
+def _align(before, now, triple):
+    """T with T now = before: the triangles' planes, centres and first edges are laid on one another."""
+    a0, a1, a2, centre = _frame(before, triple)
+    b0, b1, b2, middle = _frame(now, triple)
+    turn = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = a0[i] * b0[j] + a1[i] * b1[j] + a2[i] * b2[j]
+    quat = _quat(turn)
+    return quat, _difference(centre, turned(quat, middle))
+
+
+@njit(cache=True, error_model="numpy")
+def _quat(r):
+    """Of a rotation matrix: the row of 4 q qᵀ with the largest diagonal loses no digits."""
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    most = max(trace, r[0, 0], r[1, 1], r[2, 2])
+    if most == trace:
+        q = (x, y, z, 1.0 + trace)
+    elif most == r[0, 0]:
+        q = (1.0 + 2.0 * r[0, 0] - trace, xy, xz, x)
+    elif most == r[1, 1]:
+        q = (xy, 1.0 + 2.0 * r[1, 1] - trace, yz, y)
+    else:
+        q = (xz, yz, 1.0 + 2.0 * r[2, 2] - trace, z)
+    return unit(q[0], q[1], q[2], q[3])
+
+
+@njit(cache=True, error_model="numpy")
+def _transformed(quat, shift, pixels, camera):
+    """A point (x, y, 1, ρ) ~ Q⁻¹ (m, 1) after the motion: its place relative to that depth, and ρ."""
+    nearness = (pixels[0] - pixels[2]) / camera[4]
+    x, y = (pixels[0] - camera[2]) / camera[0], (pixels[1] - camera[3]) / camera[1]
+    apart = (x - nearness * shift[0], y - nearness * shift[1], 1.0 - nearness * shift[2])
+    return turned((-quat[0], -quat[1], -quat[2], quat[3]), apart), nearness
+
+
+@njit(cache=True, error_model="numpy")
+def _projected(point, nearness, camera):
+    """Pixels g of a point in front of the camera."""
+    left = camera[0] * point[0] / point[2] + camera[2]
+    down = camera[1] * point[1] / point[2] + camera[3]
+    return left, down, left - camera[4] * nearness / point[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _whitened(white, v, i):
+    return white[i, 0] * v[0] + white[i, 1] * v[1] + white[i, 2] * v[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _squared_distance(quat, shift, triple, z_prev, z_now, white, camera):
+    """Squared distance of a triple from a motion; infinite behind the camera."""
+    total = 0.0
+    for k in triple:
+        point, nearness = _transformed(quat, shift, z_prev[k], camera)
+        if not point[2] > 0.0:
+            return np.inf
+        miss = _difference(z_now[k], _projected(point, nearness, camera))
+        for i in range(3):
+            part = _whitened(white[k], miss, i)
+            total += part * part
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _normal_equations(quat, shift, triple, z_prev, z_now, white, camera, row, vector, info):
+    """Fills info (6, 6), its lower triangle, with JᵀJ and vector (6,) with Jᵀε of a triple's whitened pixels.
+
+    A point behind the camera counts as one at infinity that is seen at the pixels (0, 0, 0).
+    """
+    info[:], vector[:] = 0.0, 0.0
+    for k in triple:
+        point, nearness = _transformed(quat, shift, z_prev[k], camera)
+        if point[2] > 0.0:
+            seen = _projected(point, nearness, camera)
+        else:
+            seen, nearness = (0.0, 0.0, 0.0), 0.0
+            point = (-camera[2] / camera[0], -camera[3] / camera[1], 1.0)
+        miss = _difference(z_now[k], seen)
+        _pixel_jacobian(point, nearness, seen, camera, row)
+        for i in range(3):
+            error = _whitened(white[k], miss, i)
+            for e in range(6):
+                slope = _whitened(white[k], (row[0, e], row[1, e], row[2, e]), i)
+                vector[e] += slope * error
+                for f in range(e + 1):
+                    info[e, f] += slope * _whitened(white[k], (row[0, f], row[1, f], row[2, f]), i)
+    trace = info[0, 0] + info[1, 1] + info[2, 2] + info[3, 3] + info[4, 4] + info[5, 5]
+    for e in range(6):
+        info[e, e] += STIFFNESS * trace + np.finfo(np.float64).tiny
 
 
 @njit(cache=True, error_model="numpy")

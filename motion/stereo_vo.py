@@ -10,7 +10,6 @@ later pair count, and the covariance includes the earlier points' noise.
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Annotated, final
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.motion.least_squares import Minimum, Rule, minimise
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_consensus import RansacConfig, consensus
 from rbpf.motion.stereo_geometry import Matches, Points, linearised, residuals, squared_distances, white_rows
@@ -29,19 +29,6 @@ WIDE = 4.0  #: Times the gate is what agrees with the consensus of three: it is 
 #: No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it.
 LEAST_KEPT = 0.05
 ROUNDING = 1e-14  #: Variances below this fraction of the largest are rounding.
-#: A singular value below this fraction of the largest counts as this fraction: its direction is not determined.
-SINGULAR = 1e-7
-TOO_MANY = 5  #: MINPACK's word for a search that ran out of steps.
-
-
-@final
-@dataclass(frozen=True)
-class Rule(Ranged):
-    """When the optimiser stops."""
-
-    #: what a step would still gain, as a distance in standard deviations of the solution.
-    offset: Positive = 0.01
-    iterations: Annotated[int, Range(ge=1, le=100000)] = 100  #: most of them.
 
 
 @final
@@ -56,7 +43,8 @@ class VoConfig(Ranged):
     min_matches: Annotated[int, Range(ge=3), Formerly("least_matches")] = 8  #: fewer that agree are no motion.
     #: how many triples are tried.
     ransac: Annotated[RansacConfig, Formerly("draws")] = field(default_factory=RansacConfig)
-    rule: Rule = field(default_factory=Rule)  #: when the optimiser stops.
+    #: when the optimiser stops; the default is a hundredth of the motion's standard deviations.
+    rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
 
 
 @final
@@ -140,18 +128,7 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
     return np.zeros_like(later) if config.points == "exact" else -later @ seen.by_pixels, later
 
 
-@final
-@dataclass(frozen=True)
-class Minimum:
-    """Where the optimiser ended."""
-
-    motion: Array  #: (7,)
-    residual: Array  #: (3K,) whitened, there.
-    factor: Array  #: (6, 6) F with F Fᵀ = (JᵀJ)⁻¹; what the residuals leave open has a variance that is finite, and enormous.
-    converged: bool
-
-
-def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
+def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
     """The motion (7,) of least reprojection error near a start, all matches taken as true."""
     if config.points != "propagated":
         return _minimum(matches, start, config.points, config.rule)
@@ -159,49 +136,31 @@ def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
         # S as it is at the last motion takes the place of R, and stays while the motion is sought.
         weighted = replace(matches, cov_now=linearised(matches, start, matches.z_prev, "propagated")[0])
         found = _minimum(weighted, start, "exact", config.rule)
-        start = found.motion
+        start = found.x
     return found
 
 
-def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Minimum:
-    """By MINPACK's Levenberg-Marquardt (J. Moré 1978), Mathematics (vo-step), in the right chart at the start."""
-    from scipy.optimize import leastsq  # takes long to import
-
-    @lru_cache(maxsize=1)
-    def at(xi: bytes) -> tuple[Array, Array]:
-        return residuals(matches, SE3.retract(start, np.frombuffer(xi)), points)
-
-    def slope(xi: Array) -> Array:
-        return np.asarray(at(xi.tobytes())[1] @ SE3.right_jacobian(xi))
-
-    # A step that gains less than this fraction of ‖ε‖², which is about its size, is the last.
-    gain = rule.offset**2 / (3 * len(matches))
-    xi, _, _, _, ended = leastsq(
-        lambda xi: at(xi.tobytes())[0], np.zeros(6), Dfun=slope, full_output=True, ftol=gain, maxfev=rule.iterations
-    )
-    residual, jac = at(xi.tobytes())
-    _, s, vt = np.linalg.svd(np.linalg.qr(jac, mode="r"))
-    factor = vt.T / np.maximum(s, SINGULAR * s[0])
-    return Minimum(SE3.retract(start, xi), residual, factor, ended != TOO_MANY)
+def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Minimum[Array]:
+    return minimise(lambda motion: residuals(matches, motion, points), start, SE3.retract, rule)
 
 
 def _refined(matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig) -> MotionEstimate:
     """The motion of all matches that agree, from one that many agree with."""
-    agreeing = plausible & (_squared(matches, motion, config) <= WIDE * config.gate)
+    agreeing, iterations = plausible & (_squared(matches, motion, config) <= WIDE * config.gate), 0
     for _ in range(ROUNDS):
         if agreeing.sum() < config.min_matches:
             agree = f"{agreeing.sum()} of {len(matches)} matches agree on a motion"
             return _failed(start, matches, f"{agree}, {config.min_matches} are needed")
         inliers, part = agreeing, matches.rows(agreeing)
         found = fit(part, motion, config)
-        motion = found.motion
+        motion, iterations = found.x, iterations + found.iterations
         agreeing = plausible & (_squared(matches, motion, config) <= config.gate)
         if (agreeing == inliers).all():
             break
     if not found.converged:
-        return _failed(start, matches, f"the optimiser did not converge in {config.rule.iterations} iterations")
-    rms = np.sqrt(trimming(config.gate) * np.square(found.residual).sum() / max(len(found.residual) - 6, 1))
-    cov = found.factor @ found.factor.T
+        return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations")
+    rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
+    cov = found.cov
     if config.points == "adjusted":
         cov = _consistent_covariance(part, motion, found.factor)
     if config.points != "exact":

@@ -8,8 +8,9 @@ from scipy.optimize import least_squares
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.motion.least_squares import Rule
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, Rule, VisualOdometry, VoConfig, estimate_motion, fit
+from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit
 from rbpf.sensors.camera import RectifiedStereo
 from tests.motion.stereo_pairs import (
     CAR,
@@ -70,8 +71,9 @@ def test_the_default_is_scipys_bundle_adjustment(world):
     np.testing.assert_allclose(theirs.x[:6] / std, 0.0, atol=1e-3)
     np.testing.assert_allclose(ours.rms**2 * (3 * len(matches) - 6), 2.0 * theirs.cost, rtol=1e-7)
     # Before the correction for noisy depths the covariance is that of the adjustment.
-    factor = fit(matches, delta, config).factor
-    np.testing.assert_allclose(factor @ factor.T / np.outer(std, std), marginal / np.outer(std, std), atol=2e-3)
+    np.testing.assert_allclose(
+        fit(matches, delta, config).cov / np.outer(std, std), marginal / np.outer(std, std), atol=2e-3
+    )
 
 
 @pytest.mark.parametrize("points", ["propagated", "exact"])
@@ -79,7 +81,7 @@ def test_the_other_kinds_are_scipys_least_squares(points):
     """With S held where the motion was found."""
     matches, delta = correlated(LEAP, 20, np.random.default_rng(2))
     ours = fit(matches, delta, VoConfig(points, rule=STRICT))
-    camera, best = matches.camera, ours.motion
+    camera, best = matches.camera, ours.x
     before = camera.triangulate(matches.z_prev)
     by_z = np.linalg.inv(camera.jacobian(before))
     by_prev = camera.jacobian(SE3.inverse_transform(best, before)) @ SE3.rotation(best).T @ by_z
@@ -93,7 +95,7 @@ def test_the_other_kinds_are_scipys_least_squares(points):
     theirs = least_squares(misses, np.zeros(6), x_scale="jac", xtol=1e-15, ftol=1e-15)
     cov = np.linalg.inv(theirs.jac.T @ theirs.jac)
     np.testing.assert_allclose(theirs.x / np.sqrt(np.diagonal(cov)), 0.0, atol=1e-3)
-    np.testing.assert_allclose(ours.factor @ ours.factor.T, cov, rtol=2e-3, atol=2e-3 * np.abs(cov).min())
+    np.testing.assert_allclose(ours.cov, cov, rtol=2e-3, atol=2e-3 * np.abs(cov).min())
 
 
 @pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
@@ -139,21 +141,6 @@ class TestTooLittle:
         assert not found.found
         assert "of 60 matches agree on a motion, 8 are needed" in found.failure
 
-    def test_too_few_iterations(self):
-        matches = simulate(LEAP, 60, np.random.default_rng(2)).matches
-        self.refused(
-            matches, "the optimiser did not converge in 1 iterations", config=VoConfig(rule=Rule(iterations=1))
-        )
-
-
-def test_a_step_that_would_put_a_point_behind_the_camera_is_taken_back():
-    """From so far off the first full step goes past the nearest points."""
-    world = World(HAND, 0.3, 1.0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.28))
-    before, now, delta = noiseless(world, 40, np.random.default_rng(6))
-    found = fit(Matches.checked(HAND, before, now, COV, COV), SE3.identity(), VoConfig(rule=STRICT))
-    assert found.converged
-    np.testing.assert_allclose(SE3.local(delta, found.motion), 0.0, atol=1e-6)
-
 
 class TestDegenerate:
     def test_far_points_leave_the_translation_open(self):
@@ -167,22 +154,19 @@ class TestDegenerate:
         assert std[:3].max() < 1e-3 and (off[:3] < 4.0 * std[:3]).all()
         assert std[3:].min() > 0.3 and (off[3:] < 4.0 * std[3:]).all()
 
-    def seen_along(self, way):
+    @pytest.mark.parametrize("place", ["one place", "a line"])
+    def test_points_in_one_place_or_on_a_line(self, place):
+        rng = np.random.default_rng(1)
+        way = 0.0 if place == "one place" else rng.uniform(-1.0, 1.0, (30, 1))
         points = np.array([0.3, 0.1, 3.0]) + way * np.array([0.5, 0.3, 1.0]) * np.ones((30, 1))
         delta = SE3.exp(np.array(ROOM.xi))
         before, now = HAND.project(points), HAND.project(SE3.inverse_transform(delta, points))
-        return estimated(Matches.checked(HAND, before, now, COV, COV)), delta
-
-    def test_points_on_a_line(self):
-        """A turn about the line is open."""
-        found, delta = self.seen_along(np.random.default_rng(1).uniform(-1.0, 1.0, (30, 1)))
+        found = estimate_motion(Matches.checked(HAND, before, now, COV, COV), rng)
         assert found.found and found.inliers.all()
+        # A turn about the line, or about any axis through the place, is open.
         axis = np.array([0.5, 0.3, 1.0]) / np.linalg.norm([0.5, 0.3, 1.0])
         turn = SE3.adjoint(SE3.inverse(delta)) @ np.concatenate([axis, np.cross([0.3, 0.1, 3.0], axis)])
         assert turn @ found.cov @ turn > 1e3 * (turn @ turn) ** 2
-
-    def test_points_in_one_place_tell_no_motion(self):
-        assert self.seen_along(0.0)[0].failure == "0 of 30 matches agree on a motion, 8 are needed"
 
     def test_disparities_below_zero_are_used(self):
         """Noise on points far away; to drop them would push the rest nearer."""

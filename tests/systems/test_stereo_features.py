@@ -100,8 +100,7 @@ def test_nees_of_the_pose():
         runs = [filtered(log, config) for log in logs]
         whitened = [whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]) for run in runs]
         nees.append(np.mean([one.nees.mean() for one in whitened]) / 6)
-    # 1.25 ± 0.04 over 16 seeds of the filter; these recordings leave a standard error of 0.09.
-    assert 0.75 < nees[0] < 1.45
+    assert 0.75 < nees[0] < 1.25  # 1.03 with a standard error of 0.09
     assert nees[1] > 1.2 * nees[0]
     assert 0.75 < nees[2] < 1.25
 
