@@ -24,7 +24,7 @@ COMPILED = "rbpf.kernels"
 """Numba reads these functions itself."""
 
 
-CALLS = 3
+CALLS = 8
 """Of a function that are checked in each test: a filter of thousands of steps would take several times as long else."""
 
 switch = SimpleNamespace(on=True, test=0)

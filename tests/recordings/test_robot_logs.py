@@ -63,7 +63,7 @@ def test_robot_with_motion_capture(data_dir):
     known = mean_scores(data_dir / "mrclam6_robot1", 2, "map=particles")
     assert known[1] <= 0.37
     assert known[3] <= 0.09
-    unknown = mean_scores(data_dir / "mrclam6_robot1", 1, "association=ml")
+    unknown = mean_scores(data_dir / "mrclam6_robot1", 2, "association=ml")
     assert unknown[1] <= 0.25
 
 
