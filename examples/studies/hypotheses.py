@@ -15,7 +15,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from examples.studies.consistency_runs import Mean
-from examples.studies.joint_map import JOINT, PARTICLES, RECORDINGS, loops
+from examples.studies.joint_map import JOINT, RECORDINGS, loops
 from rbpf.lie import SE2
 from rbpf.runs.files import write_table
 from rbpf.runs.reading import PathAndMap
@@ -90,9 +90,9 @@ def come_back(seed: int, hypotheses: int = 4) -> Return:
 def wrong_share(run: Run, log: RobotLog) -> float:
     """Fraction of the readings that were taken for another landmark, for a new one that was known, or for clutter."""
     system = run.system
-    assert isinstance(system, RangeBearingSlam)
+    assert isinstance(system, RangeBearingSlam) and system.hypotheses is not None
     name_of, known, wrong, count = dict[int, int](), set[int](), 0, 0
-    for frame, chosen in zip(log.frames, system.associations(), strict=True):
+    for frame, chosen in zip(log.frames, system.hypotheses.held[0].chosen, strict=True):
         for name, landmark in zip(frame.landmarks.tolist(), chosen.tolist(), strict=True):
             count += 1
             if landmark >= 0 and landmark not in name_of:
@@ -109,7 +109,6 @@ FILTERS = {
     "named, joint": JOINT,
     "joint": UNKNOWN,
     "joint, one hypothesis": replace(UNKNOWN, unknown=AssociationConfig(hypotheses=1)),
-    "particles": replace(PARTICLES, association="ml"),
 }
 
 

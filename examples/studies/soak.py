@@ -114,7 +114,8 @@ def camera_steps(stream: CameraStream, config: MonoConfig, forget: int = 600) ->
 
 def robot_steps(stream: RobotStream, config: RangeBearingConfig, forget: int = 600) -> tuple[Filter, Step]:
     """The range-bearing system's filter over a stream, and what makes its steps."""
-    slam = RangeBearingSlam.of_log(stream.first(), config, wrapped=lambda sensor: Forgetting(sensor, forget))
+    slam = RangeBearingSlam.of_log(stream.first(), config)
+    slam.filter.sensors = [Forgetting(slam.sensor, forget)]
     return slam.filter, lambda frame, _: slam.take(frame).pose[1:]
 
 

@@ -81,7 +81,7 @@ def named_stereo() -> Case:
     return Case(lambda: StereoSlam(log.camera, config), log.frames[:6], log.frames[6:])
 
 
-def robot(association: str, **options: str) -> Case:
+def robot(**options: str) -> Case:
     from tempfile import TemporaryDirectory
 
     from rbpf.sensors.readers import open_log
@@ -90,9 +90,8 @@ def robot(association: str, **options: str) -> Case:
     with TemporaryDirectory() as folder:
         simulate_robot(RobotWorld(steps=24, landmarks=8), Path(folder), seed=0)
         log = open_log(Path(folder))
-    config = RangeBearingConfig(particles=4, association=association, anchor_every=3, **options)
-    make = lambda: RangeBearingSlam.of_log(log, config, keep_associations=association == "ml")  # noqa: E731
-    return Case(make, log.frames[:20], log.frames[20:])
+    config = RangeBearingConfig(particles=4, anchor_every=3, **options)
+    return Case(lambda: RangeBearingSlam.of_log(log, config), log.frames[:20], log.frames[20:])
 
 
 def returning() -> Case:
@@ -111,10 +110,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "named features, nothing known": lambda: named(False),
     "stereo": stereo,
     "named stereo": named_stereo,
-    "robot": lambda: robot("known", map="particles"),
-    "robot, unnamed": lambda: robot("ml", map="particles"),
+    "robot": lambda: robot(map="particles"),
     "robot, hypotheses": returning,
-    "robot, joint map": lambda: robot("known"),
+    "robot, joint map": robot,
 }
 
 

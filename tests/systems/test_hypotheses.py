@@ -45,7 +45,7 @@ def test_where_nothing_is_ambiguous_it_is_the_run_that_knows_the_names(submap):
     named = filter_opened(open_robot_log(log, replace(CONFIG, submap=submap, association="known")))
     assert isinstance(unnamed.system, RangeBearingSlam)
     assert bool(unnamed.system.joint.old.maps) == (submap < 150)
-    pairs = {(a, b) for f, ids in zip(log.frames, unnamed.system.associations(), strict=True)
+    pairs = {(a, b) for f, ids in zip(log.frames, unnamed.system.hypotheses.held[0].chosen, strict=True)
              for a, b in zip(f.landmarks.tolist(), ids.tolist(), strict=True)}  # fmt: skip
     names, ids = ({pair[i] for pair in pairs} for i in (0, 1))
     assert len(pairs) == len(names) == len(ids) > 4
@@ -80,6 +80,12 @@ def test_a_landmark_that_should_be_seen_and_is_not_is_dropped():
         again = replace(seen, stamp_ns=t, delta=log.space.identity(), cov_delta=1e-6 * np.eye(3))
         slam.take(replace(again, z=seen.z[1:], cov_z=seen.cov_z[1:], landmarks=seen.landmarks[1:]))
     assert len(slam.map().ids) == len(slam.filter.belief().map.ids) == len(seen.z) - 1
+
+
+@pytest.mark.parametrize("setting", [{"map": "particles"}, {"map": "auto", "lag": 5}])
+def test_maps_of_the_particles_own_are_refused(setting):
+    with pytest.raises(InputError, match="association=ml needs a joint map: leave out map=particles and lag"):
+        RangeBearingSlam(replace(CONFIG, **setting))
 
 
 def test_measurements_that_are_none_are_refused_before_anything_moves():

@@ -47,7 +47,7 @@ class RangeBearingConfig:
 
     particles: Count = 100  #: number of particles.
     seed: Seed = 0  #: of the only random generator.
-    #: landmarks named by the log, or by maximum likelihood: in each of some hypotheses (joint map), or in each particle.
+    #: landmarks named by the log, or by maximum likelihood, in each of some hypotheses: on a joint map.
     association: Literal["known", "ml"] = "known"
     #: one Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true; or
     #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles). By default

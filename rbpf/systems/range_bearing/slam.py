@@ -5,15 +5,14 @@ for stamp_ns, odometry, names, z, cov_z in log:
 frame = slam.track(z, cov_z, names, odometry, stamp_ns)
 """
 
-from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import elements, integers, read, read_one, split
+from rbpf.core.checkpoint import elements, integers, read_one
 from rbpf.core.diagnostics import motion_correction
-from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import NEW, NULL, Sensor
+from rbpf.core.filter import Filter
+from rbpf.core.models import NULL
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
@@ -22,7 +21,7 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.measurements import Kind, Measurements
@@ -43,9 +42,8 @@ class RangeBearingSlam(System):
         measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
         robot_from_sensor: (E,) mounting pose of the sensor; by default the robot's own frame.
         pitch_sign: +1 where positive pitch points up, −1 where it points down.
-        keep_associations: remember which landmark each particle took every observation for, until the end of the run
-            tells which lineage survives; the memory that this takes grows with the run.
-        wrapped: puts a sensor around the usual one, to change what it observes or starts.
+        keep_associations: remember which landmark every hypothesis took each observation for, until the end of the run
+            tells which one survives; the memory that this takes grows with the run.
         misread: whether a reading may be of another landmark than is said.
     """
 
@@ -60,7 +58,6 @@ class RangeBearingSlam(System):
         robot_from_sensor: np.ndarray | None = None,
         pitch_sign: float = 1.0,
         keep_associations: bool = False,
-        wrapped: Callable[[Sensor], Sensor] | None = None,
         misread: bool = False,
     ) -> None:
         self.config = config = config or RangeBearingConfig()
@@ -76,26 +73,25 @@ class RangeBearingSlam(System):
             self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
         self.kept_map, self.why_map = config.kept_map()
-        joint = None
+        joint, is_unnamed = None, config.association == "ml"
         if self.kept_map == "joint":
-            unnamed = config.association == "ml" and config.submap is not None
+            unnamed = is_unnamed and config.submap is not None
             joint = JointMap(space, compiled=config.compiled, submap=config.submap, unnamed=unnamed)
-        own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
+        elif is_unnamed:
+            raise InputError(
+                "association=ml needs a joint map: leave out map=particles and lag; in a program, a filter with an "
+                "AnonymousLandmarkSensor associates in every particle"
+            )
+        own = LandmarkMap(space, compiled=config.compiled)
         own.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
-        sensor: Sensor
-        if config.association == "known" or joint is not None:
-            sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
-        else:
-            evidence = unknown.gates(self.model.dim), unknown.existence()
-            sensor = AnonymousLandmarkSensor(self.model, self.point, *evidence, likelihood)
-        self.sensor = sensor
+        self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
         self.anchor: StartAnchor | None = None
         if config.anchor_every and joint is None:
             self.anchor = StartAnchor(own, self.model, config.anchor_every, likelihood)
         self.filter = Filter(
             OdometryMotion(space),
-            sensor if wrapped is None else wrapped(sensor),
+            sensor,
             [joint or own, *([] if self.anchor is None else [self.anchor])],
             config.proposal.build(),
             config.resampling.build(),
@@ -105,10 +101,9 @@ class RangeBearingSlam(System):
             consolidation=Consolidation(config.window, config.resampling.ess_threshold) if joint else None,
         )
         self.hypotheses: Hypotheses | None = None
-        if joint is not None and config.association == "ml":
+        if is_unnamed:
             self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
         self._odometry = space.identity()
-        self._associations = _Associations(self.filter) if keep_associations and not self.hypotheses else None
         d, e, p = space.dim, space.size, self.model.dim
         self.columns = (
             *FILTER_COLUMNS,
@@ -127,16 +122,12 @@ class RangeBearingSlam(System):
 
     @classmethod
     def of_log(
-        cls,
-        log: RobotLog,
-        config: RangeBearingConfig | None = None,
-        keep_associations: bool = False,
-        wrapped: Callable[[Sensor], Sensor] | None = None,
+        cls, log: RobotLog, config: RangeBearingConfig | None = None, keep_associations: bool = False
     ) -> "RangeBearingSlam":
         """The system for the robot and the sensor of a log."""
         kind: Kind = "position" if log.measurement == "position" else "range_bearing"
         mount, sign = log.robot_from_sensor, log.pitch_sign
-        return cls(config, log.space, kind, mount, sign, keep_associations, wrapped, log.misread)
+        return cls(config, log.space, kind, mount, sign, keep_associations, log.misread)
 
     def track(
         self,
@@ -160,15 +151,11 @@ class RangeBearingSlam(System):
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
-            if self.config.association == "known":
-                # One that comes a second time in the frame that starts its landmark is not used.
-                again = np.ones(names.size, dtype=bool)
-                again[np.unique(names, return_index=True)[1]] = False
-                held = [np.ravel(group.ids) for group in report.groups if group.ids is not None]
-                used = np.where(again & ~np.isin(names, np.concatenate([names[:0], *held])), NULL, names)
-            else:  # the best particle's
-                ids = _ids_with_new(report, len(names))
-                used = ids[self.filter.belief().mode if len(ids) > 1 else 0]
+            # One that comes a second time in the frame that starts its landmark is not used.
+            again = np.ones(names.size, dtype=bool)
+            again[np.unique(names, return_index=True)[1]] = False
+            held = [np.ravel(group.ids) for group in report.groups if group.ids is not None]
+            used = np.where(again & ~np.isin(names, np.concatenate([names[:0], *held])), NULL, names)
         else:
             used, report = self.hypotheses.step(z, cov_z, odometry, stamp_ns)
             self.filter = self.hypotheses.held[0].filter
@@ -181,8 +168,6 @@ class RangeBearingSlam(System):
             particles, anchored = self.filter.particles, self.anchor.after_step(report)
             estimate = relative_estimate(self.space, anchored, particles.state, particles.log_weights)
 
-        if self._associations is not None:
-            self._associations.record(report, len(z))
         d, e = self.space.dim, self.space.size
         correction = motion_correction(report.mixture)
         return Tracked(
@@ -253,22 +238,12 @@ class RangeBearingSlam(System):
             "map_share_of_dense": round(self.filter.belief().map.stored_fraction, 4),
         }
 
-    def associations(self) -> list[np.ndarray]:
-        """Landmark of every observation, one array (K,) per step, along the ancestors of the best particle.
-
-        Only with `keep_associations`; before the end of a run the association of the last steps may still change.
-        """
-        if self.hypotheses is not None:
-            return self.hypotheses.held[0].chosen
-        assert self._associations is not None
-        return self._associations.of(self.filter.belief().mode)
-
     def _final(self, log: FrameLog) -> list[np.ndarray]:
-        """The landmark of every observation, one array (K,) per step, as known now."""
+        """The landmark of every observation, one array (K,) per step, as known now: by the heaviest hypothesis, if kept."""
         found = [log.observed(t)["landmarks"] for t in range(len(log))]
-        if self._associations is None and (self.hypotheses is None or not self.hypotheses.keep):
+        if self.hypotheses is None or not self.hypotheses.keep:
             return found
-        known = self.associations()
+        known = self.hypotheses.held[0].chosen
         if [ids.size for ids in known] != [ids.size for ids in found]:
             raise InputError(
                 "the associations are not of as many observations as its frames have: the checkpoint is damaged"
@@ -276,76 +251,14 @@ class RangeBearingSlam(System):
         return known
 
     def arrays(self) -> dict[str, np.ndarray]:
-        kept = {"odometry": self._odometry}
-        if isinstance(self.sensor, NamedLandmarkSensor):
-            kept["observed_once"] = np.array(sorted(self.sensor.observed_once), dtype=np.int64)
-        if self._associations is not None:
-            kept |= self._associations.arrays()
-        if self.hypotheses is not None:
-            kept |= self.hypotheses.arrays()
-        return kept
+        kept = {
+            "odometry": self._odometry,
+            "observed_once": np.array(sorted(self.sensor.observed_once), dtype=np.int64),
+        }
+        return kept if self.hypotheses is None else kept | self.hypotheses.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        if isinstance(self.sensor, NamedLandmarkSensor):
-            self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
+        self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
-        if self._associations is not None:
-            self._associations.restore(arrays)
         if self.hypotheses is not None:
             self.hypotheses.restore(arrays)
-
-
-_ASSOCIATIONS = {"shapes": integers("steps", 3, least=0), "ids": integers("ids", least=NULL)}
-
-
-def _ids_with_new(report: StepReport, count: int) -> np.ndarray:
-    """Ids (N or 1, K) of a step's observations in every particle; what was new has the ids that it got."""
-    ids = np.full((1, count), NULL)
-    if report.groups and report.groups[0].ids is not None and report.groups[0].ids.ndim == 2:
-        ids = report.groups[0].ids.copy()
-        columns = np.flatnonzero((ids == NEW).any(axis=0))
-        for column, landmark in zip(columns, report.new_landmarks, strict=True):
-            ids[ids[:, column] == NEW, column] = landmark
-    return ids
-
-
-class _Associations:
-    """Ids of every observation in every particle, until it is known which lineage survives."""
-
-    def __init__(self, filter_: Filter) -> None:
-        self._filter = filter_
-        self._steps: list[tuple[int, np.ndarray]] = []
-
-    def record(self, report: StepReport, count: int) -> None:
-        """Keeps a step's ids (n, K), n = 1 where all particles agree."""
-        ids = _ids_with_new(report, count)
-        if (ids == ids[:1]).all():
-            ids = ids[:1]
-        lineage = self._filter.lineage
-        if ids.shape[0] > 1:
-            lineage.retain(lineage.generation)
-        self._steps.append((lineage.generation, ids))
-
-    def of(self, particle: int) -> list[np.ndarray]:
-        """Ids along the ancestors of a particle, one array per step."""
-        lineage = self._filter.lineage
-        return [ids[lineage.rows(g)[particle] if ids.shape[0] > 1 else 0] for g, ids in self._steps]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        shapes = [(g, *ids.shape) for g, ids in self._steps]
-        flat = [ids.ravel() for _, ids in self._steps]
-        return {
-            "associations/shapes": np.array(shapes, dtype=np.int64).reshape(-1, 3),
-            "associations/ids": np.concatenate([np.zeros(0, dtype=np.int64), *flat]),
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        found = read(arrays, _ASSOCIATIONS, "associations/")
-        shapes = found["shapes"].tolist()
-        if any(n not in (1, self._filter.n) for _, n, _ in shapes):
-            raise InputError("the associations of a step are not those of one or of all particles")
-        flat = split(found["ids"], [n * k for _, n, k in shapes], "associations/ids")
-        for (generation, n, k), ids in zip(shapes, flat, strict=True):
-            if n > 1:
-                self._filter.lineage.take_up(generation)
-            self._steps.append((generation, ids.reshape(n, k)))
