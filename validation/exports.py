@@ -20,10 +20,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf.core.checkpoint import save_arrays
+from rbpf.core.checkpoint import save_arrays, whole
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.files import prepare_folder, whole
+from rbpf.runs.files import prepare_folder
 from rbpf.runs.measurement_files import OBSERVATIONS
 from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import PathAndMap, RunFolder

@@ -19,7 +19,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, BinaryIO, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -46,28 +46,34 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
             raise InputError(f"{path} cannot be written: the array {name}: {error}") from error
         if "\0" in name:
             raise InputError(f"{path} cannot be written: the name {name!r} of an array holds a zero")
-    temporary = path.with_name(path.name + ".partial")
+    # All are plain by now; before NumPy 2.2 `allow_pickle` would be one more array. Its types take no dict of arrays.
+    plain: dict[str, Any] = dict(arrays)
+    with whole(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **plain)
+        file.flush()
+        # Else a power cut after the renaming could leave neither the old file nor the new one.
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary place beside a file, which gets the file's name when everything is written.
+
+    Nothing stays of what fails half way, and a file that was there before stays as it was. What bears the temporary name, a
+    link to another file too, is removed. Raises InputError: the place cannot be written to, or the disk is full.
+    """
+    temporary = path.with_name(f"{path.stem}.partial{path.suffix}")
     try:
-        with open_new(temporary) as file:
-            # All are plain by now; before NumPy 2.2 `allow_pickle` would be one more array. Its types take no dict of arrays.
-            plain: dict[str, Any] = dict(arrays)
-            np.savez(file, **plain)
-            file.flush()
-            # Else a power cut after the renaming could leave neither the old file nor the new one.
-            os.fsync(file.fileno())
+        temporary.unlink(missing_ok=True)
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+        yield temporary
         os.replace(temporary, path)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        reason = (error.strerror or str(error)).strip().splitlines()[0]
+        raise InputError(f"{path} cannot be written: {reason}") from error
+    finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise InputError(f"{path} cannot be written: {reason}") from error
-
-
-def open_new(path: Path) -> BinaryIO:
-    """A file that was not there before, to be written: what bears the name, a link to another file too, is removed."""
-    path.unlink(missing_ok=True)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    return os.fdopen(os.open(path, flags, 0o666), "wb")
 
 
 def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from rbpf.core.checkpoint import open_new
+from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 
 CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajectory.npz", "map.npz"
@@ -19,26 +19,6 @@ POSTERIOR, GRID = "posterior.npz", "grid.npz"
 LOCK = ".lock"  #: In a run's folder while somebody writes there; with the number of that process.
 VERSION = 1  #: Of trajectory.npz.
 OnDone = Callable[[int, int], None]  #: Called with how many parts of some work are done, and of how many.
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A temporary place beside a file, which gets the file's name when everything is written.
-
-    Nothing stays of what fails half way, and a file that was there before stays as it was. Raises InputError: the place cannot
-    be written to, or the disk is full.
-    """
-    temporary = path.with_name(f"{path.stem}.partial{path.suffix}")
-    try:
-        open_new(temporary).close()
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        reason = (error.strerror or str(error)).strip().splitlines()[0]
-        raise InputError(f"{path} cannot be written: {reason}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def prepare_folder(out: Path) -> None:

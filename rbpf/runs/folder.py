@@ -44,7 +44,7 @@ from typing import Any
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import save_arrays
+from rbpf.core.checkpoint import save_arrays, whole
 from rbpf.runs import files
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
@@ -171,7 +171,7 @@ def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
     log_odds, (x, y) = grid["log_odds"], grid["corner"].tolist()
     cells = np.select([log_odds > 0.0, log_odds < 0.0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
     height, width = cells.shape
-    with files.whole(out / "grid.pgm") as temporary:
+    with whole(out / "grid.pgm") as temporary:
         temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode() + cells[::-1].tobytes())
     words = {
         "image": "grid.pgm",

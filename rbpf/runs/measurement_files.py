@@ -43,9 +43,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf import gaussian
+from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
-from rbpf.runs.files import whole
 from rbpf.sensors.camera import LENSES, Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.readers.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim

@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.files import GRID, whole
+from rbpf.runs.files import GRID
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.files import prepare_folder, whole
+from rbpf.runs.files import prepare_folder
 from rbpf.runs.plots import SIGMAS, near_box, outline
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import fit, in_space

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.runs.files import OnDone, whole
+from rbpf.core.checkpoint import whole
+from rbpf.runs.files import OnDone
 from rbpf.runs.plots import outline
 from rbpf.runs.run import Run
 from rbpf.sensors.readers import ImageFrame
