@@ -193,6 +193,7 @@ def start_of(truth: Structure) -> Structure:
 def test_a_camera_that_seems_to_stand_still_is_found_to_have_moved():
     window, truth = scene()
     best = optimum(window, EXPECTED, start_of(truth))
+    assert best is not None
     assert best.cost <= Linearised(window, EXPECTED, truth).cost
     assert best.structure.inverse.mean() == pytest.approx(0.8, abs=0.8 * 5.0 * SCALE_STD)
     off = SE3.local(best.structure.path[1:], truth.path[1:]).ravel()
@@ -227,6 +228,7 @@ def test_errors_are_as_large_as_the_information_says():
     for seed in range(30):
         window, truth = walking(seed, velocity)
         best = optimum(window, MonoConfig(velocity=velocity), truth)
+        assert best is not None
         off = SE3.local(best.structure.path[1:], truth.path[1:]).ravel()
         cov = np.linalg.inv(best.information)[: off.size, : off.size]
         of_poses.append(off @ np.linalg.solve(cov, off) / off.size)
@@ -239,6 +241,7 @@ def test_errors_are_as_large_as_the_information_says():
 def test_paths_are_drawn_with_the_covariance_of_the_optimum():
     window, truth = scene()
     best = optimum(window, EXPECTED, truth)
+    assert best is not None
     paths = best.paths(4000, np.random.default_rng(2))
     assert (paths[:, 0] == truth.path[0]).all()
     drawn = SE3.local(best.structure.path[-1], paths[:, -1])

@@ -174,8 +174,7 @@ class HandOver:
             of_points = SE3.identity() if world is None else world.mean[belief.mode]
             start = replace(start, frame=SE3.between(self.first.path[steps[0]], of_points))
         best = optimum(seen, config, start)
-        is_finite = np.isfinite(best.cost) and np.isfinite(best.information).all()
-        return (names, seen, best) if is_finite else None
+        return None if best is None else (names, seen, best)
 
     def tune(self, filter_: Filter, sensor: ImageSensor) -> None:
         """The camera is taken to be what it is on the average of the particles; nothing is done to one that is given."""

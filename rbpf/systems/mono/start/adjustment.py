@@ -210,8 +210,10 @@ def gathered(
         float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z] or [1.0]))),
     )
     which, position = features.positions(belief, names)
-    path = np.array(first.path)[steps]
-    return steps, names, seen, structure_of(SE3.between(path[:1], path), position[np.argsort(which)])
+    path, position = np.array(first.path)[steps], position[np.argsort(which)]
+    length = np.linalg.norm(position[:, :3], axis=1)
+    start = Structure(SE3.between(path[:1], path), position[:, :3] / length[:, None], position[:, 3] / length)
+    return steps, names, seen, start
 
 
 @final
@@ -271,8 +273,8 @@ class Optimum:
         return np.asarray(np.sqrt(np.square(half).sum(axis=0)))
 
 
-def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum:
-    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations.
+def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | None:
+    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations; None: none.
 
     What is expected before anything is seen, of inverse distances and velocities, is that of the settings.
     """
@@ -288,12 +290,12 @@ def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum:
                 break
             damping *= DAMPING_FACTOR
             if damping > MAX_DAMPING:
-                return Optimum(now.at, now.cost, now.normal_equations(LOSS_INFORMATION)[0])
+                return now.optimum()
         damping /= DAMPING_FACTOR
         gain, now = now.cost - ahead.cost, ahead
         if gain < MIN_GAIN * (1.0 + now.cost):
             break
-    return Optimum(now.at, now.cost, now.normal_equations(LOSS_INFORMATION)[0])
+    return now.optimum()
 
 
 @final
@@ -338,6 +340,12 @@ class Linearised:
         """The first of T − 1 rows, and from row to row, whitened."""
         moved = np.concatenate([velocity[:1], np.diff(velocity, axis=0)])
         return np.einsum("ktj,jk...->tk...", self._whitener, moved)
+
+    def optimum(self) -> Optimum | None:
+        """This structure as a minimum; None where it is not finite."""
+        information = self.normal_equations(LOSS_INFORMATION)[0]
+        is_finite = np.isfinite(self.cost) and np.isfinite(information).all()
+        return Optimum(self.at, self.cost, information) if is_finite else None
 
     def normal_equations(self, loss_information: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Gauss and Newton's: information of the step, what was seen counting so often, and the vector it is solved with."""
@@ -423,9 +431,3 @@ def _summed(parts: np.ndarray, row: np.ndarray, count: int) -> np.ndarray:
     out = np.zeros((count, *parts.shape[1:]))
     np.add.at(out, row, parts)
     return out
-
-
-def structure_of(path: np.ndarray, position: np.ndarray) -> Structure:
-    """From poses (T, 7), and homogeneous points (F, 4)."""
-    length = np.linalg.norm(position[:, :3], axis=1, keepdims=True)
-    return Structure(path, position[:, :3] / length, position[:, 3] / length[:, 0])

@@ -13,27 +13,15 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, poses, read
+from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.start.adjustment import (
-    MIN_FRAMES,
-    Adjusted,
-    FirstFrames,
-    Optimum,
-    Structure,
-    Window,
-    between,
-    gathered,
-    optimum,
-    structure_of,
-)
+from rbpf.systems.mono.start.adjustment import MIN_FRAMES, Adjusted, FirstFrames, Optimum, between, gathered, optimum
 from rbpf.systems.system import Revision
 
 DISCONNECTED = (
@@ -43,15 +31,6 @@ DISCONNECTED = (
 """Of a start without known points that ended before depths were known."""
 
 TINY = np.finfo(float).tiny
-
-_LAST = {
-    "progress": integers(2, least=0),
-    "names": integers("features", least=0, ascending=True),
-    "steps": integers("steps", least=0, ascending=True),
-    "path": poses("steps"),
-    "direction": numbers("features", 3),
-    "inverse": numbers("features"),
-}
 
 
 @final
@@ -74,9 +53,6 @@ class UnknownStart:
         self.over = not (needed and config.start.batch_adjust)
         """Whether depths are known well enough, and the filter goes on alone."""
         self._next = config.start.first_adjustment
-        nothing = np.zeros(0, dtype=np.int64)
-        self._last = nothing, nothing, Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0))
-        """Names, numbers of the frames, and optimum of the last adjustment; empty before one."""
 
     def after_frame(self, filter_: Filter, usable: bool, lost: bool) -> tuple[Adjusted | None, str | None]:
         """Adjusts all frames so far if it is time.
@@ -113,28 +89,15 @@ class UnknownStart:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        names, steps, structure = self._last
-        return {
-            "start/progress": np.array([self.over, self._next]),
-            "start/names": names,
-            "start/steps": steps,
-            "start/path": structure.path,
-            "start/direction": structure.direction,
-            "start/inverse": structure.inverse,
-        }
+        return {"start/progress": np.array([self.over, self._next])}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`, once the first frames are there; errors as `rbpf.core.checkpoint.read`."""
-        last = read(arrays, _LAST, "start/")
-        over, self._next = last["progress"].tolist()
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
+        over, self._next = read_one(arrays, "start/progress", integers(2, least=0)).tolist()
         self.over = bool(over)
-        names, steps = last["names"], last["steps"]
-        self._last = names, steps, Structure(last["path"], last["direction"], last["inverse"])
-        if not self.over and names.size and not (steps.size and steps[-1] < len(self.first.seen)):
-            raise InputError("the last adjustment of the start is of frames that are not there")
 
     def _adjusted(self, filter_: Filter) -> tuple[tuple[np.ndarray, Optimum] | None, bool]:
-        """Numbers of the frames that took part, and the best optimum, or None; and whether the start is over."""
+        """Numbers of the frames that took part, and the optimum, or None; and whether the start is over."""
         first, config = self.first, self.config
         steps, names, seen, start = gathered(first, self.features, filter_.belief(), config.start.max_frames)
         if steps.size < MIN_FRAMES:
@@ -142,40 +105,13 @@ class UnknownStart:
         if not seen.is_connected():
             return None, True
 
-        # The lower of the minima downhill from where the filter is, and from where the last adjustment would have gone.
-        starts = [start]
-        if self._last[0].size:
-            starts.append(self._gone_on(seen, names, np.array(first.path)[steps], steps))
-        found = [optimum(seen, config, start) for start in starts]
-        found = [each for each in found if np.isfinite(each.cost) and np.isfinite(each.information).all()]
-        if not found:
+        best = optimum(seen, config, start)
+        if best is None:
             return None, True
-        best = min(found, key=lambda each: each.cost)
-        self._last = names, steps, best.structure
-
         relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
         relative = relative[np.isin(names, first.seen[-1].landmarks)]
         depths_known = relative.size > 0 and np.median(relative) < config.start.depth_std_ratio
         return (steps, best), bool(depths_known)
-
-    def _gone_on(self, seen: "Window", names: np.ndarray, path: np.ndarray, steps: np.ndarray) -> "Structure":
-        """The last adjustment's path and structure, gone on with as the filter moved, and what is new at the prior."""
-        before, old_steps, structure = self._last
-        joint = int(np.searchsorted(steps, old_steps[-1], side="right")) - 1
-        start = between(old_steps, structure.path[None], steps[: joint + 1])[:, 0]
-        onward = SE3.compose(start[-1:], SE3.between(path[joint : joint + 1], path[joint + 1 :]))
-        whole = np.concatenate([start, onward])
-        position = np.empty((names.size, 4))
-        _, first = np.unique(seen.feature, return_index=True)
-        # Where the lens has no direction, straight ahead is enough to start from.
-        uv = np.nan_to_num(seen.camera.unproject(seen.px[first]))
-        pose, rho = whole[seen.frame[first]], self.config.inverse_depth.mean_per_m
-        ahead = np.concatenate([uv, np.ones((names.size, 1))], axis=1)
-        position[:, :3] = SE3.transform(pose, ahead) + (rho - 1.0) * SE3.translation(pose)
-        position[:, 3] = rho
-        _, now, then = np.intersect1d(names, before, return_indices=True)
-        position[now] = np.concatenate([structure.direction, structure.inverse[:, None]], axis=1)[then]
-        return structure_of(whole, position)
 
     def _along(self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
