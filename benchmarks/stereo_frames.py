@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.mono_frames import Decoded
 from benchmarks.rows import Row, Settings
+from examples.studies.lab import LabDrive, TexturedLab
 from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
 RIG = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
 SETTLING, TIMED = 5, 30

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import tyro
 
+from examples.studies.lab import LabDrive, TexturedLab
 from rbpf.runs.files import write_table
 from rbpf.runs.recordings import StereoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.finish import finish_run
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
 FIGURES = ("ate_rmse_m", "vo_ate_rmse_m", "landmarks_mean_per_particle", "updates", "distance_m", "lost_frames")
 

@@ -14,10 +14,10 @@ import matplotlib
 import numpy as np
 import tyro
 
+from examples.studies.lab import LabDrive, TexturedLab, furnished
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_stereo
 from rbpf.validation.simulation.images import Imaging, Shutter
-from rbpf.validation.simulation.lab import LabDrive, TexturedLab, furnished
 from rbpf.validation.simulation.render import Renderer
 
 matplotlib.use("Agg")
@@ -42,7 +42,7 @@ class Moment:
 
 
 def rendered(seed: int, noise_std: float, width: int, moments: int) -> Iterator[Moment]:
-    """The laboratory at times spread over the tour, as `rbpf simulate lab --noise-std` renders it."""
+    """The laboratory at times spread over the tour, as `python -m examples.studies.lab --noise-std` renders it."""
     camera = Pinhole(width, 3 * width // 4, 0.78125 * width, 0.78125 * width, 0.5 * width - 0.5, 0.375 * width - 0.5)
     rng = np.random.default_rng(seed)
     scene = TexturedLab(texel_m=1.92 / width).build(rng)

@@ -13,13 +13,13 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
+from examples.studies.lab import RATE_HZ, LabDrive, furnished, shell, spines, world_from_camera
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.ranges import MOST, Count, CountOrNone, NotNegative, Positive, Range, Ranged, Rate, check_ranges
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints, Truth
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
 from rbpf.validation.simulation.paths import HandHeld, looking
 from rbpf.validation.simulation.textured_scene import EPOCH_NS, stamps_ns
 
@@ -149,7 +149,7 @@ class DeskWorld(Ranged):
         return Scene("desk", stamps_ns(self.frames, self.rate_hz) - EPOCH_NS, path, points, present, blocks)
 
 
-PRINTED = {textures.picture, textures.page, textures.carton, textures.spines}
+PRINTED = {textures.picture, textures.page, textures.carton, spines}
 RICH = 20.0
 """What is printed has so many times as many points per area as what is painted, of wood or a carpet."""
 

@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from examples.studies.lab import LabDrive
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from rbpf.lie import SE3
 from rbpf.runs.files import write_table
@@ -26,7 +27,6 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.simulation.lab import LabDrive
 
 DIM = 6
 """Of a pose: what the NEES of an honest filter is on the average."""

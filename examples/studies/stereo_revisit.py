@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 
 from examples.studies.feature_cache import cache_features, filter_cached
+from examples.studies.lab import LabDrive
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
@@ -31,7 +32,6 @@ from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.scores import score_path
-from rbpf.validation.simulation.lab import LabDrive
 
 
 @final

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
-from rbpf.cli.options import MOST_PX, Flag, Printed, Real, RealPositive, Text, WholeCount, given_board
+from rbpf.cli.options import MOST_PX, Flag, Printed, Real, RealPositive, Text, given_board
 from rbpf.cli.showing import answer, progress
 from rbpf.errors import InputError
 from rbpf.ranges import MOST, Count, CountOrNone, Fraction, NotNegative, Range, Seed
@@ -109,7 +109,7 @@ class SimulateDesk(ImagesOptions):
         if board is not None:
             squares = board.columns + 1, board.rows + 1
             lies = replace(lies, board=squares, square_m=board.square_m)
-        _render(lies, self)
+        render(lies, self)
 
 
 @SIMULATE.add("room")
@@ -122,37 +122,11 @@ class SimulateRoom(ImagesOptions):
 
         if self.board is not None or self.square is not None:
             raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
-        _render(TexturedRoom(frames=self.frames, contrast=self.contrast), self)
+        render(TexturedRoom(frames=self.frames, contrast=self.contrast), self)
 
 
-@SIMULATE.add("lab")
-@dataclass(frozen=True, kw_only=True)
-class SimulateLab(RenderOptions):
-    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
-
-    focal_fraction = 0.78125
-    #: a tour of 4,000 images over 68 m through both rooms and back, or 600 images on which the robot twice looks away
-    #: for 5 s and back.
-    trajectory: Literal["tour", "turn_back"] = "tour"
-    frames: WholeCount = None  #: only so many images, the first; by default all.
-    every: Count = 1  #: only each so many-th frame becomes an image.
-    focal_px: RealPositive = None  #: focal length, px; by default 0.78125 of the width, 500 px at 640.
-    #: of a second camera to the right, m; None or nothing for none.
-    baseline_m: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = 0.12
-    noise_std: NotNegative = 8.0  #: of the sensor, grey levels.
-    blur_s: NotNegative = 0.0  #: the shutter is open this long, s.
-    exposure_drift: Fraction = 0.0  #: greatest change of the exposure, as a fraction.
-    vignetting: Fraction = 0.0  #: fraction of the light that is missing in the corners.
-    texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are drawn sooner.
-
-    def __call__(self) -> None:
-        from rbpf.validation.simulation.lab import LabDrive, TexturedLab
-
-        drive = LabDrive(self.trajectory, self.frames, self.every)
-        _render(TexturedLab(drive, texel_m=self.texel_m, contrast=self.contrast), self)
-
-
-def _render(world: "ImageWorld", options: RenderOptions) -> None:
+def render(world: "ImageWorld", options: RenderOptions) -> None:
+    """Takes the pictures of a world that a command asks for, and says so."""
     from rbpf.sensors.camera import Pinhole
     from rbpf.validation.simulation.images import Imaging, simulate_images
 

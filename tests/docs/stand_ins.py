@@ -30,7 +30,6 @@ SHORTER = {
     ("simulate", "laser"): ["--scans", "20", "--laps", "1"],
     ("simulate", "desk"): ["--frames", "8", "--width", "480", "--height", "360"],
     ("simulate", "room"): ["--frames", "4", "--width", "160", "--height", "120"],
-    ("simulate", "lab"): ["--frames", "3", "--width", "160", "--height", "120", "--texel-m", "0.02"],
 }
 """Added to a command that would render or simulate for minutes."""
 

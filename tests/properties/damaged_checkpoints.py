@@ -72,8 +72,8 @@ def stereo() -> Case:
 
 
 def named_stereo() -> Case:
+    from examples.studies.lab import LabDrive
     from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
-    from rbpf.validation.simulation.lab import LabDrive
 
     world = LabWorld(LabDrive(frames=8, every=4), points=2000)
     log = simulate_features(world, Measuring(known=0, measurements=20, new_per_frame=20), STEREO, 0)

@@ -17,7 +17,6 @@ from rbpf.runs.measurement_files import read_feature_log, read_measurements, wri
 from rbpf.runs.trajectory import Trajectory, read_tum, write_tum
 from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, read_known_points, text
 from rbpf.sensors.readers.laser import read_laser_log
-from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.properties.mutations import damaged, read_or_refused, restored
 from tests.readers import small
@@ -122,7 +121,6 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "CARMEN": (lambda f: small.write(f, small.CARMEN), lambda f: read_laser_log(f / "robot.clf"), "robot.clf"),
     "laser, ROS 1": (lambda f: bags.write_scans(f / "walk.bag"), lambda f: read_laser_log(f / "walk.bag"), "*"),
     "laser, ROS 2": (lambda f: bags.write_scans(f / "walk_db3"), lambda f: read_laser_log(f / "walk_db3"), "**/*.*"),
-    "wheel odometry": (lambda f: small.write(f, small.WHEELS), read_wheel_odometry, "odometry.*"),
     "known points": (
         lambda f: small.write(f, small.KNOWN),
         lambda f: read_known_points(f / "known_points.csv"),

@@ -65,11 +65,6 @@ CARMEN = {
     "SYNC something else\nFLASER 5 1 2 3 4 5 1.5 0 0 1 0 0 10.4 robot 0.4\n"
 }
 
-WHEELS = {
-    "odometry.csv": "#stamp_ns,dx_m,dy_m,dyaw_rad,sigma_x_m,sigma_y_m,sigma_yaw_rad\n100,0,0,0,0,0,0\n"
-    f"200,1.0,0.0,{QUARTER!r},0.1,0.2,0.3\n300,2,0.5,0,0.1,0.2,0.3\n",
-    "odometry.yaml": "robot_from_camera: [0, 0, 0, 1, 0, 0, 1.5]\n",
-}
 KNOWN = {"known_points.csv": "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n7,1.5,2.5,1,2,3,0.1\n3,4,5,-1,-2,-3,0\n"}
 
 

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
 from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.readers import open_images, open_log, read_known_points
 from rbpf.sensors.readers.laser import read_laser_log
 from rbpf.sensors.readers.text import read_columns, read_csv
-from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.metrics.relations import read_relations
-from tests.readers.small import CARMEN, GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, WHEELS, write
+from tests.readers.small import CARMEN, GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, write
 
 TUM = {"path.tum": "# x\n0.5 1 2 3 0 0 0 1\n0.6 1 2 3 0 0 0 1\n"}
 RELATIONS = {"some.relations": "0 1 1 0 0 0 0 0.5\n1 2 1 0 0 0 0 0.5\n"}
@@ -25,7 +23,6 @@ FORMATS = {
     "space": (MRPT_IN_SPACE, open_log),
     "graph": (GRAPH, lambda folder: open_log(folder / "graph.txt")),
     "CARMEN": (CARMEN, lambda folder: read_laser_log(folder / "robot.clf")),
-    "wheels": (WHEELS, read_wheel_odometry),
     "path": (TUM, lambda folder: read_tum(folder / "path.tum")),
     "relations": (RELATIONS, lambda folder: read_relations(folder / "some.relations")),
     "known": (KNOWN, lambda folder: read_known_points(folder / "known_points.csv")),
@@ -77,12 +74,6 @@ CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 nan 0 10.1 | expected odomet
 CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 5e9 | expected the time in seconds, within 4e+09 of zero
 CARMEN | robot.clf | 7 | FLASER 4 1 2 3 4 0 0 0 0 0 0 10.5 | expected 5 readings as in line 4, found 4 readings
 CARMEN | robot.clf | 7 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 9.2 | the time runs backwards by 1.100 s, expected scans in order
-wheels | odometry.csv | 4 | 150,0,0,0,0,0,0 | time runs backwards
-wheels | odometry.csv | 4 | 200,0,0,0,0,0,0 | expected a later time
-wheels | odometry.csv | 2 | 100,1,0,0,0,0,0 | expected no motion on the first line
-wheels | odometry.csv | 2 | 1.5,0,0,0,0,0,0 | expected a time in whole nanoseconds
-wheels | odometry.yaml | 1 | other: 1 | expected the keys robot_from_camera, found no robot_from_camera
-wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 2, 0, 0, 0] | expected robot_from_camera to begin with a unit
 path | path.tum | 3 | 0.6 1 2 3 0 0 1 | expected 8 columns (timestamp, tx, ty, tz, qx, qy, qz, qw), found 7
 path | path.tum | 3 | 0.6 1 2 x 0 0 0 1 | expected tz to be a finite number, found 'x'
 path | path.tum | 2 | 0.5 1 2 3 0 0 0 0.9 | expected a quaternion of length 1, found one of length 0.9
@@ -109,7 +100,6 @@ FILES = [
     ("CARMEN", {"robot.clf": "ODOM 0 0 0 0 0 0 1\n"}, "robot.clf: expected a CARMEN log (a text file with lines FLASER"),
     ("CARMEN", {"robot.clf": gzip.compress(CARMEN["robot.clf"].encode())[:-9]}, "packed by gzip and cut off"),
     ("CARMEN", {"robot.clf": b"\x1f\x8b" + bytes(20)}, "robot.clf: it is packed by gzip and damaged"),
-    ("wheels", {"odometry.csv": "# only\n"}, "odometry.csv: expected lines that begin with a time"),
     ("known", {"known_points.csv": ""}, "known_points.csv: the file is empty; expected a table with the columns id,"),
     ("known", {"known_points.csv": "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n"}, "expected rows of id, u_px"),
 ]  # fmt: skip
@@ -121,8 +111,6 @@ MISSING = [
     ("MRCLAM", "Robot3_Measurement.dat", "expected an MRCLAM log"),
     *(("MRPT", name, "no such file; expected an MRPT log") for name in list(MRPT)[:3]),
     ("CARMEN", "robot.clf", "no such file or folder; expected a ROS bag"),
-    ("wheels", "odometry.csv", "no such file; expected the readings of a robot's wheels"),
-    ("wheels", "odometry.yaml", "no such file"),
     ("path", "path.tum", "no such file"),
 ]
 """Format, the file that is not there, and the words about it."""
@@ -286,18 +274,3 @@ def test_known_points(tmp_path):
     points = read_known_points(str(write(tmp_path, {"known_points.csv": text}) / "known_points.csv"))
     assert (points.names.tolist(), points.px.tolist(), points.std_m.tolist()) == ([9], [[1, 2]], [0.1])
     assert points.positions.tolist() == [[3, 4, 5]]
-
-
-def test_wheel_odometry(tmp_path):
-    odometry = read_wheel_odometry(write(tmp_path, WHEELS))
-    assert odometry.stamps_ns.tolist() == [100, 200, 300]
-    np.testing.assert_allclose(odometry.delta, [[np.pi / 2, 1.0, 0.0], [0.0, 2.0, 0.5]])
-    np.testing.assert_allclose(odometry.std, [[0.3, 0.1, 0.2]] * 2)
-    # One metre ahead, a quarter turn to the left, two metres ahead and half a metre to the left.
-    path = [[0, 0, 0], [np.pi / 2, 1, 0], [np.pi / 2, 0.5, 2]]
-    np.testing.assert_allclose(odometry.world_from_robot(), path)
-    # The camera is carried by the robot.
-    start = SE3.exp([0.1, -0.4, 0.3, 1.0, 2.0, 3.0])
-    poses = odometry.world_from_camera(start)
-    np.testing.assert_allclose(poses[0], start, atol=1e-12)
-    np.testing.assert_allclose(SE3.translation(SE3.between(poses[0], poses[2])), [0.5, 2.0, 0.0], atol=1e-12)

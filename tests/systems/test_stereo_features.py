@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.lab import LabDrive
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, RoomWorld, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -16,7 +17,6 @@ from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.simulation.lab import LabDrive
 
 pytestmark = pytest.mark.slow
 

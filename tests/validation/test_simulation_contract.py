@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from examples.studies import point_worlds
+from examples.studies.lab import LabDrive, TexturedLab
 from examples.studies.point_worlds import DeskWorld, Measuring
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -20,7 +21,6 @@ from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 from rbpf.validation.simulation.laser import LaserWorld
 from rbpf.validation.simulation.paths import HandHeld, WheelOdometer
 from rbpf.validation.simulation.render import Renderer

@@ -6,17 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 
-from rbpf.cli import main
+from examples.studies.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, RenderLab, TexturedLab, world_from_camera
+from examples.studies.wheel_odometry import WheelOdometry, read_wheel_odometry, write_wheel_odometry
 from rbpf.lie import SE2, SE3
 from rbpf.runs.trajectory import in_space, read_tum
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, open_stereo, read_known_points, read_laser_log
-from rbpf.sensors.readers.wheel_odometry import WheelOdometry, read_wheel_odometry
 from rbpf.validation.metrics.relations import read_relations, relation_errors
 from rbpf.validation.simulation import laser
-from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, TexturedLab, world_from_camera
 from rbpf.validation.simulation.laser import LaserWorld, floor_plan, simulate_laser
 from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners
 from rbpf.validation.simulation.render import Renderer
@@ -57,16 +56,14 @@ def test_the_renderer_sees_what_single_rays_see() -> None:
 
 
 def test_the_folder_holds_what_the_wheels_say(tmp_path: Path) -> None:
-    small = Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5)
-    simulate_images(TexturedLab(LabDrive(frames=9, every=6), texel_m=0.5), Imaging(known=0), small, tmp_path / "lab", 0)
-    odometry = read_wheel_odometry(tmp_path / "lab")
-    sequence = open_images(tmp_path / "lab")
-    assert sequence.truth is not None
+    world = TexturedLab(LabDrive(frames=9, every=6), texel_m=0.5)
+    write_wheel_odometry(tmp_path, world.wheels(seed=0))
+    odometry, scene = read_wheel_odometry(tmp_path), world.build(np.random.default_rng(0))
     assert len(odometry.stamps_ns) == 49
-    np.testing.assert_array_equal(odometry.stamps_ns[::6], sequence.stamps_ns)
+    np.testing.assert_array_equal(odometry.stamps_ns[::6], scene.stamps_ns)
     np.testing.assert_allclose(odometry.robot_from_camera, ROBOT_FROM_CAMERA)
-    reckoned = odometry.world_from_camera(sequence.truth.poses[0])[::6]
-    apart = np.linalg.norm(reckoned[:, 4:] - sequence.truth.poses[:, 4:], axis=1)
+    reckoned = odometry.world_from_camera(scene.world_from_camera[0])[::6]
+    apart = np.linalg.norm(reckoned[:, 4:] - scene.world_from_camera[:, 4:], axis=1)
     assert 0.0 < apart[-1] < 0.08 * TOUR.way_m[48]
 
 
@@ -147,7 +144,8 @@ STAMPS = stamps_ns(len(TOUR.way_m), RATE_HZ)
 def measured(odometer: WheelOdometer, seed: int = 0, frames: int | None = None) -> WheelOdometry:
     travelled = TOUR if frames is None else LabDrive(frames=frames).travelled()
     rng = np.random.default_rng(seed)
-    return odometer.measure(travelled, STAMPS[: len(travelled.way_m)], ROBOT_FROM_CAMERA, rng)
+    stamps_ns = STAMPS[: len(travelled.way_m)]
+    return WheelOdometry(stamps_ns, *odometer.measure(travelled, rng), ROBOT_FROM_CAMERA)
 
 
 def test_without_errors_dead_reckoning_is_the_path() -> None:
@@ -184,18 +182,18 @@ def test_slip_is_as_great_as_stated() -> None:
     assert 0.7 < np.std(seeds) / expected < 1.4
 
 
-# `rbpf simulate lab` from end to end, on a few tiny images.
+# `python -m examples.studies.lab` from end to end, on a few tiny images.
 
 SMALL = ["--width", "96", "--height", "72", "--texel-m", "0.05"]
 
 
-def lab(out: Path, *arguments: str) -> int:
-    return main(["simulate", "lab", "--out", str(out), *SMALL, *arguments])
+def render_lab(out: Path, *arguments: str) -> None:
+    tyro.cli(RenderLab, args=["--out", str(out), *SMALL, *arguments])()
 
 
 @pytest.mark.slow
 def test_a_tour_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert lab(tmp_path / "lab", "--every", "1000", "--noise-std", "0") == 0
+    render_lab(tmp_path / "lab", "--every", "1000", "--noise-std", "0")
     sequence = open_stereo(tmp_path / "lab")
     assert sequence.truth is not None
     assert len(sequence) == 4 and sequence.baseline_m == 0.12
@@ -211,7 +209,7 @@ def test_a_tour_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.slow
 def test_options_reach_the_images(tmp_path: Path) -> None:
     options = ["--trajectory", "turn_back", "--frames", "3", "--known", "0", "--jpeg", "80", "--focal-px", "60"]
-    assert lab(tmp_path / "mono", *options, "--baseline-m", "None") == 0
+    render_lab(tmp_path / "mono", *options, "--baseline-m", "None")
     sequence = open_images(tmp_path / "mono")
     assert len(sequence) == 3 and sequence.camera.fx == 60.0 and sequence.baseline_m is None
     assert {path.suffix for path in (tmp_path / "mono" / "mav0" / "cam0" / "data").iterdir()} == {".jpg"}

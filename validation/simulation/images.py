@@ -26,7 +26,7 @@ from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_r
 from rbpf.runs.files import OnDone, write_csv, write_text
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import camera_text
-from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
+from rbpf.validation.simulation.paths import Wave
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
 
@@ -285,9 +285,9 @@ def simulate_images(
 ) -> None:
     """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.
 
-    Beside mav0 there are camera.yaml; known_points.csv, if points are known; chessboard.yaml, if there is a board; and
-    odometry.csv with odometry.yaml, if the camera stands on a robot. The folder must not exist, or be empty; it appears
-    when it is complete: an interrupted run leaves nothing there. The world's path is that of the left camera;
+    Beside mav0 there are camera.yaml; known_points.csv, if points are known; and chessboard.yaml, if there is a board. The
+    folder must not exist, or be empty; it appears when it is complete: an interrupted run leaves nothing there. The world's
+    path is that of the left camera;
     `baseline_m` is that of a second one like a `Pinhole`, to its right; a `RectifiedStereo` has its own. `on_frame` is
     called after every image, in order, with how many are done, and how many there will be.
 
@@ -339,8 +339,6 @@ def simulate_images(
             # Poses as [qx, qy, qz, qw, x, y, z].
             boards = [vars(board) | {"world_from_board": pose.tolist()} for board, pose in scene.boards]
             write_text(partial / "chessboard.yaml", yaml.safe_dump(boards, sort_keys=False))
-        if scene.odometry is not None:
-            write_wheel_odometry(partial, scene.odometry)
 
         def take(frame: int) -> None:
             stamp = int(scene.stamps_ns[frame])

@@ -11,11 +11,11 @@ from typing import Annotated
 
 import numpy as np
 
-from rbpf.lie import SE2, SE3, Array
+from rbpf.lie import SE2, Array
 from rbpf.ranges import MOST, NotNegative, Positive, Range, Ranged, Rate
 from rbpf.runs.files import write_text
 from rbpf.runs.trajectory import Trajectory, write_tum
-from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners
+from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners, dead_reckoning
 
 #: Corners of the walls around the corridor, counterclockwise [m].
 OUTER = ((0.0, 0.0), (16.0, 0.0), (16.0, 12.0), (0.0, 12.0))
@@ -99,7 +99,7 @@ def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
     times = np.linspace(0.0, seconds, READINGS * (world.scans - 1) + 1)
     driven = Drive(start, moves, seconds, BEND_M, RAMP_S)(times)
     stamps_ns = START_S * 10**9 + np.rint(times * 1e6).astype(np.int64) * 1000
-    odometry = world.odometer.measure(driven, stamps_ns, SE3.identity(), rng).world_from_robot()[::READINGS]
+    odometry = dead_reckoning(world.odometer.measure(driven, rng)[0])[::READINGS]
     truth, way_m, stamps_ns = driven.world_from_robot[::READINGS], driven.way_m[::READINGS], stamps_ns[::READINGS]
     # Scans: noise, then what gives no return.
     mount, angles, walls = np.array([0.0, world.scanner_ahead_m, 0.0]), np.radians(np.arange(-90.0, 91.0)), floor_plan()

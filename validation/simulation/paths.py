@@ -11,7 +11,6 @@ agree at both ends.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -19,8 +18,6 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.ranges import NotNegative, Positive, Range, Ranged, check_ranges
-from rbpf.runs.files import write_csv, write_text
-from rbpf.sensors.readers.wheel_odometry import MOTION, MOUNT, NAME, SIGMA, WheelOdometry
 
 UP = np.array([0.0, 0.0, 1.0])
 TERMS = 3
@@ -288,10 +285,13 @@ class WheelOdometer(Ranged):
     #: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
     slip_m: NotNegative = 0.004
 
-    def measure(
-        self, travelled: Travelled, stamps_ns: np.ndarray, robot_from_camera: np.ndarray, rng: np.random.Generator
-    ) -> WheelOdometry:
-        """Readings of a drive at T times; more times leave the first readings as they are."""
+    def measure(self, travelled: Travelled, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Readings of a drive at T times; more times leave the first readings as they are.
+
+        Returns:
+            Motions (T - 1, 3) from each time to the next, elements of SE(2), and standard deviations (T - 1, 3) of what is
+            random in their theta [rad], x and y [m].
+        """
         side = 0.5 * self.wheelbase_m * np.array([-1.0, 1.0])
         way = np.diff(travelled.way_m[:, None] + travelled.heading_rad[:, None] * side, axis=0)
         counted = way * (1.0 + self.scale + 0.5 * self.inequality * np.array([-1.0, 1.0]))
@@ -301,15 +301,12 @@ class WheelOdometer(Ranged):
         delta = SE2.exp(np.stack([turn, forward, np.zeros_like(turn)], axis=-1))
         spread = self.slip_m * np.sqrt(np.abs(counted).sum(axis=1))
         std = np.stack([spread / base, 0.5 * spread, 0.5 * np.abs(forward) * spread / base], axis=-1)
-        return WheelOdometry(stamps_ns, delta, std, robot_from_camera)
+        return delta, std
 
 
-def write_wheel_odometry(folder: Path, odometry: WheelOdometry) -> None:
-    """odometry.csv and odometry.yaml, as `rbpf.sensors.readers.wheel_odometry` describes them."""
-    table = np.roll(np.hstack([odometry.delta, odometry.std]).reshape(-1, 2, 3), -1, axis=2).reshape(-1, 6)
-    rows = [[0.0] * 6, *table.tolist()]
-    numbers = [[f"{x:.9g}" for x in row] for row in rows]
-    header = ["#stamp_ns", *MOTION, *SIGMA]
-    stamped = zip(odometry.stamps_ns.tolist(), numbers, strict=True)
-    write_csv(folder / NAME, header, ([stamp, *row] for stamp, row in stamped))
-    write_text(folder / MOUNT, f"robot_from_camera: {odometry.robot_from_camera.tolist()}\n")
+def dead_reckoning(delta: np.ndarray) -> np.ndarray:
+    """(T, 3) poses by motions (T - 1, 3), elements of SE(2); the first is the identity."""
+    poses = np.zeros((len(delta) + 1, 3))
+    for k, step in enumerate(delta):
+        poses[k + 1] = SE2.compose(poses[k], step)
+    return poses

@@ -27,7 +27,6 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.ranges import NotNegative, check_ranges
 from rbpf.sensors.calibration import Board
-from rbpf.sensors.readers.wheel_odometry import WheelOdometry
 from rbpf.validation.simulation.textures import Paint, chessboard, faded
 
 #: Stamp of the first image: all stamps have as many digits, so that file names sort by time.
@@ -75,7 +74,6 @@ class TexturedScene:
     rectangles: Sequence[Rectangle]  #: what there is to see.
     #: chessboards among it, and their poses world_from_board (7,): the first inner corner, x across, y down, z into it.
     boards: Sequence[tuple[Board, np.ndarray]] = ()
-    odometry: WheelOdometry | None = None  #: what the wheels say, if the camera stands on a robot.
 
 
 class ImageWorld(Protocol):

@@ -113,22 +113,6 @@ def edges_of_pages(shape: Shape, rng: Generator) -> np.ndarray:
     return side
 
 
-def spines(shape: Shape, rng: Generator) -> np.ndarray:
-    """Backs of books that stand side by side, each with bands and a title."""
-    row = grey_levels(60.0 + 6.0 * clouds(shape, rng))
-    column = 0
-    while column < shape[1]:
-        wide = int(rng.integers(6, 19))
-        top = int(rng.uniform(0.0, 0.25) * shape[0])
-        back = row[top:, column : column + wide]
-        back[...] = grey_levels(rng.uniform(40, 220) + 5.0 * rng.standard_normal((1, back.shape[1])))
-        for place, high in zip(rng.uniform(0.05, 0.9, 3), rng.uniform(0.01, 0.12, 3), strict=True):
-            start = int(place * len(back))
-            back[start : start + 1 + int(high * len(back)), 1:-1] = rng.uniform(20, 235)
-        column += wide + int(rng.integers(0, 2))
-    return row
-
-
 def carton(shape: Shape, rng: Generator) -> np.ndarray:
     """A printed box: panels, marks and shapes."""
     side = grey_levels(rng.uniform(60, 200) + 10.0 * clouds(shape, rng))

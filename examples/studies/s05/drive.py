@@ -5,15 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from examples.studies.feature_cache import CachedSequence, cache_features
+from examples.studies.lab import LabDrive, TexturedLab
+from examples.studies.wheel_odometry import write_wheel_odometry
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import open_stereo
 from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
 FOCAL, BASELINE_M = 0.78125, 0.12
-"""Focal length as a fraction of the image's width: that of `rbpf simulate lab`."""
+"""Focal length as a fraction of the image's width: that of `examples/studies/lab.py`."""
 
 NOISE_STD = 5.0
 """Grey levels. With the other defaults of the simulator as many features agree from pair to pair as in a real room."""
@@ -80,6 +81,7 @@ def measured_drive(
         simulate_images(
             world, imaging, rig, setting.images, setting.seed, lambda done, total: told("rendered", done, total)
         )
+        write_wheel_odometry(setting.images, world.wheels(setting.seed))
     sequence = open_stereo(setting.images)
     if len(sequence) < setting.frames:
         have = f"{setting.images} has {len(sequence)} pairs, {setting.frames} are asked for"

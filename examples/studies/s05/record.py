@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from examples.studies.wheel_odometry import read_wheel_odometry
 from rbpf.lie import SE3
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import align
 from rbpf.runs.truth import poses_at
-from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.systems.stereo.landmarks import DescriptorLandmarks
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import Tracked

@@ -5,6 +5,8 @@ shelves, tables, cabinets and cartons along the walls, tables in the middle, pos
 so that what is hidden is known exactly.
 
 The world's z axis points up; x runs along the longer side from the corner of the first room, the floor is z = 0.
+
+    python -m examples.studies.lab --out LAB --every 50 --width 320 --height 240
 """
 
 from collections.abc import Sequence
@@ -12,10 +14,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+import tyro
 
+from examples.studies.wheel_odometry import WheelOdometry, write_wheel_odometry
+from rbpf.cli.options import RealPositive, WholeCount
+from rbpf.cli.simulating import RenderOptions, render
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.ranges import MOST, Count, NotNegative, Positive, Range, Ranged, check_ranges
+from rbpf.ranges import MOST, Count, Fraction, NotNegative, Positive, Range, Ranged, check_ranges
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdometer, along_corners
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
@@ -217,6 +223,22 @@ def _shelf(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
         _row(lab, wall, inner, deep, low, top - BOARD_M)
 
 
+def spines(shape: textures.Shape, rng: np.random.Generator) -> np.ndarray:
+    """Backs of books that stand side by side, each with bands and a title."""
+    row = textures.grey_levels(60.0 + 6.0 * textures.clouds(shape, rng))
+    column = 0
+    while column < shape[1]:
+        wide = int(rng.integers(6, 19))
+        top = int(rng.uniform(0.0, 0.25) * shape[0])
+        back = row[top:, column : column + wide]
+        back[...] = textures.grey_levels(rng.uniform(40, 220) + 5.0 * rng.standard_normal((1, back.shape[1])))
+        for place, high in zip(rng.uniform(0.05, 0.9, 3), rng.uniform(0.01, 0.12, 3), strict=True):
+            start = int(place * len(back))
+            back[start : start + 1 + int(high * len(back)), 1:-1] = rng.uniform(20, 235)
+        column += wide + int(rng.integers(0, 2))
+    return row
+
+
 def _row(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, low: float, top: float) -> None:
     """Books and boxes side by side on a board, with gaps."""
     place = along[0] + lab.uniform(0.0, 0.1)
@@ -225,7 +247,7 @@ def _row(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, l
         books = lab.rng.random() < 0.5
         high = min(lab.uniform(0.6, 0.95) * (top - low), 0.33 if books else 0.45)
         front = deep - lab.uniform(0.01, 0.08)
-        paint = textures.spines if books else textures.carton
+        paint = spines if books else textures.carton
         lab.add(wall.box((place, place + wide), (BACK_M, front), (low, low + high)), paint, textures.carton)
         place += wide + lab.uniform(0.01, 0.2)
 
@@ -359,20 +381,52 @@ class TexturedLab(Ranged):
     contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
-        """Draws the furniture, the textures and the odometer's slip; the drive is always the same.
+        """Draws the furniture and the textures; the drive is always the same.
 
         A shorter drive leaves all that is drawn as it is.
         """
-        slip = rng.spawn(1)[0]
         lab = furnished(rng)
         rectangles = []
         for surface, coarse in [*shell(), *((surface, 1.0) for surface in lab.surfaces)]:
             furniture = Furniture(rng, coarse * self.texel_m, self.contrast)
             furniture.sheet(surface.corner, surface.across, surface.down, surface.paint)
             rectangles += furniture.rectangles
-        images, travelled = self.drive.images, self.drive.travelled()
-        path = world_from_camera(travelled.world_from_robot)[images]
-        stamps = stamps_ns(int(images[-1]) + 1, RATE_HZ)
-        # The wheels are read in every frame of the trajectory, whether that becomes an image or not.
-        odometry = WheelOdometer().measure(travelled, stamps, ROBOT_FROM_CAMERA, slip)
-        return TexturedScene("lab", stamps[images], path, rectangles, odometry=odometry)
+        images = self.drive.images
+        path = world_from_camera(self.drive.travelled().world_from_robot)[images]
+        return TexturedScene("lab", stamps_ns(int(images[-1]) + 1, RATE_HZ)[images], path, rectangles)
+
+    def wheels(self, seed: int) -> WheelOdometry:
+        """What the wheels say in every frame of the trajectory, whether that becomes an image or not."""
+        slip, travelled = np.random.default_rng(seed).spawn(1)[0], self.drive.travelled()
+        stamps = stamps_ns(len(travelled.way_m), RATE_HZ)
+        return WheelOdometry(stamps, *WheelOdometer().measure(travelled, slip), ROBOT_FROM_CAMERA)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderLab(RenderOptions):
+    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
+
+    focal_fraction = 0.78125
+    #: a tour of 4,000 images over 68 m through both rooms and back, or 600 images on which the robot twice looks away
+    #: for 5 s and back.
+    trajectory: Literal["tour", "turn_back"] = "tour"
+    frames: WholeCount = None  #: only so many images, the first; by default all.
+    every: Count = 1  #: only each so many-th frame becomes an image.
+    focal_px: RealPositive = None  #: focal length, px; by default 0.78125 of the width, 500 px at 640.
+    #: of a second camera to the right, m; None or nothing for none.
+    baseline_m: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = 0.12
+    noise_std: NotNegative = 8.0  #: of the sensor, grey levels.
+    blur_s: NotNegative = 0.0  #: the shutter is open this long, s.
+    exposure_drift: Fraction = 0.0  #: greatest change of the exposure, as a fraction.
+    vignetting: Fraction = 0.0  #: fraction of the light that is missing in the corners.
+    texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are drawn sooner.
+
+    def __call__(self) -> None:
+        check_ranges(self)
+        world = TexturedLab(LabDrive(self.trajectory, self.frames, self.every), self.texel_m, self.contrast)
+        render(world, self)
+        write_wheel_odometry(self.out, world.wheels(self.seed))
+
+
+if __name__ == "__main__":
+    tyro.cli(RenderLab)()

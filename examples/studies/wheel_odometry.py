@@ -21,8 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.lie import SE2, SE3
+from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers.text import read_stamped
 from rbpf.sensors.readers.yaml_files import read_yaml
+from rbpf.validation.simulation.paths import dead_reckoning
 
 NAME, MOUNT = "odometry.csv", "odometry.yaml"
 KIND = "the readings of a robot's wheels"
@@ -45,10 +47,7 @@ class WheelOdometry:
 
     def world_from_robot(self) -> np.ndarray:
         """(T, 3) dead reckoning: elements of SE(2), the first the identity."""
-        poses = np.zeros((len(self.stamps_ns), 3))
-        for k, step in enumerate(self.delta):
-            poses[k + 1] = SE2.compose(poses[k], step)
-        return poses
+        return dead_reckoning(self.delta)
 
     def world_from_camera(self, start: np.ndarray) -> np.ndarray:
         """(T, 7) dead reckoning of the camera in space, from its first pose (7,)."""
@@ -83,3 +82,14 @@ def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
     if abs(np.linalg.norm(pose[:4]) - 1.0) > UNIT:
         raise mount.error("expected robot_from_camera to begin with a unit quaternion")
     return WheelOdometry(rows.stamps_ns, delta, std, np.asarray(SE3.normalise(pose)))
+
+
+def write_wheel_odometry(folder: Path, odometry: WheelOdometry) -> None:
+    """odometry.csv and odometry.yaml, as described above."""
+    table = np.roll(np.hstack([odometry.delta, odometry.std]).reshape(-1, 2, 3), -1, axis=2).reshape(-1, 6)
+    rows = [[0.0] * 6, *table.tolist()]
+    numbers = [[f"{x:.9g}" for x in row] for row in rows]
+    header = ["#stamp_ns", *MOTION, *SIGMA]
+    stamped = zip(odometry.stamps_ns.tolist(), numbers, strict=True)
+    write_csv(folder / NAME, header, ([stamp, *row] for stamp, row in stamped))
+    write_text(folder / MOUNT, f"robot_from_camera: {odometry.robot_from_camera.tolist()}\n")
