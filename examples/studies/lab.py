@@ -16,6 +16,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import tyro
 
+from examples.studies.drives import Drive, Move, Travelled, along_corners
 from examples.studies.wheel_odometry import WheelOdometry, write_wheel_odometry
 from rbpf.cli.options import RealPositive, WholeCount
 from rbpf.cli.simulating import RenderOptions, render
@@ -23,7 +24,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.ranges import MOST, Count, Fraction, NotNegative, Positive, Range, Ranged, check_ranges
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdometer, along_corners
+from rbpf.validation.simulation.laser import WheelOdometer
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
 from rbpf.validation.simulation.textures import Paint
 
@@ -399,12 +400,14 @@ class TexturedLab(Ranged):
         """What the wheels say in every frame of the trajectory, whether that becomes an image or not."""
         slip, travelled = np.random.default_rng(seed).spawn(1)[0], self.drive.travelled()
         stamps = stamps_ns(len(travelled.way_m), RATE_HZ)
-        return WheelOdometry(stamps, *WheelOdometer().measure(travelled, slip), ROBOT_FROM_CAMERA)
+        return WheelOdometry(
+            stamps, *WheelOdometer().measure(travelled.way_m, travelled.heading_rad, slip), ROBOT_FROM_CAMERA
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderLab(RenderOptions):
-    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
+    """What is rendered."""
 
     focal_fraction = 0.78125
     #: a tour of 4,000 images over 68 m through both rooms and back, or 600 images on which the robot twice looks away
@@ -421,12 +424,15 @@ class RenderLab(RenderOptions):
     vignetting: Fraction = 0.0  #: fraction of the light that is missing in the corners.
     texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are drawn sooner.
 
-    def __call__(self) -> None:
-        check_ranges(self)
-        world = TexturedLab(LabDrive(self.trajectory, self.frames, self.every), self.texel_m, self.contrast)
-        render(world, self)
-        write_wheel_odometry(self.out, world.wheels(self.seed))
+
+def main(options: Annotated[RenderLab, tyro.conf.arg(name="")]) -> None:
+    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
+    check_ranges(options)
+    drive = LabDrive(options.trajectory, options.frames, options.every)
+    world = TexturedLab(drive, options.texel_m, options.contrast)
+    render(world, options)
+    write_wheel_odometry(options.out, world.wheels(options.seed))
 
 
 if __name__ == "__main__":
-    tyro.cli(RenderLab)()
+    tyro.cli(main)

@@ -24,7 +24,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers.text import read_stamped
 from rbpf.sensors.readers.yaml_files import read_yaml
-from rbpf.validation.simulation.paths import dead_reckoning
+from rbpf.validation.simulation.laser import dead_reckoning
 
 NAME, MOUNT = "odometry.csv", "odometry.yaml"
 KIND = "the readings of a robot's wheels"

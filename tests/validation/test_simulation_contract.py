@@ -21,8 +21,8 @@ from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.laser import LaserWorld
-from rbpf.validation.simulation.paths import HandHeld, WheelOdometer
+from rbpf.validation.simulation.laser import LaserWorld, WheelOdometer
+from rbpf.validation.simulation.paths import HandHeld
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.robot import RobotWorld
 from rbpf.validation.simulation.textured_scene import ImageWorld, Rectangle, TexturedScene, stamps_ns

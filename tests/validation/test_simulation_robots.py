@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import tyro
 
-from examples.studies.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, RenderLab, TexturedLab, world_from_camera
+from examples.studies.drives import Drive, along_corners
+from examples.studies.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, TexturedLab, main, world_from_camera
 from examples.studies.wheel_odometry import WheelOdometry, read_wheel_odometry, write_wheel_odometry
 from rbpf.lie import SE2, SE3
 from rbpf.runs.trajectory import in_space, read_tum
@@ -16,8 +17,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, open_stereo, read_known_points, read_laser_log
 from rbpf.validation.metrics.relations import read_relations, relation_errors
 from rbpf.validation.simulation import laser
-from rbpf.validation.simulation.laser import LaserWorld, floor_plan, simulate_laser
-from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners
+from rbpf.validation.simulation.laser import LaserWorld, WheelOdometer, floor_plan, simulate_laser
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import TexturedScene, cast, stamps_ns
 
@@ -145,7 +145,7 @@ def measured(odometer: WheelOdometer, seed: int = 0, frames: int | None = None) 
     travelled = TOUR if frames is None else LabDrive(frames=frames).travelled()
     rng = np.random.default_rng(seed)
     stamps_ns = STAMPS[: len(travelled.way_m)]
-    return WheelOdometry(stamps_ns, *odometer.measure(travelled, rng), ROBOT_FROM_CAMERA)
+    return WheelOdometry(stamps_ns, *odometer.measure(travelled.way_m, travelled.heading_rad, rng), ROBOT_FROM_CAMERA)
 
 
 def test_without_errors_dead_reckoning_is_the_path() -> None:
@@ -188,7 +188,7 @@ SMALL = ["--width", "96", "--height", "72", "--texel-m", "0.05"]
 
 
 def render_lab(out: Path, *arguments: str) -> None:
-    tyro.cli(RenderLab, args=["--out", str(out), *SMALL, *arguments])()
+    tyro.cli(main, args=["--out", str(out), *SMALL, *arguments])
 
 
 @pytest.mark.slow

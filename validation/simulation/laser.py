@@ -15,7 +15,7 @@ from rbpf.lie import SE2, Array
 from rbpf.ranges import MOST, NotNegative, Positive, Range, Ranged, Rate
 from rbpf.runs.files import write_text
 from rbpf.runs.trajectory import Trajectory, write_tum
-from rbpf.validation.simulation.paths import Drive, WheelOdometer, along_corners, dead_reckoning
+from rbpf.validation.simulation.paths import eased
 
 #: Corners of the walls around the corridor, counterclockwise [m].
 OUTER = ((0.0, 0.0), (16.0, 0.0), (16.0, 12.0), (0.0, 12.0))
@@ -36,6 +36,55 @@ NICHES = (
 LANE_M, BEND_M, SPEED_M_S, RAMP_S = 1.0, 0.7, 0.5, 1.0
 NO_RETURN_M = 81.83  #: What SICK's scanners write.
 START_S, READINGS = 1_000_000_000, 10
+
+
+Error = Annotated[float, Range(gt=-0.5, lt=0.5)]  #: As a fraction of what is right.
+
+
+@dataclass(frozen=True)
+class WheelOdometer(Ranged):
+    """Two driven wheels side by side, whose turns are counted.
+
+    Wrong diameters and a wrong distance between the wheels err the same way all the time (J. Borenstein, L. Feng,
+    Measurement and correction of systematic odometry errors in mobile robots, 1996); slip is a random walk whose
+    variance grows with the way of each wheel (K. S. Chong, L. Kleeman, Accurate odometry and error modelling for a
+    mobile robot, 1997).
+    """
+
+    wheelbase_m: Positive = 0.4  #: true distance between the wheels.
+    scale: Error = 0.01  #: both wheels report so much more than they went, as a fraction.
+    #: the right one reports so much more than the left one, as a fraction: a drift of the heading.
+    inequality: Error = 0.002
+    #: the robot takes the distance between its wheels for so much greater, as a fraction.
+    wheelbase_error: Error = 0.02
+    #: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
+    slip_m: NotNegative = 0.004
+
+    def measure(self, way_m: Array, heading_rad: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Readings of a robot that drove so far (T,) and turned so far (T,); more of them leave the first as they are.
+
+        Returns:
+            Motions (T - 1, 3) from each time to the next, elements of SE(2), and standard deviations (T - 1, 3) of what is
+            random in their theta [rad], x and y [m].
+        """
+        side = 0.5 * self.wheelbase_m * np.array([-1.0, 1.0])
+        way = np.diff(way_m[:, None] + heading_rad[:, None] * side, axis=0)
+        counted = way * (1.0 + self.scale + 0.5 * self.inequality * np.array([-1.0, 1.0]))
+        counted += self.slip_m * np.sqrt(np.abs(way)) * rng.standard_normal(way.shape)
+        base = self.wheelbase_m * (1.0 + self.wheelbase_error)
+        forward, turn = counted.mean(axis=1), (counted[:, 1] - counted[:, 0]) / base
+        delta = SE2.exp(np.stack([turn, forward, np.zeros_like(turn)], axis=-1))
+        spread = self.slip_m * np.sqrt(np.abs(counted).sum(axis=1))
+        std = np.stack([spread / base, 0.5 * spread, 0.5 * np.abs(forward) * spread / base], axis=-1)
+        return delta, std
+
+
+def dead_reckoning(delta: np.ndarray) -> np.ndarray:
+    """(T, 3) poses by motions (T - 1, 3), elements of SE(2); the first is the identity."""
+    poses = np.zeros((len(delta) + 1, 3))
+    for k, step in enumerate(delta):
+        poses[k + 1] = SE2.compose(poses[k], step)
+    return poses
 
 
 @dataclass(frozen=True)
@@ -89,18 +138,25 @@ def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
     """Writes a log into a folder, created where it does not exist; files of that name are replaced."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    # Round the middle of the corridor, from the middle of its first side.
-    (left, low), (right, high) = np.array(OUTER[0]) + LANE_M, np.array(OUTER[2]) - LANE_M
-    middle = (0.5 * (left + right), low)
-    lap = [(right, low), (right, high), (left, high), (left, low)]
-    start, moves = along_corners([middle, *lap * world.laps, middle], BEND_M)
-    seconds = sum(move.length_m for move in moves) / SPEED_M_S
+    # Round the middle of the corridor, from the middle of its first side: straights and quarter turns, each a constant twist.
+    width, depth = np.array(OUTER[2]) - 2.0 * LANE_M
+    sides = np.array([0.5 * width, *[depth, width] * (2 * world.laps - 1), depth, 0.5 * width])
+    length = np.full(2 * sides.size - 1, 0.5 * np.pi * BEND_M)
+    length[::2] = sides - BEND_M * np.array([1.0, *[2.0] * (sides.size - 2), 1.0])
+    turn = np.where(np.arange(length.size) % 2, 0.5 * np.pi, 0.0)
+    twist = np.stack([turn, length, np.zeros_like(turn)], axis=-1)
+    reached, turned = np.append(0.0, np.cumsum(length)), np.append(0.0, np.cumsum(turn))
+    starts = SE2.compose(np.array([0.0, 0.5 * OUTER[1][0], LANE_M]), dead_reckoning(SE2.exp(twist)))
     # The wheels are read more often than the scanner.
-    times = np.linspace(0.0, seconds, READINGS * (world.scans - 1) + 1)
-    driven = Drive(start, moves, seconds, BEND_M, RAMP_S)(times)
+    times = np.linspace(0.0, reached[-1] / SPEED_M_S + 0.5 * RAMP_S, READINGS * (world.scans - 1) + 1)
+    way_m = SPEED_M_S * eased(times, RAMP_S)
+    part = np.searchsorted(reached[1:-1], way_m, side="right")
+    fraction = (way_m - reached[part]) / length[part]
+    truth = SE2.compose(starts[part], SE2.exp(fraction[:, None] * twist[part]))
     stamps_ns = START_S * 10**9 + np.rint(times * 1e6).astype(np.int64) * 1000
-    odometry = dead_reckoning(world.odometer.measure(driven, rng)[0])[::READINGS]
-    truth, way_m, stamps_ns = driven.world_from_robot[::READINGS], driven.way_m[::READINGS], stamps_ns[::READINGS]
+    readings, _ = world.odometer.measure(way_m, turned[part] + fraction * turn[part], rng)
+    odometry = dead_reckoning(readings)[::READINGS]
+    truth, way_m, stamps_ns = truth[::READINGS], way_m[::READINGS], stamps_ns[::READINGS]
     # Scans: noise, then what gives no return.
     mount, angles, walls = np.array([0.0, world.scanner_ahead_m, 0.0]), np.radians(np.arange(-90.0, 91.0)), floor_plan()
     ranges = np.stack([cast(walls, SE2.compose(pose, mount), angles) for pose in truth])
