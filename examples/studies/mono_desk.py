@@ -24,6 +24,7 @@ from rbpf.core.diagnostics import Band, chi_square_band, chi_square_quantile
 from rbpf.lie import SE3
 from rbpf.runs.files import write_table
 from rbpf.runs.recordings import filter_features as run
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
@@ -47,7 +48,7 @@ def solve_and_filter(job: Job) -> tuple[float, list[tuple[float, np.ndarray]]]:
     """Error of the batch [m], and errors and NEES (T,) of the filters."""
     log = simulate_features(DeskWorld(frames=job.frames), Measuring(), MONO, job.seed)
     truth = log.truth.poses
-    batch = solve_features(log, marginals=False).world_from_body
+    batch = solve_features(log, InitialEstimate(truth, {}), marginals=False).world_from_body
 
     def rmse(path: np.ndarray) -> float:
         return float(np.sqrt(np.square(path[:, 4:] - truth[:, 4:]).sum(axis=1).mean()))

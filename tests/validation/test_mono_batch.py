@@ -10,6 +10,7 @@ from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_f
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam.batch_problem import Optimum, connected_frames, solve_problem
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.observations import HUBER
@@ -51,7 +52,7 @@ def renamed(frame: FeatureFrame, offset: int) -> FeatureFrame:
 def test_a_whole_log_is_the_plain_solution(log):
     batch = adjusted(log, rough(log))
     np.testing.assert_array_equal(batch.steps, np.arange(FRAMES))
-    plain = solve_features(log, robust=HUBER, marginals=False)
+    plain = solve_features(log, InitialEstimate(known(log.truth).poses, {}), robust=HUBER, marginals=False)
     assert np.abs(SE3.local(plain.world_from_body, batch.estimate.world_from_body)).max() < 1e-4
     error = batch.estimate.trajectory.positions - SE3.translation(known(log.truth).poses)
     assert np.sqrt(np.square(error).sum(axis=1).mean()) < 0.02

@@ -70,12 +70,12 @@ def solve_problem(
 ) -> Optimum:
     """GTSAM's optimum: of a robot's run, or of all frames of a camera's that landmarks connect with the first one.
 
-    A camera's adjustment begins at `start` (T, E), poses of the filter, a robot's at its odometry. With `twice` it
-    begins at the known points alone, too, and the better optimum is taken, so that it does not hang on where the filter
-    went; not needed near the optimum. `robust` is Huber's threshold in standard deviations; None takes all as Gaussian,
-    as the filter does. After `most` iterations, by default as many as `WORK` allows, a camera's is given up;
-    `on_iteration` is called with the number of each and the error before it. Without `marginals` the optimum has no
-    covariances of poses, NaN of landmarks.
+    A camera's adjustment begins at `start` (T, E), poses of the filter, a robot's at its odometry. With `twice`, where
+    points are known, it begins at these and the filter's motions, too, and the better optimum is taken, so that it does
+    not hang on where the filter went; not needed near the optimum. `robust` is Huber's threshold in standard deviations;
+    None takes all as Gaussian, as the filter does. After `most` iterations, by default as many as `WORK` allows, a
+    camera's is given up; `on_iteration` is called with the number of each and the error before it. Without `marginals`
+    the optimum has no covariances of poses, NaN of landmarks.
 
     Raises InputError: the measurements do not determine everything, too few frames are connected, it takes too many
     iterations, or it does not converge.
@@ -103,9 +103,9 @@ def solve_problem(
     # A start that leads nowhere is passed over, if another one does not.
     solutions, problems = [], []
     first = InitialEstimate(start[frames], {})
-    for near in [first, None] if twice and log.known is not None else [first]:
+    for from_known in [False, True] if twice and log.known is not None else [False]:
         try:
-            solutions.append(solve(near, marginals=False))
+            solutions.append(solve(first, from_known=from_known, marginals=False))
         except InputError as error:
             problems.append(error)
     if not solutions:

@@ -228,14 +228,14 @@ def spread(table: ObservationTable, path: Array, points: Array) -> Array:
     return np.asarray(np.linalg.inv(info))
 
 
-def misfit(table: ObservationTable, path: Array, points: Array, cap: float = np.inf) -> Array:
-    """Huber's loss of each landmark's observations (L,), each of which counts for no more than the cap."""
+def misfit(table: ObservationTable, path: Array, points: Array) -> Array:
+    """Huber's loss of each landmark's observations (L,)."""
     norm = sigmas(table, path, points)
     loss = np.where(norm < HUBER, 0.5 * norm**2, HUBER * (norm - 0.5 * HUBER))
-    return np.bincount(table.index, weights=np.minimum(loss, cap), minlength=len(points)).astype(float)
+    return np.bincount(table.index, weights=loss, minlength=len(points)).astype(float)
 
 
-def parallax(table: ObservationTable, path: Array, points: Array, cap: float = np.inf) -> Array:
+def parallax(table: ObservationTable, path: Array, points: Array) -> Array:
     """By how many standard deviations the inverse distance of each landmark (L,) differs from zero.
 
     It compares how well the observations fit the point and its direction at infinity, and so sees through a point that
@@ -246,7 +246,7 @@ def parallax(table: ObservationTable, path: Array, points: Array, cap: float = n
     reach = np.linalg.norm(SE3.translation(path) - SE3.translation(path[0]), axis=1).max()
     reach = np.maximum(reach, np.linalg.norm(points - origin, axis=1))
     far = origin + (_FAR * reach / np.linalg.norm(mean, axis=1))[:, None] * mean
-    return np.sqrt(2 * np.maximum(misfit(table, path, far, cap) - misfit(table, path, points, cap), 0.0))
+    return np.sqrt(2 * np.maximum(misfit(table, path, far) - misfit(table, path, points), 0.0))
 
 
 def _directions(poses: Array, rays: Array) -> Array:
