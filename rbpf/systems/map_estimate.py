@@ -47,32 +47,25 @@ class MapEstimate:
 
 
 def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstimate:
-    """Moments of every landmark that exists in most of the weight, relative to the start where it is `anchored`."""
+    """Moments of every landmark, relative to the start where it is `anchored`."""
     belief, dim = filter_.belief(), 2 if isinstance(filter_.space, SE2Group) else 3
-    landmark_map, weights = belief.map, belief.weights
+    landmark_map = belief.map
     if isinstance(landmark_map, JointMap):
         return MapEstimate(*landmark_map.landmarks(filter_.particles))
     ids = landmark_map.ids
-    ids = ids[[landmark_map.existing(landmark_id, weights).sum() > 0.5 for landmark_id in ids.tolist()]]
-    if anchored is None:
+    if anchored is None or not ids.size:
         mean, cov = belief.moments(ids)
     else:
-        moments = []
-        for row, landmark_id in enumerate(ids.tolist()):
-            held = landmark_map.existing(landmark_id, weights)
-            points = relative_points(filter_.space, anchored, landmark_map.read(ids[row : row + 1]))
-            moments.append(gaussian.mixture_moments(held / held.sum(), *points))
-        mean, cov = np.array([mean for mean, _ in moments]), np.array([cov for _, cov in moments])
+        points = relative_points(filter_.space, anchored, landmark_map.read(ids))
+        mean, cov = gaussian.mixture_moments(belief.weights, *points)
     return MapEstimate(ids, mean.reshape(-1, dim), cov.reshape(-1, dim, dim))
 
 
 def relative_points(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:
-    """Landmark positions (N, D) relative to the start, and their covariance with the start's."""
-    model = RelativePosition(space)
-    start = anchored.mean[:, None]
+    """Positions (N, K, D) of landmarks relative to the start, and their covariances with the start's."""
+    model, start = RelativePosition(space), anchored.mean[:, None]
     jac = model.jacobians(start, records.mean)
     assert jac.state is not None and jac.landmark is not None
-    moved = jac.state[:, 0] @ anchored.factor
-    turned = jac.landmark[:, 0]
-    cov = turned @ records.cov[:, 0] @ np.swapaxes(turned, -1, -2) + moved @ np.swapaxes(moved, -1, -2)
-    return model.predict(start, records.mean)[:, 0], cov
+    moved = jac.state @ anchored.factor[:, None]
+    turned = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
+    return model.predict(start, records.mean), turned + moved @ np.swapaxes(moved, -1, -2)

@@ -13,7 +13,7 @@ from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
-from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, optimum
+from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, gathered, optimum
 from rbpf.systems.mono.start.unknown import UnknownStart
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
@@ -52,13 +52,13 @@ def test_a_flat_scene_is_not_bent(plane):
 @pytest.fixture
 def adjusted(monkeypatch) -> list[int]:
     """Numbers of frames of each adjustment, those that found too little included."""
-    counts, original = [], UnknownStart._adjusted
+    counts, original = [], gathered
 
-    def counted(self, filter_):
-        counts.append(len(self.first.seen))
-        return original(self, filter_)
+    def counted(first, *arguments):
+        counts.append(len(first.seen))
+        return original(first, *arguments)
 
-    monkeypatch.setattr(UnknownStart, "_adjusted", counted)
+    monkeypatch.setattr("rbpf.systems.mono.start.unknown.gathered", counted)
     return counts
 
 

@@ -183,8 +183,8 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
             extent = unknown_depth.extent(belief.read_mode([landmark_id]), RAY_SIGMAS, MIN_RHO)[0, 0]
             ends = SE3.inverse_transform(world.mean[mode], extent[:, :3] / extent[:, 3:])
             records = unknown_depth.as_points(records)
-        moments = gaussian.mixture_moments(weights, *relative_points(SE3, world, records))
-        rows.append((landmark_id, *moments, ends))
+        (mean,), (cov,) = gaussian.mixture_moments(weights, *relative_points(SE3, world, records))
+        rows.append((landmark_id, mean, cov, ends))
     names = np.array([row[0] for row in rows], dtype=np.int64)
     order = np.argsort(names, kind="stable")
     means, covs, spans = (np.array([row[k] for row in rows]) for k in (1, 2, 3))

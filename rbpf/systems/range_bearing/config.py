@@ -8,7 +8,7 @@ import numpy as np
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.core.models import Likelihood
-from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged, Seed, check_ranges
+from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged, Seed
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
@@ -42,7 +42,7 @@ class AssociationConfig(Ranged):
 
 
 @dataclass(frozen=True)
-class RangeBearingConfig:
+class RangeBearingConfig(Ranged):
     """A run of range-bearing SLAM."""
 
     particles: Count = 100  #: number of particles.
@@ -75,9 +75,6 @@ class RangeBearingConfig:
     #: chosen among by the first wrong one.
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
     unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def kept_map(self) -> tuple[Literal["joint", "particles"], str]:
         """The map of a run, and in one sentence why it is this one."""

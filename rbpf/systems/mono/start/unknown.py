@@ -21,7 +21,7 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.start.adjustment import MIN_FRAMES, Adjusted, FirstFrames, Optimum, between, gathered, optimum
+from rbpf.systems.mono.start.adjustment import MIN_FRAMES, Adjusted, FirstFrames, between, gathered, optimum
 from rbpf.systems.system import Revision
 
 DISCONNECTED = (
@@ -70,14 +70,20 @@ class UnknownStart:
         if self.over or count < self._next or not usable:
             return None, None
         self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
-        best, self.over = self._adjusted(filter_)
+        steps, names, seen, start = gathered(first, self.features, filter_.belief(), self.config.start.max_frames)
+        if steps.size < MIN_FRAMES:
+            return None, None
+        best = optimum(seen, self.config, start) if seen.is_connected() else None
         if best is None:
-            return None, DISCONNECTED if self.over else None
+            self.over = True
+            return None, DISCONNECTED
+        relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
+        relative = relative[np.isin(names, first.seen[-1].landmarks)]
+        self.over = bool(relative.size > 0 and np.median(relative) < self.config.start.depth_std_ratio)
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
-        steps, optimum_ = best
         stamps = np.array(first.stamps_ns)
-        drawn = optimum_.paths(filter_.n, filter_.rng)
+        drawn = best.paths(filter_.n, filter_.rng)
         paths = between(stamps[steps], drawn, stamps)
         filter_ = self._along(paths, set(steps.tolist()), filter_, first.seen)
         equal = uniform_log_weights(paths.shape[1])
@@ -95,23 +101,6 @@ class UnknownStart:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         over, self._next = read_one(arrays, "start/progress", integers(2, least=0)).tolist()
         self.over = bool(over)
-
-    def _adjusted(self, filter_: Filter) -> tuple[tuple[np.ndarray, Optimum] | None, bool]:
-        """Numbers of the frames that took part, and the optimum, or None; and whether the start is over."""
-        first, config = self.first, self.config
-        steps, names, seen, start = gathered(first, self.features, filter_.belief(), config.start.max_frames)
-        if steps.size < MIN_FRAMES:
-            return None, False
-        if not seen.is_connected():
-            return None, True
-
-        best = optimum(seen, config, start)
-        if best is None:
-            return None, True
-        relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
-        relative = relative[np.isin(names, first.seen[-1].landmarks)]
-        depths_known = relative.size > 0 and np.median(relative) < config.start.depth_std_ratio
-        return (steps, best), bool(depths_known)
 
     def _along(self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
