@@ -9,62 +9,17 @@ from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 
-#: Points that may each have an error of their own; a record's covariance grows with the square of their number.
-MOST = 12
+MOST = 30  #: Points of one; a record's covariance grows with the square of their number.
 #: Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors, of the points' means
 #: over the particles.
 ROUNDS = 20
 SETTLED = 1e-10  #: Length of the last step, radians and metres.
-LEAST = 1e-12  #: Variance, m², that keeps the fit defined where some of the points are exact and others are not.
+LEAST = 1e-12  #: Variance, m², of exact points, which keeps the fit defined.
 
 
 @final
 class Constellation(Landmark):
-    """A rigid group of M exactly known points; the frame that they are given in is estimated.
-
-    The record's mean is ξ (6,): the frame is world_from_group = G Exp(ξ), with G the record's constant (7,).
-
-    Args:
-        points: (M, 3) in the group's frame, metres.
-    """
-
-    constants = 7
-    dim = 6
-
-    def __init__(self, points: np.ndarray) -> None:
-        self.points = points.tolist()
-
-    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        assert const is not None
-        origin = SE3.translation(SE3.retract(const, mean))
-        return np.concatenate([origin, np.ones((*origin.shape[:-1], 1))], axis=-1)
-
-    def started(self, n: int, world_from_group: np.ndarray, cov: np.ndarray) -> Records:
-        """First records (n, 1, …): the frame at world_from_group (7,), covariance (6, 6) in the right chart there."""
-        return Records(
-            np.zeros((n, 1, 6)), np.broadcast_to(cov, (n, 1, 6, 6)), np.broadcast_to(world_from_group, (n, 1, 7))
-        )
-
-    def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        """world_from_group (N, 7), a factor (N, 6, 6) of its covariance in the right chart there; of one landmark."""
-        assert records.const is not None
-        mean = records.mean[:, 0]
-        chart = SE3.right_jacobian(mean)
-        return SE3.retract(records.const[:, 0], mean), chart @ gaussian.psd_factor(records.cov[:, 0])
-
-    def in_world(self, records: Records) -> np.ndarray:
-        """The points (N, M, 3) of one landmark."""
-        return SE3.transform(self.frame(records)[0][:, None], np.asarray(self.points))
-
-    def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        """The points in their own frame: means (N, M, 3) and covariances (N, M, 3, 3)."""
-        shape = (records.mean.shape[0], len(self.points), 3)
-        return np.broadcast_to(np.asarray(self.points), shape), np.zeros((*shape, 3))
-
-
-@final
-class UncertainConstellation(Landmark):
-    """M points, given in a frame of their own up to Gaussian errors; where they are in the world is estimated.
+    """M points, given in a frame of their own, exactly or up to Gaussian errors; where they are in the world is estimated.
 
     The record's mean is (p_1, …, p_M), where the points are in the world, with their joint covariance: the shape that
     is given correlates them. What a camera measures is nearly linear in where the points are, however uncertain the
@@ -81,7 +36,9 @@ class UncertainConstellation(Landmark):
 
     def __init__(self, points: np.ndarray, cov_points: np.ndarray) -> None:
         if points.shape[0] > MOST:
-            raise InputError(f"{points.shape[0]} known points have errors: give at most {MOST}, or exact ones (σ = 0)")
+            raise InputError(
+                f"{points.shape[0]} known points are too many for one group: give {MOST}, or set known=points"
+            )
         self.points = points.tolist()
         self.dim = 3 * points.shape[0]
         self._info_points = np.linalg.inv(cov_points + LEAST * np.eye(3)).tolist()

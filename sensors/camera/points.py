@@ -231,99 +231,51 @@ def clamp_depth(direction: Array) -> Array:
     return np.concatenate([direction[..., :2], depth[..., None]], axis=-1)
 
 
-class PointsView(ObservationModel):
-    """The pixels of m points that one landmark holds together, one after the other: z (2m,).
+@final
+class MembersView(ObservationModel):
+    """The pixels of the points (p_1, p_2, …) of a `Constellation` at `places` (m,), one after the other: z (2m,).
 
     Where the state holds more than world_from_camera, the pose comes first.
     """
 
-    def __init__(self, camera: Pinhole, count: int) -> None:
+    def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
         self.camera = camera
-        self.dim = 2 * count
+        self.dim = 2 * places.size
+        self.places = places
+        self._point = CameraPoint(camera)
+        self._params = np.concatenate([camera.params, places])
 
-    @abstractmethod
-    def in_world(self, landmark: Array, const: Given) -> Array:
-        """The points (…, m, 3) in the world."""
-
-    @abstractmethod
-    def slopes(self, state: Array, landmark: Array, const: Given) -> tuple[Array, Array]:
-        """∂z/∂state (…, m, 2, d) and ∂z/∂landmark (…, m, 2, D) of each point."""
-
-    def in_camera(self, state: Array, landmark: Array, const: Given) -> Array:
+    def in_camera(self, state: Array, landmark: Array) -> Array:
         """The points (…, m, 3) in the camera's frame."""
-        return SE3.inverse_transform(state[..., None, :7], self.in_world(landmark, const))
+        return SE3.inverse_transform(state[..., None, :7], self.in_world(landmark))
 
     def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         """Every point by E06 (7)–(9)."""
         assert landmark is not None
-        px = self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
+        px = self.camera.project(clamp_depth(self.in_camera(state, landmark)))
         return px.reshape(*px.shape[:-2], self.dim)
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
-        """Those of each point, one below the other."""
+        """Those of a `CameraPoint`, one below the other; a pixel depends on its own point alone."""
         assert landmark is not None
-        by_state, by_landmark = self.slopes(state, landmark, const)
+        by_state, by_point, _ = self._point.jacobians(state[..., None, :], self.in_world(landmark))
+        assert by_state is not None and by_point is not None
+        by_landmark = np.zeros((*by_point.shape[:-1], landmark.shape[-1]))
+        for k, place in enumerate(self.places.tolist()):
+            by_landmark[..., k, :, 3 * place : 3 * place + 3] = by_point[..., k, :, :]
         shape = (*by_state.shape[:-3], self.dim)
         return Jacobians(by_state.reshape(*shape, -1), by_landmark.reshape(*shape, -1))
 
     def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
         """Whether all of its points are in the image."""
-        return np.asarray(self.camera.visible(self.in_camera(state, landmark, const)).all(axis=-1))
-
-
-@final
-class MembersView(PointsView):
-    """The pixels of the points (p_1, p_2, …) of an `UncertainConstellation` at `places` (m,), one after the other: z (2m,)."""
-
-    def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
-        super().__init__(camera, places.size)
-        self.places = places
-        self._point = CameraPoint(camera)
-        self._params = np.concatenate([camera.params, places])
-
-    def in_world(self, landmark: Array, const: Given) -> Array:
-        points = landmark.reshape(*landmark.shape[:-1], -1, 3)
-        return np.asarray(points[..., self.places, :])
-
-    def slopes(self, state: Array, landmark: Array, const: Given) -> tuple[Array, Array]:
-        """Those of a `CameraPoint`; a pixel depends on its own point alone."""
-        by_state, by_point, _ = self._point.jacobians(state[..., None, :], self.in_world(landmark, const))
-        assert by_state is not None and by_point is not None
-        by_landmark = np.zeros((*by_point.shape[:-1], landmark.shape[-1]))
-        for k, place in enumerate(self.places.tolist()):
-            by_landmark[..., k, :, 3 * place : 3 * place + 3] = by_point[..., k, :, :]
-        return by_state, by_landmark
+        return np.asarray(self.camera.visible(self.in_camera(state, landmark)).all(axis=-1))
 
     def kernel(self) -> FusedKernel | None:
         from rbpf.sensors.camera.kernels import members_view
 
         return FusedKernel(members_view, self._params)
 
-
-@final
-class ConstellationView(PointsView):
-    """The pixels of m exact points of a `Constellation`, `points` (m, 3) in the group's frame, one after the other: z (2m,).
-
-    The landmark is ξ with constant G: point m lies at G Exp(ξ) k_m.
-    """
-
-    def __init__(self, camera: Pinhole, points: Array) -> None:
-        super().__init__(camera, points.shape[0])
-        self.points = points
-
-    def in_world(self, landmark: Array, const: Given) -> Array:
-        assert const is not None
-        return SE3.transform(SE3.retract(const, landmark)[..., None, :], self.points)
-
-    def slopes(self, state: Array, landmark: Array, const: Given) -> tuple[Array, Array]:
-        """∂z/∂state = D [[c]× | −I]; ∂z/∂ξ = D R [−[k]× | I] J_r(ξ), with R = R_cᵀ R_G Exp(ξ)."""
-        assert const is not None
-        direction = clamp_depth(self.in_camera(state, landmark, const))
-        slope = self.camera.jacobian(direction)
-        by_state = np.zeros((*slope.shape[:-1], 6 + state.shape[-1] - 7))
-        by_state[..., :3], by_state[..., 3:6] = np.cross(slope, direction[..., None, :]), -slope
-        frame = SE3.retract(const, landmark)
-        turned = slope @ (np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ SE3.rotation(frame))[..., None, :, :]
-        # a·(ω × k) = −(a × k)·ω
-        by_frame = np.concatenate([-np.cross(turned, self.points[:, None, :]), turned], axis=-1)
-        return by_state, by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]
+    def in_world(self, landmark: Array, const: Given = None) -> Array:
+        """The points (…, m, 3) in the world."""
+        points = landmark.reshape(*landmark.shape[:-1], -1, 3)
+        return np.asarray(points[..., self.places, :])

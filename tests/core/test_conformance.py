@@ -28,7 +28,7 @@ from rbpf.core.models import (
 from rbpf.errors import InputError
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.lie import SE2, SE3, Euclidean, Product
-from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
@@ -176,8 +176,8 @@ SOUND: list[tuple[Any, Any, Example | None]] = [
         for camera in CAMERAS.values()
         for ray in (CameraRay, EpipolarRay)
     ),
-    *((landmark, SE3, None) for landmark in (InverseDepth(), Constellation(CORNERS))),
-    (UncertainConstellation(CORNERS, np.tile(1e-4 * np.eye(3), (4, 1, 1))), SE3, None),
+    *((landmark, SE3, None) for landmark in (InverseDepth(), Constellation(CORNERS, np.zeros((4, 3, 3))))),
+    (Constellation(CORNERS, np.tile(1e-4 * np.eye(3), (4, 1, 1))), SE3, None),
     (LandmarkMap(SE2), None, None),
     (KalmanSubstate(SE2, np.zeros(1), np.eye(1), moves=lambda dt: (np.eye(1), np.zeros(1), np.eye(1))), None, None),
     (Gaussian(), None, None),

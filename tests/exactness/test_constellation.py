@@ -1,4 +1,4 @@
-"""Known points, marginalised: the joint EKF of their frame, or of all of them, on a path that is known."""
+"""Known points, exact or uncertain, marginalised: the joint EKF of all of them on a path that is known."""
 
 import numpy as np
 import pytest
@@ -8,15 +8,14 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Observations, Records
 from rbpf.core.particles import Prior
 from rbpf.lie import SE3, skew
-from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.sensors.camera.points import ConstellationView, MembersView
+from rbpf.sensors.camera.points import MembersView
 from tests.exactness.models import Kalman
 from tests.sensors.camera_scenes import DISTORTED
 
 POINTS = np.random.default_rng(0).uniform([-0.5, -0.4, -0.3], [0.5, 0.4, 0.3], size=(4, 3))
 STD = 0.02
-COVS = np.tile(STD**2 * np.eye(3), (4, 1, 1))
 COV_FRAME = np.diag(np.repeat([0.02**2, 0.04**2], 3))
 NOISE_PX = 1.5
 SEEN = [np.array([0, 1, 2, 3]), np.array([3, 1]), np.array([2, 0, 1]), np.array([0])]
@@ -25,34 +24,30 @@ every_path = pytest.mark.parametrize("compiled", [True, False], ids=["compiled",
 
 
 class World:
-    """A camera moves past a group whose frame, or whose points, were drawn from their prior."""
+    """A camera moves past a group whose frame was drawn from its prior, and each of whose points, where they have errors."""
 
     def __init__(self, errors: bool, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        self.errors = errors
+        self.std = STD if errors else 0.0
         self.given = SE3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.2, 3.0]))
-        self.group = UncertainConstellation(POINTS, COVS) if errors else Constellation(POINTS)
+        self.group = Constellation(POINTS, np.tile(self.std**2 * np.eye(3), (4, 1, 1)))
         first = self.started(1)
         self.mean, self.cov = first.mean[0, 0], first.cov[0, 0]
         self.true = self.mean + gaussian.psd_factor(self.cov) @ rng.standard_normal(self.mean.size)
         steps = rng.normal(scale=[0.05, 0.05, 0.05, 0.2, 0.2, 0.2], size=(len(SEEN), 6))
         self.path = SE3.exp(steps)
-        self.views = [
-            MembersView(DISTORTED, seen) if errors else ConstellationView(DISTORTED, POINTS[seen]) for seen in SEEN
-        ]
+        self.views = [MembersView(DISTORTED, seen) for seen in SEEN]
         self.z = [
-            view.predict(pose, self.true, self.given) + NOISE_PX * rng.standard_normal(view.dim)
+            view.predict(pose, self.true) + NOISE_PX * rng.standard_normal(view.dim)
             for view, pose in zip(self.views, self.path, strict=True)
         ]
 
     def started(self, n: int) -> Records:
-        """Exact points by their frame; others where that frame puts them, with what frame and errors do to them."""
-        if not self.errors:
-            return self.group.started(n, self.given, COV_FRAME)
+        """Where the frame puts the points, with what frame and errors do to them."""
         turn = SE3.rotation(self.given)
         by_frame = np.concatenate([np.hstack([-turn @ skew(point), turn]) for point in POINTS])
         by_errors = np.kron(np.eye(4), turn)
-        cov = by_frame @ COV_FRAME @ by_frame.T + STD**2 * by_errors @ by_errors.T
+        cov = by_frame @ COV_FRAME @ by_frame.T + self.std**2 * by_errors @ by_errors.T
         return self.group.started(n, SE3.transform(self.given, POINTS), cov)
 
     def map(self, n: int, compiled: bool) -> LandmarkMap:
@@ -66,12 +61,11 @@ class World:
         return Observations(self.z[t][None], cov, self.views[t], ids=np.array([0]))
 
 
-def slope(view: ConstellationView, pose: np.ndarray, mean: np.ndarray, const: np.ndarray) -> np.ndarray:
+def slope(view: MembersView, pose: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Numeric derivative by the landmark."""
     step = 1e-6
     columns = [
-        view.predict(pose, mean + step * axis, const) - view.predict(pose, mean - step * axis, const)
-        for axis in np.eye(mean.size)
+        view.predict(pose, mean + step * axis) - view.predict(pose, mean - step * axis) for axis in np.eye(mean.size)
     ]
     return np.stack(columns, axis=-1) / (2 * step)
 
@@ -85,8 +79,8 @@ def test_joint_ekf(errors, compiled):
     ekf = Kalman(world.mean, world.cov)
     for t, (view, pose) in enumerate(zip(world.views, world.path, strict=True)):
         before = ekf.log_evidence
-        H = slope(view, pose, ekf.mean, world.given)
-        residual = world.z[t] - view.predict(pose, ekf.mean, world.given)
+        H = slope(view, pose, ekf.mean)
+        residual = world.z[t] - view.predict(pose, ekf.mean)
         ekf.update(residual + H @ ekf.mean, H, NOISE_PX**2 * np.eye(view.dim))
         density = held.correct(np.tile(pose, (3, 1)), np.zeros((3, 6)), [world.observed(t)]).all
         np.testing.assert_allclose(density, ekf.log_evidence - before, rtol=1e-5)
@@ -106,9 +100,9 @@ def test_information_of_a_frame_has_the_frames_uncertainty(errors):
     held = world.map(1, True)
     found = held.information(pose, [world.observed(0)], prior).info[0]
     mean, cov = held.read(held.ids).mean[0, 0], held.read(held.ids).cov[0, 0]
-    J = slope(world.views[0], pose[0], mean, world.given)
+    J = slope(world.views[0], pose[0], mean)
     moves = np.stack([SE3.retract(pose[0], sign * 1e-6 * np.eye(6)) for sign in (1.0, -1.0)])
-    ahead, back = world.views[0].predict(moves, mean, world.given)
+    ahead, back = world.views[0].predict(moves, mean)
     H = (ahead - back).T / 2e-6
     R = NOISE_PX**2 * np.eye(len(J))
     expected = H.T @ np.linalg.solve(J @ cov @ J.T + R, H)

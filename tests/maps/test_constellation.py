@@ -1,4 +1,4 @@
-"""Known points as one landmark: exact ones through their frame, uncertain ones together."""
+"""Known points, exact or uncertain, as one landmark."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import MOST, Constellation, UncertainConstellation
+from rbpf.maps.constellation import MOST, Constellation
 from rbpf.maps.landmark_map import LandmarkMap
 
 POINTS = np.random.default_rng(0).normal(size=(4, 3))
@@ -19,50 +19,34 @@ FRAME = SE3.exp(np.array([0.4, -0.8, 1.2, 2.0, -1.0, 0.5]))
 COV_FRAME = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]) ** 2
 
 
-def shape_and_records(n: int, seed: int, scale: float = 0.01) -> tuple[UncertainConstellation, Records]:
+def shape_and_records(n: int, seed: int, scale: float = 0.01) -> tuple[Constellation, Records]:
     """Points of n particles, each near the given shape in a frame of its own, with a joint covariance."""
     rng = np.random.default_rng(seed)
     frames = SE3.retract(FRAME, rng.normal(scale=0.5, size=(n, 6)))
     points = SE3.transform(frames[:, None], POINTS + rng.normal(scale=scale, size=(n, 4, 3)))
     half = rng.normal(scale=0.003, size=(12, 14))
     cov = np.broadcast_to(half @ half.T, (n, 1, 12, 12))
-    return UncertainConstellation(POINTS, COVS), Records(points.reshape(n, 1, 12), cov)
+    return Constellation(POINTS, COVS), Records(points.reshape(n, 1, 12), cov)
 
 
-def test_only_so_many_points_have_errors():
+def test_only_so_many_points_are_one_landmark():
     covs = np.tile(np.eye(3), (MOST + 1, 1, 1))
-    assert UncertainConstellation(np.zeros((MOST, 3)), covs[:MOST]).dim == 3 * MOST
-    with pytest.raises(InputError, match="at most 12, or exact ones"):
-        UncertainConstellation(np.zeros((MOST + 1, 3)), covs)
-    assert Constellation(np.zeros((100, 3))).dim == 6
+    assert Constellation(np.zeros((MOST, 3)), covs[:MOST]).dim == 3 * MOST
+    with pytest.raises(InputError, match="give 30, or set known=points"):
+        Constellation(np.zeros((MOST + 1, 3)), covs)
 
 
-def test_exact_points_move_with_their_frame():
-    group, xi = Constellation(POINTS), np.array([0.3, 0.1, -0.2, 1.0, 2.0, 3.0])
-    moved = SE3.compose(FRAME, SE3.exp(xi))
-    records = Records(xi[None, None], COV_FRAME[None, None], FRAME[None, None])
-    np.testing.assert_allclose(group.frame(records)[0][0], moved, atol=1e-14)
-    np.testing.assert_allclose(group.homogeneous(xi, FRAME), [*moved[4:], 1.0], atol=1e-14)
-    np.testing.assert_allclose(group.in_world(records)[0], SE3.transform(moved, POINTS), atol=1e-14)
-    mean, cov = group.in_group(records)
-    np.testing.assert_array_equal(mean[0], POINTS)
-    assert not cov.any()
-
-
-def test_factor_of_an_exact_groups_frame_is_in_the_chart_at_the_frame():
-    """Samples of ξ, told as Log(frame⁻¹ G Exp(ξ))."""
-    group, n = Constellation(POINTS), 200_000
-    rng = np.random.default_rng(5)
-    half = rng.normal(scale=0.003, size=(6, 8))
-    cov = half @ half.T
-    mean = np.array([0.9, -0.7, 1.1, 2.0, 1.0, -3.0])
-    frame, factor = group.frame(Records(mean[None, None], cov[None, None], FRAME[None, None]))
-    xi = mean + rng.standard_normal((n, 6)) @ gaussian.cholesky(cov).T
-    moved = SE3.local(frame[0], SE3.retract(FRAME, xi))
-    expected = factor[0] @ factor[0].T
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert (np.abs(moved.T @ moved / n - expected) / scale).max() < 0.02
-    assert (np.abs(cov - expected) / scale).max() > 0.2
+def test_exact_points_are_as_uncertain_as_their_frame():
+    group = Constellation(POINTS, np.zeros((4, 3, 3)))
+    by_frame = SE3.rotation(FRAME) @ SE3.transform_jacobian(POINTS)
+    slope = by_frame.reshape(12, 6)
+    records = group.started(2, SE3.transform(FRAME, POINTS), slope @ COV_FRAME @ slope.T)
+    frame, factor = group.frame(records)
+    np.testing.assert_allclose(frame, np.tile(FRAME, (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(factor[0] @ factor[0].T, COV_FRAME, atol=1e-9)
+    places, covs = group.in_group(records)
+    np.testing.assert_allclose(places[0], POINTS, atol=1e-9)
+    assert np.abs(covs).max() < 1e-9
 
 
 def test_frame_of_uncertain_points_is_the_best_fit():
@@ -100,7 +84,7 @@ def test_two_groups_in_one_map():
     held = LandmarkMap(SE3)
     held.begin(2, Lineage(2))
     for points in (POINTS, POINTS.copy(), POINTS + 1.0):
-        group = UncertainConstellation(points, COVS.copy())
+        group = Constellation(points, COVS.copy())
         held.add_records(group.started(2, points, 1e-4 * np.eye(12)), group)
     assert len(held.layouts) == 2
     assert held.store.columns.kinds(np.arange(3)).tolist() == [0, 0, 1]

@@ -7,13 +7,13 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import KnownPixels
 from rbpf.systems.mono.start.known import (
     ISOTROPIC,
     TRIANGULATED,
     KnownStart,
-    constellation,
     constellation_records,
     require_texture,
     resect_known,
@@ -100,7 +100,7 @@ def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
         placed = exact.positions + std_m * rng.standard_normal((6, 1)) * line
         given = replace(exact, px=px, positions=placed, std_m=np.full(6, std_m))
         start = KnownStart.from_pixels(CAMERA, given, std_px)
-        group, cov_frame = constellation(start.points), np.diag(np.repeat([0.25, 1.0], 3))
+        group, cov_frame = Constellation(start.points.positions, start.points.cov), np.diag(np.repeat([0.25, 1.0], 3))
         records = constellation_records(CAMERA, start, group, 1, cov_frame)
         frame, factor = (part[0] for part in group.frame(records))
         error = SE3.local(frame, SE3.inverse(POSE))

@@ -11,7 +11,7 @@ from rbpf.core.models import Part
 from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.runs.recordings import filter_features as run
@@ -240,10 +240,10 @@ def test_the_first_frame_finds_the_camera(mode, velocity):
 
 
 def test_known_points_are_one_landmark_and_new_ones_are_counted():
-    for cov, kind in ((known(FIRST.known).cov, UncertainConstellation), (np.zeros((4, 3, 3)), Constellation)):
+    for cov in (known(FIRST.known).cov, np.zeros((4, 3, 3))):
         log = replace(first_only(FIRST), known=replace(known(FIRST.known), cov=cov))
         held = kinds(run(log, replace(SMALL, max_new_per_frame=3)).system.filter)
-        assert list(held.values()) == [kind] + 3 * [InverseDepth]
+        assert list(held.values()) == [Constellation] + 3 * [InverseDepth]
 
 
 @every_velocity
@@ -311,12 +311,14 @@ def test_logs_that_are_refused(log, words, mode):
 
 
 def test_more_known_points_than_needed():
-    """One may be outside the image; of those with errors of their own there may be twelve."""
+    """One may be outside the image; there may be thirty, and any number as landmarks of their own."""
     done = run(first_only(one_outside(desk(0, known=5))), SMALL)
     assert np.abs(errors(done)[0]).max() < 0.1
-    log = desk(known=13, measurements=30)
-    with pytest.raises(InputError, match="13 known points have errors: give at most 12"):
+    log = desk(known=31, measurements=40)
+    with pytest.raises(InputError, match="31 known points are too many for one group: give 30, or set known=points"):
         MonoSlam(log.camera, SMALL, log.known)
-    exact = replace(known(log.known), cov=np.zeros((13, 3, 3)))
+    MonoSlam(log.camera, replace(SMALL, known="points"), log.known)
+    exact = known(log.known)
+    exact = KnownPoints(exact.names[:30], exact.positions[:30], np.zeros((30, 3, 3)))
     done = run(first_only(replace(log, known=exact)), SMALL)
     assert np.abs(errors(done)[0]).max() < 0.05

@@ -15,13 +15,13 @@ from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import Belief, Landmark, NewLandmarks, Observations, Part, Records, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.maps.rows import BOTH, MAP, STATE
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView
+from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, EpipolarRay, MembersView
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.feature_table import directions
@@ -41,7 +41,6 @@ STILL_CHI2 = 4.0
 LINEAR = 3.0
 """Times the greatest standard deviation at which something is looked for: so far off a measurement is taken as linear."""
 
-GroupView = ConstellationView | MembersView
 """Measurements of several known points at once."""
 
 
@@ -237,7 +236,7 @@ class FeatureSensor(Sensor):
         rows = np.flatnonzero((members >= 0) & inside)
         held = rows.size > 0
         if held:
-            landmark, view = self._view(belief, members[rows])
+            landmark, view = self._view(members[rows])
             cov = np.zeros((1, view.dim, view.dim))
             for k, row in enumerate(rows.tolist()):
                 cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
@@ -336,7 +335,7 @@ class FeatureSensor(Sensor):
         """Of features (K,) found at px (K, 2), in the heaviest particle: which, ν (k, 2), H (k, 2, d), J P Jᵀ (k, 2, 2)."""
         which, nus, jacs, covs = [], [], [], []
         for model, chosen, ids in self._by_model(belief, names):
-            z = px[chosen].reshape(1, -1) if isinstance(model, GroupView) else px[chosen]
+            z = px[chosen].reshape(1, -1) if isinstance(model, MembersView) else px[chosen]
             nu, jac, cov = belief.innovations(model, z, ids)
             which.append(chosen)
             nus.append(nu.reshape(-1, 2))
@@ -361,7 +360,7 @@ class FeatureSensor(Sensor):
         for model, chosen, ids in self._by_model(belief, names):
             records = belief.read(ids, particles)
             which.append(chosen)
-            if isinstance(model, GroupView):
+            if isinstance(model, MembersView):
                 points = model.in_world(records.mean, records.const)[:, 0]
                 out.append(np.pad(points, ((0, 0), (0, 0), (0, 1)), constant_values=1.0))
             else:
@@ -419,30 +418,25 @@ class FeatureSensor(Sensor):
 
     def _by_model(
         self, belief: Belief, names: np.ndarray
-    ) -> list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]]:
+    ) -> list[tuple[CameraModel | MembersView, np.ndarray, np.ndarray]]:
         """Features (K,) by how they are measured: the model, which of them, and the landmarks' ids."""
         ids, member = self._ids(belief, names), self.members(names)
         own = np.flatnonzero(ids >= 0)
         unknown = belief.map.are(ids[own], self.unknown_depth.landmark)
-        out: list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]] = []
+        out: list[tuple[CameraModel | MembersView, np.ndarray, np.ndarray]] = []
         for model, chosen in ((self.point, own[~unknown]), (self.unknown_depth.model, own[unknown])):
             if chosen.size:
                 out.append((model, chosen, ids[chosen]))
         of_group = np.flatnonzero(member >= 0)
         if of_group.size:
-            landmark, view = self._view(belief, member[of_group])
+            landmark, view = self._view(member[of_group])
             out.append((view, of_group, landmark))
         return out
 
-    def _view(self, belief: Belief, members: np.ndarray) -> tuple[np.ndarray, GroupView]:
+    def _view(self, members: np.ndarray) -> tuple[np.ndarray, MembersView]:
         """The constellation's id (1,), and the camera's view of some of its members."""
         assert self.group is not None
-        landmark = int(self.group.names[0])
-        if isinstance(belief.map.landmark_of(landmark), Constellation):
-            view: GroupView = ConstellationView(self.camera, self.group.positions[members])
-        else:
-            view = MembersView(self.camera, members)
-        return np.array([landmark]), view
+        return self.group.names[:1], MembersView(self.camera, members)
 
     def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
         """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
@@ -454,7 +448,7 @@ class FeatureSensor(Sensor):
         if self.group is not None:
             landmark = int(self.group.names[0])
             known = belief.map.landmark_of(landmark)
-            assert isinstance(known, Constellation | UncertainConstellation)
+            assert isinstance(known, Constellation)
             points = known.in_world(belief.read_mode([landmark]))[0]
             seen.append(SE3.inverse_transform(pose, points))
         point = np.concatenate(seen)

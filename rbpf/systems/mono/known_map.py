@@ -15,7 +15,7 @@ from rbpf.core.checkpoint import fitting, grey, integers, load_arrays, numbers, 
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import MIN_RHO
 from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.calibration import spread_rows
@@ -171,7 +171,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
     for landmark_id in landmark_map.ids.tolist():
         landmark = landmark_map.landmark_of(landmark_id)
         records = landmark_map.read(np.array([landmark_id]))
-        if isinstance(landmark, Constellation | UncertainConstellation):
+        if isinstance(landmark, Constellation):
             assert features.group is not None
             points, within = landmark.in_group(records)
             for member in range(points.shape[1]):

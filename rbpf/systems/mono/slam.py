@@ -22,6 +22,7 @@ from rbpf.core.models import Conditional, MotionModel, Records, Sensor
 from rbpf.core.particles import Estimate, mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
@@ -43,7 +44,7 @@ from rbpf.systems.mono.known_map import NAME, KnownMap, distant_views, estimate_
 from rbpf.systems.mono.place_recognition import PlaceRecognition
 from rbpf.systems.mono.relocalisation import Attempt, TrackingLoss
 from rbpf.systems.mono.start.adjustment import FirstFrames
-from rbpf.systems.mono.start.known import KnownStart, constellation, constellation_records, require_texture, world_of
+from rbpf.systems.mono.start.known import KnownStart, constellation_records, require_texture, world_of
 from rbpf.systems.mono.start.unknown import UnknownStart
 from rbpf.systems.system import (
     DIAGNOSTICS,
@@ -490,7 +491,7 @@ class MonoSlam(System):
         landmark_map.register(Point(3))
         landmark_map.register(self.features.unknown_depth.landmark)
         if self.features.group is not None:
-            landmark_map.register(constellation(self.features.group))
+            landmark_map.register(Constellation(self.features.group.positions, self.features.group.cov))
         parts: list[Conditional] = [landmark_map]
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
@@ -525,7 +526,7 @@ class MonoSlam(System):
             return measured, PosePrior(start.world_from_camera, config.start_cov())
 
         # One landmark, placed by what the frame shows of it: the frame is not used again.
-        landmark_map, group = self.filter.belief().map, constellation(start.points)
+        landmark_map, group = self.filter.belief().map, Constellation(start.points.positions, start.points.cov)
         records = constellation_records(self.camera, start, group, self.filter.n, config.start_cov())
         landmark_map.add_records(records, group, ids=start.points.names[:1])
         if isinstance(measured, FeatureFrame):

@@ -11,7 +11,7 @@ from rbpf.core.filter import Filter
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation
+from rbpf.maps.constellation import LEAST, Constellation
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraPoint
 from rbpf.sensors.camera.resection import resect
@@ -114,15 +114,8 @@ class KnownStart:
         return cls(known, resect(camera, known.positions[rows], seen.z), rows, seen)
 
 
-def constellation(points: KnownPoints) -> Constellation | UncertainConstellation:
-    """Known points as one landmark; an InputError where too many have errors of their own."""
-    if not points.cov.any():
-        return Constellation(points.positions)
-    return UncertainConstellation(points.positions, points.cov)
-
-
 def constellation_records(
-    camera: Pinhole, start: KnownStart, group: Constellation | UncertainConstellation, n: int, cov_frame: np.ndarray
+    camera: Pinhole, start: KnownStart, group: Constellation, n: int, cov_frame: np.ndarray
 ) -> Records:
     """Known points after the first image, whose camera is the world: records (n, 1, …).
 
@@ -133,14 +126,12 @@ def constellation_records(
     """
     from scipy.optimize import least_squares  # takes long to import
 
-    fit = _FirstImage(camera, start, cov_frame, isinstance(group, Constellation))
+    fit = _FirstImage(camera, start, cov_frame)
     x = least_squares(fit.residual, np.zeros(fit.size), fit.jacobian, method="lm").x
     pose, local = fit.split(x)
     half = np.linalg.pinv(fit.jacobian(x))
     frame = SE3.inverse(pose)
     half[:6] = -SE3.adjoint(pose) @ SE3.right_jacobian(x[:6]) @ half[:6]  # in the frame's own right chart
-    if isinstance(group, Constellation):
-        return group.started(n, frame, gaussian.symmetrise(half @ half.T))
     moved = half[6:].reshape(*local.shape, -1) + SE3.transform_jacobian(local) @ half[:6]
     turned = (SE3.rotation(frame) @ moved).reshape(-1, half.shape[1])
     return group.started(n, SE3.transform(frame, local), gaussian.symmetrise(turned @ turned.T))
@@ -151,7 +142,7 @@ def world_of(filter_: Filter) -> Anchored | None:
     landmark_map = filter_.belief().map
     first = landmark_map.ids[:1]  # it was the first landmark: no other one has to be asked
     group = landmark_map.landmark_of(int(first[0])) if first.size else None
-    if not isinstance(group, Constellation | UncertainConstellation):
+    if not isinstance(group, Constellation):
         return None
     return Anchored(*group.frame(landmark_map.read(first)))
 
@@ -159,19 +150,17 @@ def world_of(filter_: Filter) -> Anchored | None:
 class _FirstImage:
     """Whitened residuals by x = (ξ, e_1, …, e_M): group_from_camera = T Exp(ξ), point m at k_m + e_m in the group."""
 
-    def __init__(self, camera: Pinhole, start: KnownStart, cov_frame: np.ndarray, exact: bool) -> None:
+    def __init__(self, camera: Pinhole, start: KnownStart, cov_frame: np.ndarray) -> None:
         self.start = start
         self.model = CameraPoint(camera)
-        self.exact = exact
-        self.size = 6 if exact else 6 + start.points.positions.size
+        self.size = 6 + start.points.positions.size
         self._chol_px = gaussian.cholesky(start.seen.cov_z)
-        prior = [cov_frame] if exact else [cov_frame, *(start.points.cov + LEAST * np.eye(3))]
+        prior = [cov_frame, *(start.points.cov + LEAST * np.eye(3))]
         self._chol_prior = gaussian.cholesky(block_diag(*prior))
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """group_from_camera (7,) and the points (M, 3) in the group's frame."""
-        errors = np.zeros(self.start.points.positions.shape) if self.exact else x[6:].reshape(-1, 3)
-        return SE3.retract(self.start.world_from_camera, x[:6]), self.start.points.positions + errors
+        return SE3.retract(self.start.world_from_camera, x[:6]), self.start.points.positions + x[6:].reshape(-1, 3)
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Of what is seen, then of what was given."""
@@ -187,7 +176,7 @@ class _FirstImage:
         assert by_pose is not None and by_point is not None
         rows = np.zeros((*self.start.seen.z.shape, self.size))
         rows[..., :6] = by_pose @ SE3.right_jacobian(x[:6])
-        for k, m in enumerate(() if self.exact else self.start.rows.tolist()):
+        for k, m in enumerate(self.start.rows.tolist()):
             rows[k, :, 6 + 3 * m : 9 + 3 * m] = by_point[k]
         seen = gaussian.solve_lower_matrix(self._chol_px, rows).reshape(-1, self.size)
         return -np.concatenate([seen, gaussian.solve_lower_matrix(self._chol_prior, np.eye(self.size))])
