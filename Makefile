@@ -67,7 +67,7 @@ dist: $(STAMP) ## wheel and source distribution into dist/: of one commit always
 	  $(abspath $(BIN))/python -m build --no-isolation --wheel --outdir . $$name && rm -r $$name; done
 
 docs: $(STAMP) ## build the documentation into docs/_build
-	$(BIN)/sphinx-build -W -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W -j 2 -b html docs docs/_build/html
 
 clean: ## remove everything that make made, .venv included
 	rm -rf .venv .venv-lowest demo build dist coverage .coverage *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
