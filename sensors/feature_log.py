@@ -6,10 +6,13 @@ from numbers import Integral
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.checkpoint import elements, integers, numbers, require
 from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
-UNIT = 1e-6  #: How far a quaternion's length may be from 1: six decimals in a file leave it there.
+_FRAME = {"landmarks": integers("K"), "z": numbers("K", "p"), "cov_z": numbers("K", "p", "p")}
+_KNOWN = {"names": integers("M"), "positions": numbers("M", 3), "cov": numbers("M", 3, 3)}
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,10 @@ class KnownPoints:
     cov: np.ndarray  #: (M, 3, 3) their covariance, m².
 
     def __post_init__(self) -> None:
-        where = "the known points"
-        _check_names(where, "names", "M", self.names)
-        count = len(self.names)
-        _check_numbers(where, "positions", self.positions, (count, 3))
-        _check_covariances(where, "cov", self.cov, (count, 3, 3))
+        what = "the known points"
+        require(what, vars(self), _KNOWN)
+        _check_names(what, self.names)
+        _check_covariances(what, "cov", self.cov)
 
 
 @dataclass(frozen=True)
@@ -68,18 +70,12 @@ class Truth:
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        where = "the ground truth"
-        _check_whole(where, "stamps_ns", "T", self.stamps_ns)
-        planar = self.poses.shape[1:] == (3,)
-        _check_numbers(where, "poses", self.poses, (len(self.stamps_ns), 3 if planar else 7))
+        what, planar = "the ground truth", self.poses.shape[1:] == (3,)
+        require(what, vars(self), {"stamps_ns": integers("T"), "poses": elements(SE2 if planar else SE3, "T")})
         if (late := np.flatnonzero(np.diff(self.stamps_ns) < 0)).size:
-            raise InputError(f"{where}: stamp {late[0] + 1} is before the one it follows, sort the poses by time")
-        length = np.ones(len(self.poses)) if planar else np.linalg.norm(self.poses[:, :4], axis=1)
-        if (wrong := np.flatnonzero(np.abs(length - 1.0) > UNIT)).size:
-            found = f"pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.9g}"
-            raise InputError(f"{where}: {found}, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion")
-        for name, position in self.landmarks.items():
-            _check_numbers(where, f"landmark {name}", position, position.shape if planar else (3,))
+            raise InputError(f"{what}: stamp {late[0] + 1} is before the one it follows, sort the poses by time")
+        places = {f"landmark {name}": position for name, position in self.landmarks.items()}
+        require(what, places, dict.fromkeys(places, numbers("" if planar else 3)))
 
 
 @dataclass(frozen=True)
@@ -104,10 +100,9 @@ class FeatureLog:
             stamp_ns: object = frame.stamp_ns
             if not isinstance(stamp_ns, Integral):
                 raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
-            _check_names(where, "landmarks", "K", frame.landmarks)
-            shape = (len(frame.landmarks), self.camera.dim)
-            _check_numbers(where, "z", frame.z, shape)
-            _check_covariances(where, "cov_z", frame.cov_z, (*shape, self.camera.dim))
+            require(where, vars(frame), _FRAME, p=self.camera.dim)
+            _check_names(where, frame.landmarks)
+            _check_covariances(where, "cov_z", frame.cov_z)
             before = self.frames[max(index - 1, 0)].stamp_ns
             if frame.stamp_ns < before:
                 order = f"at {frame.stamp_ns} ns is before the frame it follows ({before} ns)"
@@ -119,39 +114,16 @@ class FeatureLog:
         return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
 
 
-def _check_whole(where: str, what: str, letter: str, values: np.ndarray) -> None:
-    """Refuses all but a vector of whole numbers."""
-    if not (isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype == np.int64):
-        raise InputError(f"{where}: {what} must be ({letter},) int64, got {_described(values)}")
-
-
-def _check_names(where: str, what: str, letter: str, names: np.ndarray) -> None:
-    """Refuses all but a vector of names, each once."""
-    _check_whole(where, what, letter, names)
+def _check_names(what: str, names: np.ndarray) -> None:
+    """Refuses names that come twice."""
     unique, counts = np.unique(names, return_counts=True)
     if (counts > 1).any():
-        raise InputError(f"{where}: landmark {unique[np.argmax(counts > 1)]} comes twice, keep one of the two")
+        raise InputError(f"{what}: landmark {unique[np.argmax(counts > 1)]} comes twice, keep one of the two")
 
 
-def _check_numbers(where: str, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Refuses all but finite numbers of this shape."""
-    if not (isinstance(values, np.ndarray) and values.shape == shape and values.dtype == np.float64):
-        raise InputError(f"{where}: {what} must be {shape} float64, got {_described(values)}")
-    if not (finite := np.isfinite(values)).all():
-        place = tuple(int(i) for i in np.argwhere(~finite)[0])
-        raise InputError(f"{where}: {what} must be finite, entry {place} is {values[place]}")
-
-
-def _check_covariances(where: str, what: str, cov: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Refuses all but symmetric positive semi-definite matrices of this shape."""
-    _check_numbers(where, what, cov, shape)
+def _check_covariances(what: str, name: str, cov: np.ndarray) -> None:
+    """Refuses all but symmetric positive semi-definite matrices."""
     try:
         gaussian.psd_factor(cov)
     except InputError as error:
-        raise InputError(f"{where}: {what} is no covariance: {error}") from error
-
-
-def _described(values: object) -> str:
-    if isinstance(values, np.ndarray):
-        return f"{values.shape} {values.dtype}"
-    return f"a {type(values).__name__}"
+        raise InputError(f"{what}: {name} is no covariance: {error}") from error

@@ -258,6 +258,14 @@ def read_one(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, **sizes:
     return _read(arrays, name, entry, sizes)
 
 
+def require(what: str, values: Mapping[str, Any], schema: Schema, **sizes: int) -> None:
+    """Refuses arrays in memory, of `what` in words, that are not what the schema says; errors as `read`."""
+    try:
+        read({name: np.asarray(values[name]) for name in schema}, schema, "", **sizes)
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from None
+
+
 def split(rows: np.ndarray, counts: Sequence[int], name: str) -> list[np.ndarray]:
     """The rows of an array as so many each. Raises InputError: there are not as many rows."""
     if sum(counts) != len(rows):

@@ -13,9 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.errors import InputError
+from rbpf.core.checkpoint import integers, numbers, require
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted
 
+_SCHEMA = {
+    "names": integers("M"),
+    "px": numbers("M", 2),
+    "positions": numbers("M", 3),
+    "std_m": numbers("M", least=0.0),
+}
 COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
 
 
@@ -36,13 +42,7 @@ class KnownPixels:
 
     def __post_init__(self) -> None:
         """Checks what is given: the points may be made by hand."""
-        count = np.size(self.names)
-        for name, shape in (("px", (count, 2)), ("positions", (count, 3)), ("std_m", (count,))):
-            values = getattr(self, name)
-            if np.shape(values) != shape or not np.isfinite(values).all():
-                raise InputError(f"{name} of {count} known points must be {shape} finite numbers")
-        if (np.asarray(self.std_m) < 0.0).any():
-            raise InputError("the standard deviation of a known point is negative: std_m must be zero or more")
+        require("the known points", vars(self), _SCHEMA)
 
 
 def read_known_points(path: str | Path) -> KnownPixels:

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rbpf.core.checkpoint import elements, integers, numbers, require
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, SE3Group
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
-from rbpf.sensors.readers.text import LARGEST
 
 Kind = Literal["range_bearing", "position"]
 KINDS: dict[str, Kind] = {"range_bearing": "range_bearing", "position": "position"}
@@ -47,34 +48,21 @@ class Measurements:
         if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
             expected = f"a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1"
             raise InputError(f"Expected {expected}, found {self.measurement!r} and {self.pitch_sign!r}.")
-        # Shapes.
-        size, dim, point = self.space.size, self.space.dim, point_dim(self.space)
-        moves, count = max(len(self.stamps_ns) - 1, 0), len(self.steps)
-        expected_shapes = {
-            "robot_from_sensor": (size,),
-            "start": (size,),
-            "stamps_ns": (moves + 1,),
-            "deltas": (moves, size),
-            "covs": (moves, dim, dim),
-            "steps": (count,),
-            "landmarks": (count,),
-            "z": (count, point),
-            "cov_z": (count, point, point),
+        dim, point, poses = self.space.dim, point_dim(self.space), partial(elements, self.space)
+        schema = {
+            "robot_from_sensor": poses(),
+            "start": poses(),
+            "stamps_ns": integers("T"),
+            "deltas": poses("moves"),
+            "covs": numbers("moves", dim, dim),
+            "steps": integers("K", least=0, below="T"),
+            "landmarks": integers("K"),
+            "z": numbers("K", point),
+            "cov_z": numbers("K", point, point),
         }
-        for name, shape in expected_shapes.items():
-            found = getattr(self, name).shape
-            if found != shape:
-                raise InputError(f"Expected {name} of shape {shape}, found {found}.")
-        # Values.
-        if ((self.steps < 0) | (self.steps >= len(self.stamps_ns))).any():
-            raise InputError(f"Expected the steps of observations from 0 to {len(self.stamps_ns) - 1}.")
+        require(self.recording, vars(self), schema, moves=max(len(self.stamps_ns) - 1, 0))
         if (np.diff(self.stamps_ns) < 0).any():
             raise InputError("Expected the stamps of the steps in order of time.")
-        for name in ("robot_from_sensor", "start", "deltas", "covs", "z", "cov_z"):
-            if not (np.abs(getattr(self, name)) <= LARGEST).all():
-                raise InputError(f"Expected finite numbers of at most {LARGEST:.0e} in {name}.")
-        if not are_poses(self.space, np.vstack([self.robot_from_sensor, self.start, self.deltas])).all():
-            raise InputError("Expected quaternions of length 1 in robot_from_sensor, start and deltas.")
         for name in ("covs", "cov_z"):
             valid = are_covariances(getattr(self, name))
             if not valid.all():

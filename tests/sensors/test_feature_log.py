@@ -29,7 +29,7 @@ def refused(message: str):
 
 def test_stereo_measures_three_numbers():
     assert log(frame(0, 4, dim=3), camera=STEREO).camera.dim == 3
-    with refused("frame 0 of walk: z must be (4, 3) float64, got (4, 2) float64"):
+    with refused("frame 0 of walk: the array z must hold numbers of shape (K = 4, p = 3), got (4, 2) float64"):
         log(frame(0, 4), camera=STEREO)
 
 
@@ -56,20 +56,26 @@ MADE = {
 }
 WRONG = [
     ("frame 1 of walk", "stamp_ns", 1.5, "stamp_ns must be a whole number of nanoseconds, got 1.5"),
-    ("frame 1 of walk", "landmarks", np.array([1.0, 2.0]), "landmarks must be (K,) int64, got (2,) float64"),
+    ("frame 1 of walk", "landmarks", np.array([1.0, 2.0]),
+     "the array landmarks must hold whole numbers of shape (K), got (2,) float64"),
     ("frame 1 of walk", "landmarks", np.array([7, 7]), "landmark 7 comes twice, keep one of the two"),
-    ("frame 1 of walk", "landmarks", np.array([1, 2, 3]), "z must be (3, 2) float64, got (2, 2) float64"),
-    ("frame 1 of walk", "z", np.array([[1.0, 2.0], [np.nan, 4.0]]), "z must be finite, entry (1, 0) is nan"),
+    ("frame 1 of walk", "landmarks", np.array([1, 2, 3]),
+     "the array z must hold numbers of shape (K = 3, p = 2), got (2, 2) float64"),
+    ("frame 1 of walk", "z", np.array([[1.0, 2.0], [np.nan, 4.0]]), "the array z must hold finite numbers, got nan at 1, 0"),
     ("frame 1 of walk", "cov_z", np.stack([np.eye(2), np.diag([1.0, -1.0])]), "cov_z is no covariance: "),
     ("the known points", "names", np.array([4, 4]), "landmark 4 comes twice, keep one of the two"),
-    ("the known points", "positions", np.zeros((2, 2)), "positions must be (2, 3) float64, got (2, 2) float64"),
+    ("the known points", "positions", np.zeros((2, 2)),
+     "the array positions must hold numbers of shape (M = 2, 3), got (2, 2) float64"),
     ("the known points", "cov", np.tile(-np.eye(3), (2, 1, 1)), "cov is no covariance: "),
-    ("the ground truth", "stamps_ns", np.array([0.0, 1.0, 2.0]), "stamps_ns must be (T,) int64, got (3,) float64"),
-    ("the ground truth", "stamps_ns", np.array([0, 1]), "poses must be (2, 7) float64, got (3, 7) float64"),
+    ("the ground truth", "stamps_ns", np.array([0.0, 1.0, 2.0]),
+     "the array stamps_ns must hold whole numbers of shape (T), got (3,) float64"),
+    ("the ground truth", "stamps_ns", np.array([0, 1]),
+     "the array poses must hold numbers of shape (T = 2, 7), got (3, 7) float64"),
     ("the ground truth", "stamps_ns", np.array([0, 5, 4]), "stamp 2 is before the one it follows, sort the poses by"),
     ("the ground truth", "poses", POSES * [1, 1, 1, 2, 1, 1, 1],
-     "pose 0 has a quaternion of length 2, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion"),
-    ("the ground truth", "landmarks", {8: np.zeros(2)}, "landmark 8 must be (3,) float64, got (2,) float64"),
+     "the array poses must hold poses, of unit quaternions, got 2.0 at 0, 3"),
+    ("the ground truth", "landmarks", {8: np.zeros(2)},
+     "the array landmark 8 must hold numbers of shape (3), got (2,) float64"),
 ]  # fmt: skip
 
 
