@@ -3,11 +3,10 @@
 Every function broadcasts over leading axes and is meant for n up to about twelve. Covariances are full symmetric matrices
 (..., n, n); a chol_* is lower triangular (..., n, n), a factor L is any matrix with L L^T = covariance. A result may lie in
 memory entry by entry, so that what is computed from it runs along the batch: code that insists on C order takes its
-`numpy.ascontiguousarray`. Up to n = 8 the loops run over the entries of a matrix and the arithmetic along the batch, which
-LAPACK, called once per matrix, cannot do. Sums use no BLAS: equal input gives equal bytes.
+`numpy.ascontiguousarray`. But for LAPACK's factors the loops run over the entries of a matrix and the arithmetic along the
+batch. Sums use no BLAS: equal input gives equal bytes.
 """
 
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
@@ -21,7 +20,6 @@ from rbpf.errors import InputError
 Array = NDArray[np.float64]
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
-_UNROLLED = 8
 _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
@@ -103,11 +101,6 @@ def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n 
     """Lower Cholesky factor, upper triangle not read. Raises InputError: not positive definite, or NaN."""
     cov = np.asarray(cov, dtype=float)
     with np.errstate(invalid="ignore"):  # from entries that are infinite, which the complaint covers
-        if cov.shape[-1] > _UNROLLED:
-            with suppress(np.linalg.LinAlgError):  # which does not say which matrix of the batch failed
-                chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
-                if np.isfinite(chol).all():
-                    return chol
         chol, definite = _factored(cov, 0.0)
     _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
     return chol
@@ -210,10 +203,15 @@ def _distinct(cov: Array) -> Array:
 
 
 def _factored(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
-    if math.prod(cov.shape[:-2]) != 1:
-        return _cholesky_batch(cov, floor)
-    chol, definite = _cholesky_one(cov.reshape(cov.shape[-2:]), floor)
-    return chol.reshape(cov.shape), definite.reshape(cov.shape[:-2])
+    with (
+        suppress(np.linalg.LinAlgError),
+        np.errstate(invalid="ignore"),
+    ):  # it does not say which one of the batch failed
+        chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
+        variances, pivots = (np.diagonal(each, axis1=-2, axis2=-1) for each in (cov, chol))
+        if (np.square(pivots) > floor * variances).all() and np.isfinite(chol).all():
+            return chol, np.ones(cov.shape[:-2], dtype=bool)
+    return _cholesky_batch(cov, floor)
 
 
 def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -230,20 +228,6 @@ def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]
         definite &= positive
         chol[j:, j] = column / np.sqrt(np.where(positive, pivot, np.inf))
     return entries_last(chol), definite
-
-
-def _cholesky_one(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
-    # The same for a single matrix: plain numbers cost a fifth of arrays that hold one each.
-    entries, chol = cov.tolist(), [[0.0] * len(cov) for _ in cov]
-    for j, row in enumerate(chol):
-        pivot = entries[j][j] - sum(x * x for x in row[:j])
-        if not pivot > floor * entries[j][j]:
-            return np.zeros_like(cov), np.array(False)
-        root = math.sqrt(pivot)
-        for i in range(j, len(chol)):
-            rest = sum(x * y for x, y in zip(chol[i][:j], row, strict=False))
-            chol[i][j] = (entries[i][j] - rest) / root
-    return np.array(chol).reshape(cov.shape), np.array(True)
 
 
 def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:

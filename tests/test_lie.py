@@ -136,6 +136,7 @@ def test_weighted_mean_is_stationary_and_moves_with_its_cloud(group, rng):
     np.testing.assert_allclose(weights @ group.local(mean, cloud), np.zeros(group.dim), atol=1e-14)
     shift = random_elements(group, rng, ())
     assert_same(group, group.compose(shift, mean), group.mean(group.compose(shift, cloud), weights), 1e-13)
+    assert_same(group, mean, LieGroup._mean_from(group, cloud[3], cloud, weights))
 
 
 def hat(xi: np.ndarray) -> np.ndarray:

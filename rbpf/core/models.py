@@ -636,7 +636,7 @@ class Belief:
         """The particle of highest weight."""
         return int(np.argmax(self.log_weights))
 
-    @property
+    @cached_property
     def map(self) -> Map:
         """The landmark map. Raises InputError: the filter holds none."""
         held = self.parts.get(self.landmarks)

@@ -11,10 +11,10 @@ from typing import final
 
 import numpy as np
 
-from rbpf import gaussian
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Information, Prior, Proposed
 from rbpf.errors import InputError
+from rbpf.kernels.dense import refine
 
 
 @final
@@ -63,16 +63,13 @@ class EkfProposal(Proposal):
 
 def refined(prior: Prior, information: Information) -> Proposed:
     """The refined Gaussian and the joint marginal weight of each particle, the largest for any choice of outliers."""
-    factor, transposed = prior.factor, np.swapaxes(prior.factor, -1, -2)
-    unit, sound = np.eye(factor.shape[2]), np.isfinite(information.info).all(axis=(1, 2))
+    n, rank = len(information.quad), prior.factor.shape[2]
+    mean, root, squared, log_det = np.empty((n, rank)), np.empty((n, rank, rank)), np.empty(n), np.empty(n)
     # With M = C Cᵀ the covariance of u is C⁻ᵀC⁻¹, and its mean C⁻ᵀ of C⁻¹Lᵀη. What a model spoils makes the weight NaN.
-    info = np.where(sound[:, None, None], information.info, 0.0)
-    chol = np.linalg.cholesky(unit + transposed @ info @ factor)
-    inverse = gaussian.solve_lower_matrix(chol, unit)
-    root, white = np.swapaxes(inverse, -1, -2), inverse @ (transposed @ information.vector[..., None])
-    nis = information.quad - np.square(white).sum(axis=(1, 2))
-    log_w1 = information.log_factor - 0.5 * (nis + information.log_det + gaussian.log_det(chol))
-    log_w1[~sound] = np.nan
+    info, vector, factor = map(np.ascontiguousarray, (information.info, information.vector, prior.factor))
+    refine(info, vector, factor, mean, root, squared, log_det)
+    nis = information.quad - squared
+    log_w1 = information.log_factor - 0.5 * (nis + information.log_det + log_det)
     for other in information.otherwise:
         np.maximum(log_w1, refined(prior, other).log_w1, out=log_w1)
-    return Proposed((root @ white)[..., 0], root, log_w1, nis, information.rows)
+    return Proposed(mean, root, log_w1, nis, information.rows)

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit, void
+from numba import float64, int64, njit, void
 
-from rbpf.kernels.signature import INDEX_MATRIX, MATRIX
+from rbpf.kernels.signature import CUBE, INDEX_MATRIX, MATRIX, VECTOR
 
 
 @njit(cache=True, error_model="numpy")
@@ -43,6 +43,75 @@ def solve(chol, vector):
         for b in range(a + 1, vector.size):
             vector[a] -= chol[b, a] * vector[b]
         vector[a] /= chol[a, a]
+
+
+@njit(void(MATRIX, CUBE, int64, float64, VECTOR, MATRIX), cache=True, error_model="numpy")
+def fit_robustly(white, slope, rounds, scale, u, info):
+    """Fills u (r,), where 0 is expected with unit covariance, by K measurements (K, p) of slopes (K, p, r), and `info` (r, r).
+
+    Iteratively reweighted least squares with a Cauchy loss; what is as far off as `scale` keeps half of its weight.
+    """
+    (count, p, rank), total = slope.shape, np.empty(u.size)
+    off, u[:] = np.empty(p), 0.0
+    for _ in range(rounds):
+        info[:], total[:] = np.eye(rank), 0.0
+        for k in range(count):
+            squared = 0.0
+            for a in range(p):
+                off[a] = white[k, a]
+                for r in range(rank):
+                    off[a] -= slope[k, a, r] * u[r]
+                squared += off[a] * off[a]
+            weight = 1.0 / (1.0 + squared / (scale * scale))
+            for a in range(p):
+                for r in range(rank):
+                    weighed = weight * slope[k, a, r]
+                    total[r] += weighed * white[k, a]
+                    for s in range(rank):
+                        info[r, s] += weighed * slope[k, a, s]
+        chol = info.copy()
+        factor(chol)
+        solve(chol, total)
+        u[:] = total
+
+
+@njit(void(CUBE, MATRIX, CUBE, MATRIX, CUBE, VECTOR, VECTOR), cache=True, error_model="numpy")
+def refine(info, vector, root_prior, mean, root, squared, log_det):
+    """Fills mean (N, r) and root (N, r, r) of u, |C⁻¹Lᵀη|² and log |M| (N,), see `rbpf.core.proposals`.
+
+    Of N particles with Λ (N, d, d) and η (N, d), and L (N or 1, d, r). Where M is not definite, all of these are NaN.
+    """
+    dim, rank = root_prior.shape[1], root_prior.shape[2]
+    half, chol, white = np.empty((dim, rank)), np.empty((rank, rank)), np.empty(rank)
+    for i in range(len(info)):
+        spread = root_prior[i if len(root_prior) > 1 else 0]
+        half[:] = 0.0
+        for a in range(dim):
+            for b in range(dim):
+                for r in range(rank):
+                    half[a, r] += info[i, a, b] * spread[b, r]
+        for r in range(rank):
+            for s in range(r + 1):
+                chol[r, s] = 1.0 if r == s else 0.0
+                for a in range(dim):
+                    chol[r, s] += spread[a, r] * half[a, s]
+            white[r] = 0.0
+            for a in range(dim):
+                white[r] += spread[a, r] * vector[i, a]
+        factor(chol)
+        solve_lower(chol, white)
+        # Columns of C⁻¹, which are the rows of its transposed.
+        for r in range(rank):
+            root[i, r] = 0.0
+            root[i, r, r] = 1.0
+            solve_lower(chol, root[i, r])
+        squared[i] = log_det[i] = 0.0
+        for r in range(rank):
+            squared[i] += white[r] * white[r]
+            log_det[i] += 2.0 * math.log(chol[r, r])
+            mean[i, r] = 0.0
+            for s in range(rank):
+                mean[i, r] += root[i, r, s] * white[s]
 
 
 @njit(cache=True, error_model="numpy")

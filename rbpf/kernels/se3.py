@@ -15,7 +15,7 @@ closed forms cancel:
 import math
 
 import numpy as np
-from numba import njit, void
+from numba import float64, int64, njit, types, void
 
 from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY
 
@@ -28,6 +28,7 @@ _E = tuple((-1) ** k * (k + 1) / math.factorial(2 * k + 5) for k in range(_TERMS
 
 _ONE = void(READ_ONLY, MATRIX)
 _TWO = void(READ_ONLY, READ_ONLY, MATRIX)
+WEIGHTS = types.Array(float64, 1, "C", readonly=True)
 
 
 @njit(cache=True, error_model="numpy")
@@ -233,6 +234,21 @@ def local(x, y, out):
         q = _inverse_quat(x, j)
         apart = (y[k, 4] - x[j, 4], y[k, 5] - x[j, 5], y[k, 6] - x[j, 6])
         _store_log(multiply(q, _quat(y, k)), turned(q, apart), out, i)
+
+
+@njit(void(READ_ONLY, WEIGHTS, int64, float64, MATRIX), cache=True, error_model="numpy")
+def mean(points, weights, iterations, tolerance, out):
+    """Replaces a guess (1, 7) by the weighted Fréchet mean of points (N, 7), Gauss-Newton in the order of the rows."""
+    apart, step = np.empty((len(points), 6)), np.empty((1, 6))
+    for _ in range(iterations):
+        local(out, points, apart)
+        step[:] = 0.0
+        for i in range(len(points)):
+            for j in range(6):
+                step[0, j] += weights[i] * apart[i, j]
+        retract(out, step, out)
+        if np.abs(step).max() <= tolerance:
+            break
 
 
 @njit(_TWO, cache=True, error_model="numpy")

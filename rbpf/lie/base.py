@@ -18,8 +18,7 @@ StateArray = Float[np.ndarray, "*batch {self.size}"]
 TangentArray = Float[np.ndarray, "*batch {self.dim}"]
 TangentMatrix = Float[np.ndarray, "*batch {self.dim} {self.dim}"]
 
-_MEAN_ITERATIONS = 50
-_MEAN_TOLERANCE = 1e-14
+MEAN = 50, 1e-14  #: Iterations at most, and the step that ends them.
 
 
 def join(parts: Sequence[Array]) -> Array:
@@ -60,13 +59,16 @@ class LieGroup(ABC):
         within a quarter turn of one another; a wider cloud gives the stationary point next to its heaviest member. The sum
         runs in the order of the rows: equal bytes.
         """
-        points = np.asarray(x, dtype=float)
-        column = np.asarray(weights, dtype=float)[:, None]
-        mean = self._first_guess(points, column[:, 0])
-        for _ in range(_MEAN_ITERATIONS):
-            step = (column * self.local(mean, points)).sum(0)
+        points, weights = np.asarray(x, dtype=float), np.asarray(weights, dtype=float)
+        return self._mean_from(self._first_guess(points, weights), points, weights)
+
+    def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
+        """The stationary point next to a guess; a group may fuse the iteration."""
+        iterations, tolerance = MEAN
+        for _ in range(iterations):
+            step = (weights[:, None] * self.local(mean, points)).sum(0)
             mean = self.retract(mean, step)
-            if np.abs(step).max(initial=0.0) <= _MEAN_TOLERANCE:
+            if np.abs(step).max(initial=0.0) <= tolerance:
                 break
         return mean
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.kernels import se3 as kernels
-from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
+from rbpf.lie.base import MEAN, Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
 
 @final
@@ -44,6 +44,11 @@ class SE3Group(LieGroup):
 
     def local(self, x: States, y: States) -> TangentArray:
         return _two(kernels.local, x, y, 7, 6)
+
+    def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
+        mean = np.array(mean)[None]
+        kernels.mean(np.ascontiguousarray(points), np.ascontiguousarray(weights), *MEAN, mean)
+        return mean[0]
 
     def normalise(self, x: States) -> StateArray:
         out = np.array(x, dtype=float)
@@ -170,7 +175,9 @@ def _two(
     _require_size(x, 7)
     _require_size(y, size)
     shape = x.shape[:-1]
-    if y.shape[:-1] != shape:
+    if x.ndim == 1:
+        shape = y.shape[:-1]
+    elif y.ndim > 1 and y.shape[:-1] != shape:
         shape = np.broadcast_shapes(shape, y.shape[:-1])
         x, y = _spread(x, shape), _spread(y, shape)
     out = np.empty((*shape, out_size))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.kernels import forest
-from rbpf.kernels.dense import add_gram, add_inner, gather, product
+from rbpf.kernels.dense import add_gram, add_inner, gather, product, refine
 
 
 @pytest.fixture
@@ -38,6 +38,26 @@ def test_rows_that_read_few_columns_are_a_matrix(count, rng):
     add_gram(cov, rows, -1.0)
     expected = covariances(np.random.default_rng(4), 1, 9)[0] - rows.T @ rows
     np.testing.assert_allclose(np.tril(cov), np.tril(expected), rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("shared", [1, 4])
+@pytest.mark.parametrize("rank", [0, 2, 6])
+def test_a_refined_gaussian_is_numpys(rank, shared, rng):
+    """One that a model has spoilt is NaN, the others are as they are."""
+    info, vector, root = covariances(rng, 4, 6), rng.normal(size=(4, 6)), rng.normal(size=(shared, 6, rank))
+    mean, half, squared, log_det = np.empty((4, rank)), np.empty((4, rank, rank)), np.empty(4), np.empty(4)
+    refine(info, vector, root, mean, half, squared, log_det)
+    turned = np.swapaxes(root, 1, 2)
+    inside, ahead = np.eye(rank) + turned @ info @ root, turned @ vector[..., None]
+    np.testing.assert_allclose(mean, np.linalg.solve(inside, ahead)[..., 0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(half @ np.swapaxes(half, 1, 2), np.linalg.inv(inside), rtol=1e-9, atol=1e-12)
+    assert not np.tril(half, -1).any()
+    np.testing.assert_allclose(squared, (mean[:, None] @ ahead).ravel(), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(log_det, np.linalg.slogdet(inside)[1], rtol=1e-9, atol=1e-12)
+    if rank:
+        info[1] = np.nan
+        refine(info, vector, root, mean, half, squared, log_det)
+        np.testing.assert_array_equal(np.isnan(log_det), [False, True, False, False])
 
 
 def test_the_forest_is_compiled_as_it_is_loaded():
