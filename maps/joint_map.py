@@ -40,6 +40,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
+from rbpf.kernels.landmarks import expect_group
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.present import Present
@@ -246,7 +247,9 @@ class JointMap(Map):
     @property
     def is_full(self) -> bool:
         """Whether more landmarks are held than a sub-map should have, without those that leave."""
-        return self.submap is not None and np.setdiff1d(self.ids, self.leaving).size > self.submap
+        if self.submap is None or self.ids.size <= self.submap:
+            return False
+        return np.setdiff1d(self.ids, self.leaving).size > self.submap
 
     def make_room(self, order: np.ndarray) -> np.ndarray:
         """Lets go of the first of these landmarks (K,) until half of a sub-map is left, if they are worth one.
@@ -271,6 +274,8 @@ class JointMap(Map):
         Returns whether some can be: of those that are not about the start of the present one at least three, as many as tell
         a pose in space; fewer are not worth a solution of all.
         """
+        if not ids.size and not self._returning.size:
+            return False
         self._returning = np.union1d(self._returning, ids[~self.holds(ids)])
         self.leaving = np.setdiff1d(self.leaving, ids)
         near = np.isin(self._returning, self.old.near)
@@ -415,8 +420,8 @@ class JointMap(Map):
 
     def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
         if self._reading is None or not self._reading.is_of(self.held, cov, groups):
-            self._reading = Reading(self.held, cov, groups)
-        return self._reading.rows(groups, state, mean, self.origin if self.submap is None else None, self.compiled)
+            self._reading = Reading(self.held, cov, groups, self.compiled)
+        return self._reading.rows(groups, state, mean, self.origin if self.submap is None else None)
 
     def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Rows:
         """The rows at predicted states; what has been seen through the increment of a substate moves with the state."""
@@ -589,11 +594,23 @@ class JointMap(Map):
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
     ) -> tuple[np.ndarray, np.ndarray]:
-        predicted, inside = expected(model, self.read(ids), belief, self.compiled)
+        predicted, inside = self._expected(model, ids, belief)
         return model.residual(z[:, None, :], predicted[:, None]), inside[:, None] + cov[:, None]
 
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        return projected(model, self.read(ids), belief, self.compiled)
+        return projected(model, *self._expected(model, ids, belief), belief)
+
+    def _expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+        """As `expected`."""
+        kind, prior = self.held.of_one_kind(np.asarray(ids)), belief.prior
+        kernel = self.held.kernel(model, kind) if self.compiled else None
+        if kernel is None:
+            return expected(model, self.read(ids), belief)
+        predicted = np.empty((self.n, len(kind.rows), model.dim))
+        within, held = np.empty((*predicted.shape, model.dim)), (kind.columns, kind.clones, kind.origins)
+        mean, cov, root = map(np.ascontiguousarray, (self.mean, self.cov, prior.spread(prior.mean)))
+        expect_group(kernel.function.address, kernel.params, belief.state, mean, *held, cov, root, predicted, within)
+        return predicted, within
 
     def project_jointly(
         self, model: ObservationModel, ids: np.ndarray, belief: Belief

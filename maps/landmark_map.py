@@ -186,7 +186,7 @@ class LandmarkMap(Map):
             fused = kernel.function.address, kernel.params, state
             project(*fused, *access, anchor, weights, spread, sizes, mean, cov)
             return anchor + mean, cov
-        return rows.projected(model, self.read(ids), belief)
+        return rows.projected(model, *rows.expected(model, self.read(ids), belief), belief)
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         if not self.evidence:

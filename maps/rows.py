@@ -31,7 +31,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import linearise_all, refine, update
+from rbpf.kernels.landmarks import linearise_group, refine, update
 from rbpf.kernels.signature import run_driver
 from rbpf.lie import Array, LieGroup
 from rbpf.maps.store import Layout, SharedStore
@@ -383,19 +383,11 @@ def _likelihood(group: Observations) -> Likelihood:
 # What every map does alike: numbers for new landmarks, and what the particles expect to measure of the ones they hold.
 
 
-def expected(
-    model: ObservationModel, records: Records, belief: Belief, compiled: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
+def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
     """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
     prior, state = belief.prior, belief.state[:, None, :]
-    if compiled and fused_kernel(model) is not None:
-        zero = np.zeros((records.mean.shape[1], model.dim))
-        nu, *slopes = linearised(model, prior.space, zero, belief.state, records.mean, records.const, True)
-        predicted, jac = -nu, Jacobians(*slopes)
-    else:
-        predicted = model.predict(state, records.mean, records.const)
-        _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
-    by_state, by_landmark, _ = jac
+    predicted = model.predict(state, records.mean, records.const)
+    _, (by_state, by_landmark, _) = linearise(model, prior.space, predicted, state, records.mean, records.const)
     assert by_state is not None and by_landmark is not None
     moved = by_state @ prior.spread(prior.mean)[:, None]
     within = by_landmark @ records.cov @ np.swapaxes(by_landmark, -1, -2)
@@ -403,10 +395,9 @@ def expected(
 
 
 def projected(
-    model: ObservationModel, records: Records, belief: Belief, compiled: bool = False
+    model: ObservationModel, predicted: np.ndarray, within: np.ndarray, belief: Belief
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The moments (K, p), (K, p, p) of all particles' expectations together, see `Belief.project`."""
-    predicted, within = expected(model, records, belief, compiled)
+    """The moments (K, p), (K, p, p) of all particles' expectations together, see `expected` and `Belief.project`."""
     # Relative to the particle of highest weight, so that angles need not be wrapped.
     mode = predicted[belief.mode]
     mean, cov = gaussian.mixture_moments(belief.weights, model.residual(predicted, mode), within)
@@ -442,22 +433,16 @@ def innovations(
     model: ObservationModel, space: LieGroup, z: Array, state: Array, records: Records, compiled: bool
 ) -> tuple[Array, Jacobians, Records]:
     """Of one particle's records (1, K, …) at its state (E,), as `Map.innovations`."""
-    nu, *slopes = linearised(model, space, z, state[None], records.mean, records.const, compiled)
-    return nu[0], Jacobians(*(slope[0] for slope in slopes)), records
-
-
-def linearised(
-    model: ObservationModel, space: LieGroup, z: Array, state: Array, mean: Array, const: Array | None, compiled: bool
-) -> tuple[Array, Array, Array]:
-    """ν (N, K, p), ∂z/∂state (N, K, p, d), ∂z/∂landmark (N, K, p, D) of landmarks (N, K, D) at states (N, E)."""
-    (n, k, dim), p = mean.shape, z.shape[1]
-    kernel = fused_kernel(model) if compiled else None
+    kernel, const = fused_kernel(model) if compiled else None, records.const
     if kernel is None:
-        nu, jac = linearise(model, space, z, state[:, None], mean, const)
+        nu, jac = linearise(model, space, z, state, records.mean, const)
         assert jac.state is not None and jac.landmark is not None
-        return nu, jac.state, jac.landmark
-    held = np.empty((n, k, 0)) if const is None else np.broadcast_to(const, (n, *const.shape[1:]))
-    nu, by_state, by_landmark = np.empty((n, k, p)), np.empty((n, k, p, space.dim)), np.empty((n, k, p, dim))
-    arrays = (np.require(array, np.float64, ["C", "W"]) for array in (state, mean, held, z))
-    linearise_all(kernel.function.address, kernel.params, *arrays, nu, by_state, by_landmark)
-    return nu, by_state, by_landmark
+        return nu[0], Jacobians(jac.state[0], jac.landmark[0]), records
+    (_, k, dim), p = records.mean.shape, z.shape[1]
+    said, slope = np.zeros((1, 1 + space.dim, k * p)), np.zeros((k * p, dim))
+    columns, none = np.arange(k * dim).reshape(k, dim), np.zeros((k, 0), dtype=np.int64)
+    arrays = state[None], records.mean.reshape(1, -1), np.empty((k, 0)) if const is None else const[0], z
+    at, mean, origins, z = (np.require(array, np.float64, ["C", "W"]) for array in arrays)
+    linearise_group(kernel.function.address, kernel.params, at, mean, columns, none, origins, z, 0, said, slope)
+    by_state = said[0, 1:].T.reshape(k, p, space.dim)
+    return said[0, 0].reshape(k, p), Jacobians(by_state, slope.reshape(k, p, dim)), records

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.core import checkpoint
-from rbpf.core.models import Landmark
+from rbpf.core.models import FusedKernel, Landmark, ObservationModel, Part
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, SE2Group, SE3Group
+from rbpf.maps.rows import fused_kernel
 
 
 class Table(NamedTuple):
@@ -26,7 +27,7 @@ class Kind(NamedTuple):
     rows: np.ndarray
     columns: np.ndarray  #: (K, D) of their means.
     clones: np.ndarray  #: (K, d) columns of what they are anchored at; (K, 0) where they are not.
-    origins: np.ndarray  #: (K, E) K of these clones; (0, E) where there are none.
+    origins: np.ndarray  #: (K, E) K of these clones; (K, 0) where there are none.
 
 
 class JointColumns:
@@ -118,6 +119,12 @@ class JointColumns:
         """Where anchored landmarks are anchored (…, K, E), in the frame, by means (…, n)."""
         return self.space.retract(kind.origins, mean[..., kind.clones])
 
+    def kernel(self, model: ObservationModel, kind: Kind | None) -> FusedKernel | None:
+        """That of a model of landmarks of a kind, where `linearise_group` knows how they are anchored."""
+        if kind is None or (Part.SUBSTATE in model.reads and model.about is None):
+            return None
+        return fused_kernel(model) if not kind.landmark.anchored or isinstance(self.space, SE3Group) else None
+
     def points(self, kind: Kind, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Landmarks as points (…, K, dim) in the frame, of means (…, n), and how they move by their columns and clones."""
         if not kind.landmark.anchored:
@@ -160,5 +167,5 @@ class JointColumns:
         landmark, clones = self.kinds[number], self.table.clone[rows]
         columns = self.table.first[rows, None] + np.arange(landmark.dim)
         if not landmark.anchored:
-            return Kind(landmark, rows, columns, np.zeros((rows.size, 0), dtype=np.int64), self.clones[:0])
+            return Kind(landmark, rows, columns, np.zeros((rows.size, 0), dtype=np.int64), np.zeros((rows.size, 0)))
         return Kind(landmark, rows, columns, self.clone_columns(clones), self.clones[clones])

@@ -11,12 +11,13 @@ from scipy.linalg.blas import dsyrk, dtrsm
 
 from rbpf import gaussian
 from rbpf.core.linearisation import linearise
-from rbpf.core.models import NEW, NULL, Jacobians, Likelihood, Observations, Part
+from rbpf.core.models import NEW, NULL, FusedKernel, Likelihood, Observations, Part
 from rbpf.core.particles import Information, weighted_mean
 from rbpf.errors import InputError
 from rbpf.kernels.dense import add_gram, add_inner, congruent, gather, mirror, product
+from rbpf.kernels.landmarks import linearise_group
 from rbpf.maps.joint.columns import JointColumns, Kind
-from rbpf.maps.rows import GAUSSIAN, linearised
+from rbpf.maps.rows import GAUSSIAN
 
 QUICK = 30_000_000
 """Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
@@ -58,18 +59,19 @@ class Rows(NamedTuple):
         gather(self.at, self.slope, np.ascontiguousarray(matrix), out)
         return out
 
-    def inliers(self) -> np.ndarray:
+    def inliers(self) -> np.ndarray | slice:
         """The rows that update, those of the surest observations first."""
         if all(group.likelihood.kernel_id == 0 for group in self.groups):
-            return np.arange(len(self.cov))
+            return slice(None)
         pairs = [pair for group in self.groups for pair in zip(group.log_odds, group.rows, strict=True)]
         found = [(-odds, *rows) for odds, rows in pairs if odds >= 0.0]
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
-    def factor(self) -> tuple[np.ndarray, np.ndarray]:
+    def factor(self) -> tuple[np.ndarray | slice, np.ndarray]:
         """The `inliers`, and Cholesky's factor of their covariance."""
         inside = self.inliers()
-        return inside, gaussian.cholesky(self.cov[inside[:, None], inside]) if inside.size else np.zeros((0, 0))
+        cov = self.cov[inside][:, inside]
+        return inside, gaussian.cholesky(cov) if len(cov) else cov
 
     def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
         """The same where all that is held moves with the state, by gain (n, d) times turn (N, d, d)."""
@@ -81,19 +83,13 @@ class Rows(NamedTuple):
         inside, chol = self.factor()
         white = whitened(chol, self.said[..., inside])
         gram = white @ np.swapaxes(white, 1, 2)
-        total = Information.zeros(len(gram), gram.shape[1] - 1)
-        total.info += gram[:, 1:, 1:]
-        total.vector += gram[:, 1:, 0]
-        total.quad += gram[:, 0, 0]
-        total.log_factor += self.log_factor
-        total.rows += inside.size
-        is_density = np.ones(len(self.cov), dtype=bool)
+        log_factor, is_density = self.log_factor, np.ones(len(self.cov), dtype=bool)
         for likelihood, own, log_odds, _ in self.groups:
             count = int((log_odds >= 0.0).sum())
-            total.log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
+            log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
             is_density[own] = likelihood.normalised
-        total.log_det += log_det(np.diagonal(chol)[is_density[inside]])
-        return total
+        of_all = log_det(np.diagonal(chol)[is_density[inside]]), log_factor, float(len(chol))
+        return Information(gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0], *np.repeat([of_all], len(gram), axis=0).T)
 
     def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One gain for all particles: log p(z | x) (N,), by what the means move (N, n), and the covariance (n, n) after."""
@@ -130,12 +126,14 @@ class Reading:
         held: which columns there are.
         cov: (n, n) of the map.
         groups: the observations.
+        compiled: use the models' fused kernels where they have one.
     """
 
-    def __init__(self, held: JointColumns, cov: np.ndarray, groups: Sequence[Observations]) -> None:
+    def __init__(self, held: JointColumns, cov: np.ndarray, groups: Sequence[Observations], compiled: bool) -> None:
         self._table, self._groups, self._of, self.held = held.table, groups, cov, held
         self._cov, self._log_factor = np.ascontiguousarray(cov), 0.0
-        self._parts = list[tuple[np.ndarray, Kind | None, np.ndarray]]()  # which measurements, of what, rows (K, p)
+        # Which measurements, of what, rows (K, p), and the kernel that they are linearised by.
+        self._parts = list[tuple[np.ndarray, Kind | None, np.ndarray, FusedKernel | None]]()
         read, noises, first = list[np.ndarray](), list[np.ndarray](), 0
         for group in groups:
             ids, kind, reads = checked_ids(group), None, group.model.reads
@@ -152,13 +150,13 @@ class Reading:
                 at.append(np.tile(np.arange(held.space.dim), (seen.size, 1)))
             p = group.z.shape[1]
             rows = first + np.arange(seen.size * p).reshape(seen.size, p)
-            self._parts.append((seen, kind, rows))
+            self._parts.append((seen, kind, rows, held.kernel(group.model, kind) if compiled else None))
             read.append(np.repeat(np.concatenate(at, axis=1), p, axis=0))
             noises.append(group.cov[seen])
             first += rows.size
         widest = max((columns.shape[1] for columns in read), default=0)
         self._at, self._noise = np.zeros((first, widest), dtype=np.int64), np.zeros((first, first))
-        for (_, _, rows), columns, noise in zip(self._parts, read, noises, strict=True):
+        for (_, _, rows, _), columns, noise in zip(self._parts, read, noises, strict=True):
             self._at[rows.ravel(), : columns.shape[1]] = columns
             self._noise[rows[:, :, None], rows[:, None]] = noise
 
@@ -171,25 +169,34 @@ class Reading:
         )
 
     def rows(
-        self,
-        groups: Sequence[Observations],
-        state: np.ndarray,
-        mean: np.ndarray,
-        origin: np.ndarray | None,
-        compiled: bool,
+        self, groups: Sequence[Observations], state: np.ndarray, mean: np.ndarray, origin: np.ndarray | None
     ) -> Rows:
         """Linearises all groups, at states (N, E) and the particles' own means (N, n).
 
         Jacobians by what is held are averaged over the particles. `origin` is None where nothing may be observed in the
-        world; `compiled` uses the models' fused kernels where they have one.
+        world.
         """
         held, space, (n, d) = self.held, self.held.space, (len(state), self.held.space.dim)
+        mean = np.ascontiguousarray(mean)
         count, parts = len(self._at), list[Group]()
         said, by_held = np.zeros((n, 1 + d, count)), np.zeros(self._at.shape)
-        for group, (seen, kind, rows) in zip(groups, self._parts, strict=True):
+        for group, (seen, kind, rows, kernel) in zip(groups, self._parts, strict=True):
             model, z, at = group.model, group.z[seen], state[:, None]
             log_odds = np.full(seen.size, np.inf) if group.log_odds is None else group.log_odds[seen]
             parts.append(Group(group.likelihood or GAUSSIAN, rows, log_odds, kind))
+            if kernel is not None and kind is not None:
+                columns = kind.columns, kind.clones, kind.origins
+                first = int(rows[0, 0]) if rows.size else 0
+                linearise_group(kernel.function.address, kernel.params, state, mean, *columns, z, first, said, by_held)
+                if model.about is not None and rows.size:
+                    # By what all particles have in common: in the slope they differ in the second order.
+                    centre, middle = space.mean(state, np.full(n, 1.0 / n)), mean.mean(axis=0)
+                    const = held.poses(kind, middle) if kind.landmark.anchored else None
+                    by_substate = model.by_substate(centre, middle[kind.columns], const).reshape(rows.size, -1)
+                    own, used = slice(first, first + rows.size), kind.columns.shape[1] + kind.clones.shape[1]
+                    said[:, 0, own] -= (mean[:, d : held.first] - model.about) @ by_substate.T
+                    by_held[own, used : used + by_substate.shape[1]] = by_substate
+                continue
             landmarks = anchors = substate = None
             if kind is not None:
                 landmarks = mean[:, kind.columns]
@@ -201,18 +208,7 @@ class Reading:
                     name = type(model).__name__
                     raise InputError(f"{name} observes the pose in the world: sub-maps do not take that")
                 at = space.compose(space.retract(origin, mean[:, :d]), state)[:, None]
-            if landmarks is None or (substate is not None and model.about is None) or not compiled:
-                found, jac = linearise(model, space, z, at, landmarks, anchors, substate)
-            else:
-                found, *by = linearised(model, space, z, state, landmarks, anchors, True)
-                jac = Jacobians(*by)
-                if substate is not None:
-                    # By what all particles have in common: in the slope they differ in the second order.
-                    centre = space.mean(state, np.full(n, 1.0 / n))
-                    const = None if kind is None or anchors is None else held.poses(kind, mean.mean(axis=0))
-                    by_substate = model.by_substate(centre, landmarks.mean(axis=0), const)
-                    found = found - np.moveaxis(by_substate @ (substate[:, 0] - model.about).T, -1, 0)
-                    jac = jac._replace(substate=by_substate[None])
+            found, jac = linearise(model, space, z, at, landmarks, anchors, substate)
             # By what slope each observation reads the Gaussian, in the order of its columns.
             used = list[np.ndarray]()
             if kind is not None:
@@ -310,13 +306,13 @@ def _swept(given: np.ndarray, rows: np.ndarray, back: bool) -> np.ndarray:
     return given
 
 
-def beyond_gaussian(rows: Rows, inside: np.ndarray, chol: np.ndarray, white: np.ndarray) -> np.ndarray:
+def beyond_gaussian(rows: Rows, inside: np.ndarray | slice, chol: np.ndarray, white: np.ndarray) -> np.ndarray:
     """What likelihoods other than the Gaussian add to log N (N,) of the inliers, Mathematics (joint-outlier-weight).
 
     Each inlier's own log-density in place of the Gaussian, given the inliers before it; and each outlier's, given all inliers.
     """
     total, place = np.zeros(len(white)), np.empty(rows.nu.shape[1], dtype=np.int64)
-    place[inside] = np.arange(inside.size)
+    place[inside] = np.arange(len(chol))
     for likelihood, own, log_odds, _ in rows.groups:
         if likelihood.kernel_id == 0:
             continue
@@ -325,7 +321,7 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray, chol: np.ndarray, white: np.
         nu, cov = (lower @ white[:, at][..., None])[..., 0], gaussian.gram(lower)
         total += (likelihood.log_density(nu, cov) - gaussian.log_density(nu, cov)).sum(axis=1)
         out = own[log_odds < 0.0]
-        half = whitened(chol, rows.cov[np.ix_(out.ravel(), inside)]).T
+        half = whitened(chol, rows.cov[out.ravel()][:, inside]).T
         nu = (rows.nu[:, out.ravel()] - white @ half).reshape(len(white), *out.shape)
         explained = diagonal_blocks(half.T @ half, np.arange(out.size).reshape(out.shape))
         total += likelihood.log_density(nu, diagonal_blocks(rows.cov, out) - explained).sum(axis=1)

@@ -12,6 +12,7 @@ from numba import int64, njit, prange, void
 from rbpf.kernels import block as lanes
 from rbpf.kernels.block import packed
 from rbpf.kernels.gate import accept_predicted, is_inlier, leave_out, log_likelihood
+from rbpf.kernels.se3 import back, cross, exp_pair, left_jacobian, multiply, rotation, times, turned
 from rbpf.kernels.signature import (
     BLOCK,
     CUBE,
@@ -30,6 +31,8 @@ RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
 OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
 _REFINE = void(int64, VECTOR, MATRIX, *RECORDS, *OBSERVED, CUBE, INDICES, CUBE, MATRIX, VECTOR, VECTOR, VECTOR)
 _UPDATE = void(int64, VECTOR, MATRIX, *RECORDS, INDICES, *OBSERVED, INDICES, VECTOR)
+#: Types of (address, params, state, mean, columns, clones, origins), see `linearise_group`.
+_GROUP = int64, VECTOR, MATRIX, MATRIX, INDEX_MATRIX, INDEX_MATRIX, MATRIX
 _PROJECT = void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE)
 
 
@@ -251,28 +254,122 @@ def call_kernel(address, state, mean, const, z, params, n, nu, jac_state, jac_la
     kernel(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
 
 
-@njit(void(int64, VECTOR, MATRIX, CUBE, CUBE, MATRIX, CUBE, HYPERCUBE, HYPERCUBE), cache=True, error_model="numpy")
-def linearise_all(address, params, state, mean, const, z, nu, jac_state, jac_landmark):
-    """Fills `nu` (N, K, p), `jac_state` (N, K, p, d) and `jac_landmark` (N, K, p, D) of K landmarks in N particles.
+@njit(cache=True, error_model="numpy")
+def _load(mean, columns, clone, origin, start, count, landmark, pose):
+    """Fills lanes with a landmark (D, BLOCK), and with where it is anchored: its origin, or a clone K Exp(δ) (7, BLOCK)."""
+    for i in range(count):
+        own = mean[start + i]
+        for j in range(columns.size):
+            landmark[j, i] = own[columns[j]]
+        for j in range(origin.size):
+            pose[j, i] = origin[j]
+        if clone.size:
+            w = (own[clone[0]], own[clone[1]], own[clone[2]])
+            turn, shift = exp_pair(w, (own[clone[3]], own[clone[4]], own[clone[5]]))
+            q = (origin[0], origin[1], origin[2], origin[3])
+            shift, q = turned(q, shift), multiply(q, turn)
+            pose[0, i], pose[1, i], pose[2, i], pose[3, i] = q
+            for j in range(3):
+                pose[4 + j, i] = origin[4 + j] + shift[j]
 
-    The states are (N, E), the landmarks `mean` (N, K, D) and `const` (N, K, A), measured as `z` (K, p).
+
+@njit(cache=True, error_model="numpy")
+def _add_by_clone(own, clone, state, anchor, i, by_state, weight, tangent, jacobian, out):
+    """Adds to out (p, 6) −weight H Ad(y⁻¹ C) J_r(δ), of lane i: how rows move with the δ of the clone C = K Exp(δ)."""
+    for j in range(6):
+        tangent[0, j] = -own[clone[j]]
+    left_jacobian(tangent, jacobian)
+    r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
+    s = rotation(anchor[0, i], anchor[1, i], anchor[2, i], anchor[3, i])
+    apart = (anchor[4, i] - state[4, i], anchor[5, i] - state[5, i], anchor[6, i] - state[6, i])
+    for a in range(len(by_state)):
+        # In the world's axes Ad(y⁻¹ C) takes (a, v) to (a + v × t, v).
+        v = times(r, by_state[a, 3, i], by_state[a, 4, i], by_state[a, 5, i])
+        w = times(r, by_state[a, 0, i], by_state[a, 1, i], by_state[a, 2, i])
+        moment = cross(v, apart)
+        w = back(s, w[0] + moment[0], w[1] + moment[1], w[2] + moment[2])
+        v = back(s, v[0], v[1], v[2])
+        for j in range(6):
+            total = 0.0
+            for k in range(3):
+                total += w[k] * jacobian[0, k, j] + v[k] * jacobian[0, 3 + k, j]
+            out[a, j] -= weight * total
+
+
+@njit(void(*_GROUP, MATRIX, int64, CUBE, MATRIX), cache=True, error_model="numpy")
+def linearise_group(address, params, state, mean, columns, clones, origins, z, first, said, slope):
+    """Fills rows from `first` on of `said` (N, 1 + d, R), ν and ∂z/∂state, and of slopes (R, q), averages over the particles.
+
+    Of K landmarks, measured as z (K, p), in particles with states (N, E) and means (N, n): `columns` (K, D), the `clones`
+    (K, 6) that they are anchored at by their columns, (K, 0) where they are at none; and their constants, or K of the clones,
+    `origins` (K, A). The slopes are ∂z/∂landmark, then by the clone.
     """
     kernel = kernel_at(address)
-    particles, count, p = nu.shape
-    x = np.empty((state.shape[1], BLOCK))
-    lane_mean, lane_const = np.empty((mean.shape[2], BLOCK)), np.empty((const.shape[2], BLOCK))
-    lane_nu = np.empty((p, BLOCK))
-    by_state = np.zeros((p, jac_state.shape[3], BLOCK))
-    by_landmark = np.empty((p, jac_landmark.shape[3], BLOCK))
-    for first in range(0, particles, BLOCK):
-        n = min(BLOCK, particles - first)
+    (particles, size), (count, dim), p = said.shape[:2], columns.shape, z.shape[1]
+    anchored = clones.shape[1] > 0
+    x, landmark, anchor = np.empty((state.shape[1], BLOCK)), np.empty((dim, BLOCK)), np.empty((origins.shape[1], BLOCK))
+    nu, by_state, by_landmark = np.empty((p, BLOCK)), np.zeros((p, size - 1, BLOCK)), np.empty((p, dim, BLOCK))
+    tangent, jacobian = np.empty((1, 6)), np.empty((1, 6, 6))
+    for start in range(0, particles, BLOCK):
+        n = min(BLOCK, particles - start)
         for i in range(n):
-            x[:, i] = state[first + i]
+            x[:, i] = state[start + i]
         for k in range(count):
+            _load(mean, columns[k], clones[k], origins[k], start, n, landmark, anchor)
+            kernel(x, landmark, anchor, z[k], params, n, nu, by_state, by_landmark)
+            for a in range(p):
+                row = first + k * p + a
+                for i in range(n):
+                    said[start + i, 0, row] = nu[a, i]
+                    for e in range(size - 1):
+                        said[start + i, 1 + e, row] = by_state[a, e, i]
+                for j in range(dim):
+                    total = 0.0
+                    for i in range(n):
+                        total += by_landmark[a, j, i]
+                    slope[row, j] += total / particles
+            if anchored:
+                out = slope[first + k * p : first + (k + 1) * p, dim : dim + 6]
+                for i in range(n):
+                    _add_by_clone(
+                        mean[start + i], clones[k], x, anchor, i, by_state, 1.0 / particles, tangent, jacobian, out
+                    )
+
+
+@njit(void(*_GROUP, MATRIX, CUBE, CUBE, HYPERCUBE), cache=True, error_model="numpy")
+def expect_group(address, params, state, mean, columns, clones, origins, cov, root, predicted, within):
+    """Fills what each particle expects to measure, `predicted` (N, K, p), and J P Jᵀ + H L Lᵀ Hᵀ, `within` (N, K, p, p).
+
+    Arguments as of `linearise_group`; further the map's covariance (n, n), and L (N or 1, d, r) of the predicted states.
+    """
+    kernel = kernel_at(address)
+    (particles, count, p), dim, (_, size, rank) = predicted.shape, columns.shape[1], root.shape
+    x, landmark, anchor = np.empty((state.shape[1], BLOCK)), np.empty((dim, BLOCK)), np.empty((origins.shape[1], BLOCK))
+    nu, by_state, by_landmark = np.empty((p, BLOCK)), np.zeros((p, size, BLOCK)), np.empty((p, dim, BLOCK))
+    zero, carried, moved = np.zeros(p), np.empty((p, dim)), np.empty((p, rank))
+    for start in range(0, particles, BLOCK):
+        n = min(BLOCK, particles - start)
+        for i in range(n):
+            x[:, i] = state[start + i]
+        for k in range(count):
+            _load(mean, columns[k], clones[k], origins[k], start, n, landmark, anchor)
+            kernel(x, landmark, anchor, zero, params, n, nu, by_state, by_landmark)
             for i in range(n):
-                lane_mean[:, i], lane_const[:, i] = mean[first + i, k], const[first + i, k]
-            kernel(x, lane_mean, lane_const, z[k], params, n, lane_nu, by_state, by_landmark)
-            for i in range(n):
-                nu[first + i, k] = lane_nu[:, i]
-                jac_state[first + i, k] = by_state[:, :, i]
-                jac_landmark[first + i, k] = by_landmark[:, :, i]
+                spread = root[start + i if len(root) > 1 else 0]
+                for a in range(p):
+                    predicted[start + i, k, a] = -nu[a, i]
+                    for j in range(dim):
+                        carried[a, j] = 0.0
+                        for b in range(dim):
+                            carried[a, j] += by_landmark[a, b, i] * cov[columns[k, b], columns[k, j]]
+                    for r in range(rank):
+                        moved[a, r] = 0.0
+                        for e in range(size):
+                            moved[a, r] += by_state[a, e, i] * spread[e, r]
+                    for b in range(a + 1):
+                        total = 0.0
+                        for j in range(dim):
+                            total += carried[a, j] * by_landmark[b, j, i]
+                        for r in range(rank):
+                            total += moved[a, r] * moved[b, r]
+                        within[start + i, k, a, b] = within[start + i, k, b, a] = total

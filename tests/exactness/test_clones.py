@@ -7,8 +7,8 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
-from rbpf.core.models import Landmark, Observations, Records
-from rbpf.core.particles import Particles
+from rbpf.core.models import Belief, Landmark, Observations, Part, Records
+from rbpf.core.particles import Particles, Prior
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
@@ -162,6 +162,24 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
     np.testing.assert_allclose(by_mean, numeric(measured, joint.mean[0]), atol=1e-4)
     by_state = numeric(lambda xi: measured(joint.mean[0], SE3.retract(particles.state, xi)), np.zeros(6))
     np.testing.assert_allclose(rows.said[0, 1:].T, by_state, atol=1e-4)
+
+
+def test_the_loops_do_what_numpy_does():
+    """More particles than a block of lanes has, of which the last one is not full; points, and rays at two clones."""
+    joint, particles = rays(150)
+    prior = Prior(SE3, particles.state, np.full((1, 6), 0.01), 0.01 * np.eye(6)[None], centred=False)
+    belief = Belief(particles.log_weights, prior, {Part.LANDMARK: joint})
+    kinds = (CameraRay(CAMERA), np.array([11, 20, 23])), (CameraPoint(CAMERA), np.array([9, 5]))
+    cov = np.repeat(np.eye(2)[None], 3, axis=0)
+    groups = [Observations(np.ones((ids.size, 2)), cov[: ids.size], model, ids=ids) for model, ids in kinds]
+    found = []
+    for compiled in (True, False):
+        joint.compiled, joint._reading = compiled, None
+        rows = joint._rows(particles.state, joint.mean, joint.cov, groups)
+        expected = [joint.project(model, ids, belief) for model, ids in kinds]
+        found.append([rows.said, rows.slope, rows.carried, rows.cov, *(each for pair in expected for each in pair)])
+    for first, second in zip(*found, strict=True):
+        np.testing.assert_allclose(first, second, 1e-9, 1e-9)
 
 
 def test_what_is_told_of_rays_is_the_gaussian_carried_over():
