@@ -11,8 +11,9 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.features.interface import checked_image
 
-#: What a product of grey levels and a template cost beside the pairs of `rbpf.kernels.signature`.
-PAIRS_PER_PRODUCT, PAIRS_PER_TEMPLATE = 1.0 / 400.0, 300.0
+#: What a product of grey levels and a template count beside the pairs of `rbpf.kernels.signature`: a quarter of what they
+#: cost, so that threads are woken for a millisecond at least. On a busy machine a frame would wait for them far longer.
+PAIRS_PER_PRODUCT, PAIRS_PER_TEMPLATE = 1.0 / 1600.0, 75.0
 LARGEST_SIZE = 101  #: Of a template: sums of squares over a window stay far inside 32 bits.
 
 

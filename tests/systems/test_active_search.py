@@ -14,7 +14,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.patches.search import cut
 from rbpf.sensors.readers import open_images, read_known_points
-from rbpf.systems.mono.active_search import RobustMotionGate, SearchResult
+from rbpf.systems.mono.active_search import CAUCHY_SCALE, ROUNDS, RobustMotionGate, SearchResult
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -107,6 +107,29 @@ def matches(seed: int, count: int = 20) -> tuple[np.ndarray, ...]:
 
 
 fit_motion = RobustMotionGate().fit
+
+
+@pytest.mark.parametrize("rank", [4, 6])
+def test_the_fit_is_numpys(rank):
+    """Reweighted least squares of ε = L u, some matches not trusted."""
+    nu, jac, cov, factor, _ = matches(5)
+    nu[3] += 30.0
+    cov, factor, trusted = cov + 0.3, (factor + 0.01)[:, :rank], np.arange(len(nu)) % 3 > 0
+    chol = np.linalg.cholesky(cov[trusted])
+    white, slope = (np.linalg.solve(chol, each) for each in (nu[trusted, :, None], jac[trusted] @ factor))
+    u = np.zeros(rank)
+    for _ in range(ROUNDS):
+        weight = 1.0 / (1.0 + np.square(white[..., 0] - slope @ u).sum(axis=1) / CAUCHY_SCALE**2)
+        weighed = (weight[:, None, None] * slope).reshape(-1, rank)
+        info = np.eye(rank) + weighed.T @ slope.reshape(-1, rank)
+        u = np.linalg.solve(info, weighed.T @ white.ravel())
+    fit = fit_motion(nu, jac, cov, factor, trusted)
+    np.testing.assert_allclose(fit.increment, factor @ u, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(fit.cov, factor @ np.linalg.solve(info, factor.T), rtol=1e-9, atol=1e-12)
+    off, given = nu - jac @ fit.increment, cov + jac @ fit.cov @ np.swapaxes(jac, 1, 2)
+    given[trusted] = cov[trusted]
+    expected = (off[:, None] @ np.linalg.solve(given, off[..., None])).ravel()
+    np.testing.assert_allclose(fit.squared, expected, rtol=1e-8)
 
 
 def test_without_outliers_it_is_near_the_posterior_of_a_linear_model():

@@ -14,6 +14,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.models import Belief
+from rbpf.kernels.dense import fit_robustly
 from rbpf.sensors.patches.search import search, warp
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
@@ -77,12 +78,9 @@ class RobustMotionGate(OutlierGate):
         chol = gaussian.cholesky(cov[trusted])
         white = gaussian.solve_lower(chol, nu[trusted])
         slope = gaussian.solve_lower_matrix(chol, jac[trusted] @ factor)
-        u, unit = np.zeros(factor.shape[1]), np.eye(factor.shape[1])
-        for _ in range(ROUNDS):
-            weight = 1.0 / (1.0 + np.square(white - slope @ u).sum(axis=1) / CAUCHY_SCALE**2)
-            weighed = (weight[:, None, None] * slope).reshape(-1, u.size)
-            info = unit + weighed.T @ slope.reshape(-1, u.size)
-            u = np.linalg.solve(info, weighed.T @ white.ravel())
+        u, info = np.empty(factor.shape[1]), np.empty((factor.shape[1],) * 2)
+        white, slope = np.ascontiguousarray(white), np.ascontiguousarray(slope)
+        fit_robustly(white, slope, ROUNDS, CAUCHY_SCALE, u, info)
         half = gaussian.solve_lower_matrix(gaussian.cholesky(info), factor.T)
         increment, spread = factor @ u, half.T @ half
         squared = np.empty(nu.shape[0])

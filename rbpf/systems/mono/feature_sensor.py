@@ -392,8 +392,9 @@ class FeatureSensor(Sensor):
 
     def remove(self, belief: Belief, names: np.ndarray) -> None:
         """Drops features from all particles."""
-        ids = self._ids(belief, names)
-        belief.map.remove(ids[ids >= 0])
+        if names.size:
+            ids = self._ids(belief, names)
+            belief.map.remove(ids[ids >= 0])
 
     def _in_world(self, belief: Belief, position: np.ndarray, particles: slice) -> np.ndarray:
         """Homogeneous points (n, k, 4) of some particles' frames, where states are, in their worlds."""

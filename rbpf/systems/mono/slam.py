@@ -294,14 +294,12 @@ class MonoSlam(System):
 
         seen = measured.features if isinstance(measured, Measurement) else frame
         assert isinstance(seen, FeatureFrame)
-        # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
-        near = mixture_estimate(*report.mixture).mean[:7]
-
         # 6. As long as depths are unknown: batch adjustment of the frames so far, and particles drawn from it; once they are
         # known, one Gaussian, if there is to be one. It stays where it is while the camera is lost.
         revision: Revision | None = None
         if not self.start.over or self.hand_over.is_ahead:
-            self.first.note(seen, near)
+            # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
+            self.first.note(seen, mixture_estimate(*report.mixture).mean[:7])
             is_usable, is_lost = not sensor.bad_frames, sensor.lost and len(sensor.table) > 0
             adjusted, words = self.start.after_frame(self.filter, is_usable, is_lost)
             messages = [words, *messages] if words is not None else messages
