@@ -118,7 +118,7 @@ def cache_features(
 class CachedFrontEnd(ImageFrontEnd):
     """Takes pairs whose features are known, in place of images."""
 
-    frames = (CachedPair,)
+    takes = CachedPair
 
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
         return frame.features, frame.problem

@@ -22,6 +22,7 @@ from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
 
@@ -78,7 +79,8 @@ def named_stereo() -> Case:
     world = LabWorld(LabDrive(frames=8, every=4), points=2000)
     log = simulate_features(world, Measuring(known=0, measurements=20, new_per_frame=20), STEREO, 0)
     config = StereoConfig(particles=10, trigger=TriggerConfig(0.0, 0.0))
-    return Case(lambda: StereoSlam(log.camera, config), log.frames[:6], log.frames[6:])
+    make = lambda: StereoSlam(log.camera, config, front_end=NamedFrontEnd(log.camera, config))  # noqa: E731
+    return Case(make, log.frames[:6], log.frames[6:])
 
 
 def robot(**options: str) -> Case:

@@ -10,6 +10,7 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import Tracked, TrackingState
 
@@ -30,7 +31,8 @@ def frames(count: int = 4, missing: tuple[int, ...] = ()) -> list[FeatureFrame]:
 
 
 def slam(dof: int = 6, **options) -> StereoSlam:
-    return StereoSlam(RIG, StereoConfig(particles=20, dof=dof, map=MapConfig(used=False), **options))
+    config = StereoConfig(particles=20, dof=dof, map=MapConfig(used=False), **options)
+    return StereoSlam(RIG, config, front_end=NamedFrontEnd(RIG, config))
 
 
 NEVER = {"trigger": TriggerConfig(9.0, 9.0)}

@@ -13,6 +13,7 @@ from rbpf.runs.trajectory import align
 from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measurements, initial_estimate, point_dim
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
+from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
@@ -123,7 +124,8 @@ def test_visual_odometry_alone(tracks, solved):
     log = tracks.log
     frames = [replace(frame, stamp_ns=100_000_000 * frame.stamp_ns) for frame in log.frames]
     odometry = OdometryConfig(prior=MotionPrior(std_speed=10.0))
-    slam = StereoSlam(log.camera, StereoConfig(1, odometry=odometry, map=MapConfig(used=False)))
+    config = StereoConfig(1, odometry=odometry, map=MapConfig(used=False))
+    slam = StereoSlam(log.camera, config, front_end=NamedFrontEnd(log.camera, config))
     said = [slam.take(frame) for frame in frames]
     path = np.array([one.values["odometry"] for one in said])
     batch = SE3.between(solved.world_from_body[0], solved.world_from_body)

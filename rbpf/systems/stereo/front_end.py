@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.checkpoint import Schema, integers, numbers, read
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
@@ -25,17 +25,9 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.landmarks import DescriptorLandmarks, F, FeatureKind, Landmarks, NamedLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
-_LABELS = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
-_PAIR = {
-    "z": numbers("features", 3),
-    "cov": numbers("features", 3, 3),
-    "names": integers("features", least=0),
-    **_LABELS,
-}
-
-KEPT = {
-    "z": numbers("features", 3),
-    "cov": numbers("features", 3, 3),
+_STOOD = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
+_PIXELS = {"z": numbers("features", 3), "cov": numbers("features", 3, 3)}
+KEPT = _PIXELS | {
     "scale": numbers("features"),
     "orientation": numbers("features"),
     "descriptors": numbers("features", "length", dtype=np.float32),
@@ -46,8 +38,11 @@ KEPT = {
 class FrontEnd(ABC, Generic[F]):
     """Measures frames and matches pairs."""
 
-    frames: ClassVar[tuple[type, ...]]  #: types of the frames that it takes.
+    takes: ClassVar[type[Any]]  #: of the frames.
     names_landmarks: ClassVar[bool] = False  #: whether the frames themselves say which landmark each feature is.
+    kept: ClassVar[
+        Schema
+    ]  #: attributes of the features of a pair from which `features` makes them again, for checkpoints.
     rig: RectifiedStereo
     config: StereoConfig
     landmarks: Landmarks[F]  #: the map's side: finds landmarks among the features.
@@ -87,16 +82,26 @@ class FrontEnd(ABC, Generic[F]):
         return np.full(len(pair), NULL, dtype=np.int64), np.full(len(pair), FeatureKind.FEATURE)
 
     @abstractmethod
-    def arrays(self, pair: Pair[F]) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+    def features(self, kept: dict[str, np.ndarray]) -> F:
+        """Features of which a checkpoint has held these arrays."""
 
     @abstractmethod
+    def half(self, features: F) -> np.ndarray:
+        """A random half (K,) bool of the features, in which each is always or never, whenever it is seen."""
+
+    def arrays(self, pair: Pair[F]) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {f"pair/{name}": getattr(pair.features, name) for name in self.kept} | {"pair/stood": pair.labels}
+
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[F]:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
+        found = read(arrays, {**self.kept, **_STOOD}, "pair/")
+        labels = found.pop("stood")
+        return replace(self.pair(0, self.features(found)), labels=labels)
 
-    def _pair(self, stamp_ns: int, features: F, half: np.ndarray) -> Pair[F]:
-        """A pair whose features odometry and map share as the settings say; `half` (K,) of them are always on one side."""
-        split, everything = self.config.odometry.split, np.ones(len(features), dtype=bool)
+    def pair(self, stamp_ns: int, features: F) -> Pair[F]:
+        """A pair whose features odometry and map share as the settings say."""
+        split, everything, half = self.config.odometry.split, np.ones(len(features), dtype=bool), self.half(features)
         for_map = {"none": everything, "same": half, "apart": ~half}[split]
         # A point at infinity or beyond is no landmark.
         for_map = for_map & (features.z[:, 0] > features.z[:, 2]) & self.config.map.used
@@ -114,7 +119,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         landmarks: finds landmarks among the features; None for `DescriptorLandmarks`.
     """
 
-    frames = (ImageFrame,)
+    takes, kept = ImageFrame, KEPT
 
     def __init__(
         self,
@@ -134,7 +139,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
             nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
             descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
             features = StereoFeatures.measured(self.rig, *nothing, descriptors)
-        return self._measured(frame.stamp_ns, features), problem
+        return self.pair(frame.stamp_ns, features), problem
 
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
         """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
@@ -165,20 +170,16 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         used = before.for_odometry[found.first] & now.for_odometry[found.second]
         return found.first[used], found.second[used]
 
-    def arrays(self, pair: Pair[StereoFeatures]) -> dict[str, np.ndarray]:
-        kept = {f"pair/{name}": getattr(pair.features, name) for name in KEPT}
-        return kept | {"pair/stood": pair.labels}
+    def features(self, kept: dict[str, np.ndarray]) -> StereoFeatures:
+        length = self.matcher.extractor.length
+        if kept["descriptors"].shape[1] != length:
+            raise InputError(f"the array pair/descriptors must hold descriptors of {length} numbers")
+        return StereoFeatures.measured(self.rig, *kept.values())
 
-    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[StereoFeatures]:
-        found = read(arrays, KEPT | _LABELS, "pair/", length=self.matcher.extractor.length)
-        features = StereoFeatures.measured(self.rig, *(found[name] for name in KEPT))
-        return replace(self._measured(0, features), labels=found["stood"])
-
-    def _measured(self, stamp_ns: int, features: StereoFeatures) -> Pair[StereoFeatures]:
-        # A random half, the same whenever a feature is seen: whether its first numbers outweigh its last ones.
+    def half(self, features: StereoFeatures) -> np.ndarray:
+        """Whose descriptor's first numbers outweigh its last ones."""
         side = features.descriptors.shape[1] // 3
-        half = features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)
-        return self._pair(stamp_ns, features, half)
+        return features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)
 
 
 @final
@@ -188,15 +189,14 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
     The frames' stamps are `ns_per_stamp` nanoseconds long: 10⁹ where they count frames of unknown time.
     """
 
-    frames = (FeatureFrame,)
-    names_landmarks = True
+    takes, kept, names_landmarks = FeatureFrame, {"landmarks": integers("features", least=0), **_PIXELS}, True
 
     def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
         self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
         self.landmarks: NamedLandmarks = NamedLandmarks(rig, config)
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[FeatureFrame], str]:
-        return self._pair(self.ns_per_stamp * frame.stamp_ns, frame, frame.landmarks % 2 == 0), ""
+        return self.pair(self.ns_per_stamp * frame.stamp_ns, frame), ""
 
     def match(self, before: Pair[FeatureFrame], now: Pair[FeatureFrame]) -> tuple[np.ndarray, np.ndarray]:
         names = before.features.landmarks, now.features.landmarks
@@ -209,10 +209,8 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
         kind = FeatureKind.LANDMARK if updated else FeatureKind.FEATURE
         return pair.features.landmarks, np.full(len(pair), kind)
 
-    def arrays(self, pair: Pair[FeatureFrame]) -> dict[str, np.ndarray]:
-        shown = pair.features.landmarks, pair.features.z, pair.features.cov, pair.labels
-        return {f"pair/{name}": array for name, array in zip(("names", "z", "cov", "stood"), shown, strict=True)}
+    def features(self, kept: dict[str, np.ndarray]) -> FeatureFrame:
+        return FeatureFrame(0, *kept.values())
 
-    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[FeatureFrame]:
-        z, cov, names, labels = read(arrays, _PAIR, "pair/").values()
-        return replace(self._pair(0, FeatureFrame(0, names, z, cov), names % 2 == 0), labels=labels)
+    def half(self, features: FeatureFrame) -> np.ndarray:
+        return features.landmarks % 2 == 0

@@ -33,7 +33,7 @@ from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd
+from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd
 from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
 from rbpf.systems.stereo.odometry import DeadReckoning
@@ -57,7 +57,6 @@ from rbpf.systems.system import (
 
 _STEREO = {
     "frames": integers(2, least=0),
-    "front_end": integers(least=0, below="front_ends"),
     "at_update": poses(),
     "cov_at_update": numbers(6, 6),
     "since_update": poses(),
@@ -79,8 +78,8 @@ class StereoSlam(System):
         gate: which landmarks may be which feature; None for that of `config`.
         model: how a landmark is measured; None for pixels of points in space.
         landmark: its parametrisation; None for points in space.
-        front_end: measures frames, and finds landmarks in them. None chooses by the first frame: images, or pixels
-            of landmarks that have names.
+        front_end: measures frames, and finds landmarks in them; None takes images, `NamedFrontEnd` pixels of landmarks that
+            have names.
     """
 
     name: ClassVar[str] = "stereo"
@@ -124,13 +123,11 @@ class StereoSlam(System):
     ) -> None:
         self.rig, self.config = rig, config or StereoConfig()
         config = self.config
-        self._front_ends: tuple[FrontEnd[Any], ...]
         if front_end is None:
             extractor = extractor or Sift(config.sift)
             landmarks = DescriptorLandmarks(rig, config, extractor.length, gate, model, landmark)
-            self._front_ends = ImageFrontEnd(rig, config, extractor, landmarks), NamedFrontEnd(rig, config)
-        else:
-            self._front_ends = (front_end,)
+            front_end = ImageFrontEnd(rig, config, extractor, landmarks)
+        self.front_end = front_end
         free = CAMERA_PLANE if config.dof == 3 else None
         added = np.repeat([config.odometry.std_added_rad, config.odometry.std_added_m], 3)
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
@@ -153,11 +150,10 @@ class StereoSlam(System):
                 "alone, candidates among them"
             )
         own = LandmarkMap(SE3, compiled=config.compiled)
-        self.front_end = self._front_ends[0]
-        own.register(self.front_end.landmarks.landmark)
+        own.register(front_end.landmarks.landmark)
         self.filter = Filter(
             OdometryMotion(SE3, added, free),
-            self.front_end.landmarks,
+            front_end.landmarks,
             joint or own,
             self._proposal.build(),
             config.resampling.build(),
@@ -190,18 +186,13 @@ class StereoSlam(System):
         return self.take(ImageFrame(stamp_ns, left, right))
 
     def take(self, frame: Any) -> Tracked:
-        """`track` with a frame of a recording, an `ImageFrame`, or with pixels that have names, a `FeatureFrame`."""
+        """`track` with a frame of a recording, an `ImageFrame`, or another one that the front end takes."""
         started, messages = time.perf_counter(), list[str]()
-        # The first frame chooses the front end that takes frames of its kind, and is refused if it is not the cameras'.
-        if not self.frames:
-            for one in self._front_ends:
-                if isinstance(frame, one.frames):
-                    self._choose(one)
         front_end, config = self.front_end, self.config
-        fits = isinstance(frame, front_end.frames)
-        if not fits:
-            taken = " or ".join(kind.__name__ for kind in front_end.frames)
+        if not isinstance(frame, front_end.takes):
+            taken = front_end.takes.__name__
             raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {taken} here")
+        # The first frame is refused if it is not the cameras'.
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
         landmarks = front_end.landmarks
@@ -359,7 +350,6 @@ class StereoSlam(System):
             **self.front_end.landmarks.arrays(),
             **self.reckoning.arrays(),
             "stereo/frames": np.array([self.frames, self._last_update]),
-            "stereo/front_end": np.array(self._front_ends.index(self.front_end)),
             "stereo/at_update": self.at_update.mean,
             "stereo/cov_at_update": self.at_update.cov,
             "stereo/since_update": self.since_update,
@@ -368,8 +358,7 @@ class StereoSlam(System):
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        found = read(arrays, _STEREO, "stereo/", front_ends=len(self._front_ends))
-        self._choose(self._front_ends[int(found["front_end"])])
+        found = read(arrays, _STEREO, "stereo/")
         self.frames, self._last_update = found["frames"].tolist()
         self.at_update = Estimate(found["at_update"], found["cov_at_update"])
         self.since_update = found["since_update"]
@@ -377,10 +366,6 @@ class StereoSlam(System):
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
-
-    def _choose(self, front_end: FrontEnd[Any]) -> None:
-        self.front_end = front_end
-        self.filter.sensors = [front_end.landmarks]
 
     def _motion_to(self, pair: Pair[Any], dt: float) -> "_Motion":
         """The motion from the last measured pair to this one, `dt` seconds later."""
