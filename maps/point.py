@@ -1,4 +1,4 @@
-"""Landmarks that are points in the plane or in space: Gaussian, or on a curve (a mixture)."""
+"""Landmarks that are points in the plane or in space: Gaussian, in the frame of an anchor, or on a curve (a mixture)."""
 
 from typing import final
 
@@ -7,6 +7,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.models import Landmark, Records, RigidSpace
 from rbpf.errors import InputError
+from rbpf.lie import SE2Group, SE3Group
 
 #: Distance from the heaviest component of a mixture, in its standard deviations, within which another one says the same;
 #: and the weight that these must have together for the mixture to be a single Gaussian.
@@ -29,6 +30,23 @@ class Point(Landmark):
     def seen_from(self, space: RigidSpace, pose: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """R(pose)ᵀ (p − t)."""
         return space.inverse_transform(pose, mean), np.swapaxes(space.rotation(pose), -1, -2)
+
+
+@final
+class AnchoredPoint(Landmark):
+    """A point in the frame of an anchor in SE2 or SE3, which is the record's constant: world_from_anchor (E,)."""
+
+    anchored = True
+
+    def __init__(self, space: SE2Group | SE3Group) -> None:
+        self.space = space
+        self.dim = 2 if isinstance(space, SE2Group) else 3
+        self.constants = space.size
+
+    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        assert const is not None
+        world = self.space.transform(const, mean)
+        return np.concatenate([world, np.ones((*world.shape[:-1], 1))], axis=-1)
 
 
 @final

@@ -10,9 +10,8 @@ from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import MixturePoint, Point, ring
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
-from tests.exactness.models import AnchoredPoint
 
 N, K, DRAWS = 12, 3, 100_000
 STD = 0.01

@@ -31,14 +31,14 @@ from rbpf.lie import SE2, SE3, Euclidean, Product
 from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import MixturePoint, Point, ring
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
 from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from tests.core.scripted import Polar, says
 from tests.core.worlds import Recipe, drive, planar_world
-from tests.exactness.models import AnchoredPoint, Frame, Scripted
+from tests.exactness.models import Frame, Scripted
 from tests.sensors.camera_scenes import CAMERAS
 
 RING = 24

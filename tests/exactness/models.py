@@ -9,7 +9,6 @@ import numpy as np
 from rbpf.core.filter import Filter
 from rbpf.core.models import (
     Jacobians,
-    Landmark,
     MotionModel,
     NewLandmarks,
     ObservationModel,
@@ -18,24 +17,9 @@ from rbpf.core.models import (
     Sensor,
     Transition,
 )
-from rbpf.lie import Euclidean, SE2Group, SE3Group
+from rbpf.lie import Euclidean
 
 SEEDS = 400
-
-
-class AnchoredPoint(Landmark):
-    """A point in the frame of an anchor in SE2 or SE3, which is the record's constant: world_from_anchor (E,)."""
-
-    anchored = True
-
-    def __init__(self, space: SE2Group | SE3Group) -> None:
-        self.space = space
-        self.dim = 2 if space.dim == 3 else 3
-        self.constants = space.size
-
-    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        world = self.space.transform(const, mean)
-        return np.concatenate([world, np.ones((*world.shape[:-1], 1))], axis=-1)
 
 
 class LinearMotion(MotionModel):

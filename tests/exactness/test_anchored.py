@@ -8,10 +8,10 @@ from rbpf.core.models import Jacobians, ObservationModel, Observations, Records
 from rbpf.core.resampling import Systematic
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import Point
+from rbpf.maps.point import AnchoredPoint, Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing
-from tests.exactness.models import AnchoredPoint, Frame, Scripted
+from tests.exactness.models import Frame, Scripted
 from tests.exactness.scenes import Scene, random_covs
 
 TOLERANCE = 1e-9

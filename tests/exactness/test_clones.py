@@ -14,12 +14,12 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.joint_map import JointMap
-from rbpf.maps.point import MixturePoint, Point
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraPoint, CameraRay
 from rbpf.sensors.range_bearing import RelativePosition
-from tests.exactness.models import AnchoredPoint, Kalman, Scripted
+from tests.exactness.models import Kalman, Scripted
 from tests.exactness.slam import ALONG, NOISE, STEP, TURNED, Q, turned
 from tests.exactness.test_joint_map import assert_same
 

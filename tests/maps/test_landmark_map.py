@@ -11,9 +11,8 @@ from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import MixturePoint, Point, ring
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.sensors.range_bearing import RangeBearing
-from tests.exactness.models import AnchoredPoint
 
 N = 40
 
