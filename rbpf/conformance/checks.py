@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from rbpf import gaussian
 from rbpf.conformance.trial import (
     LANDMARKS,
     PARTICLES,
@@ -29,12 +28,10 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.linearisation import numeric_jacobians
 from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.gate import is_inlier, log_likelihood
 from rbpf.kernels.landmarks import call_kernel
 from rbpf.kernels.signature import BLOCK
 from rbpf.lie import LieGroup
 
-KERNEL_IDS = (-1, 0, 1, 2)
 MASS_TOLERANCE = 5e-3
 FAR = 1000.0  #: Standard deviations up to which a density is integrated; out there only a uniform floor is left of it.
 ESTIMATE_STD = 0.1  #: Of random estimates of landmarks, in the parametrisation's units.
@@ -324,7 +321,7 @@ def landmark_checks(landmark: models.Landmark, space: LieGroup | None, rng: Gene
 
 
 def likelihood_checks(likelihood: models.Likelihood, rng: Generator) -> list[Check]:
-    """Shapes, mass, and the compiled twin."""
+    """Shapes, and mass."""
     log_density, inlier = likelihood.log_density, likelihood.inlier
 
     def innovations(p: int) -> tuple[np.ndarray, np.ndarray]:
@@ -358,27 +355,7 @@ def likelihood_checks(likelihood: models.Likelihood, rng: Generator) -> list[Che
             fits = abs(found - expected) <= MASS_TOLERANCE
             require(fits, f"{what}, expected {expected:.4g}: normalise it, or set normalised = False")
 
-    def compiled_twin() -> None:
-        name, kernel_id, params = type(likelihood).__name__, likelihood.kernel_id, likelihood.params
-        require(kernel_id in KERNEL_IDS, f"{name}.kernel_id is {kernel_id}, expected one of {KERNEL_IDS}")
-        if kernel_id < 0:
-            return
-        plain = isinstance(params, np.ndarray) and params.dtype == float and params.ndim == 1
-        require(plain, f"{name}.params is not one axis of float64 numbers")
-        nu, cov = innovations(2)
-        chol = gaussian.cholesky(cov)
-        squared = np.square(gaussian.solve_lower(chol, nu)).sum(axis=-1)
-        scale = np.exp(-0.5 * gaussian.log_det(chol))
-        twin, inside = np.empty_like(squared), np.empty_like(squared, dtype=bool)
-        for at in np.ndindex(squared.shape):
-            lane = (kernel_id, params, squared[at], scale[at], 2)
-            twin[at], inside[at] = log_likelihood(*lane), is_inlier(*lane)
-        what = f"{name}.log_density differs from its compiled kernel {kernel_id}"
-        require_close(what, log_density(nu, cov), twin, 1e-9)
-        same = np.array_equal(inlier(nu, cov), inside)
-        require(same, f"{name}.inlier differs from its compiled kernel {kernel_id}")
-
-    return [shapes, mass, compiled_twin]
+    return [shapes, mass]
 
 
 def sensor_checks(sensor: models.Sensor, example: Example) -> list[Check]:

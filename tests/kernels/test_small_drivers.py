@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from rbpf import gaussian
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.kernels import forest
 from rbpf.kernels.dense import add_gram, add_inner, gather, product, refine
+from rbpf.kernels.gate import is_inlier, log_likelihood
 
 
 @pytest.fixture
@@ -15,6 +18,20 @@ def rng() -> np.random.Generator:
 def covariances(rng, count, size):
     root = rng.normal(size=(count, size, size))
     return root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(size)
+
+
+LIKELIHOODS = [Gaussian(), TruncatedMahalanobis(), TruncatedMahalanobis(4.0, 9.0), GaussianWithOutliers(0.1, 20.0)]
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS, ids=lambda one: f"{type(one).__name__} {one.params.tolist()}")
+def test_a_likelihood_is_its_numpy_twin(likelihood, rng):
+    """Of innovations within and far outside of their covariance."""
+    nu, cov = rng.normal(size=(40, 2)) * np.repeat([0.1, 1.0, 3.0, 30.0], 10)[:, None], covariances(rng, 40, 2)
+    chol = gaussian.cholesky(cov)
+    squared, scale = np.square(gaussian.solve_lower(chol, nu)).sum(axis=-1), np.exp(-0.5 * gaussian.log_det(chol))
+    lanes = [(likelihood.kernel_id, likelihood.params, *lane, 2) for lane in zip(squared, scale, strict=True)]
+    np.testing.assert_allclose([log_likelihood(*lane) for lane in lanes], likelihood.log_density(nu, cov), rtol=1e-9)
+    assert [bool(is_inlier(*lane)) for lane in lanes] == likelihood.inlier(nu, cov).tolist()
 
 
 @pytest.mark.parametrize(("m", "k", "n"), [(3, 7, 5), (2, 4, 1), (1, 0, 2), (0, 3, 2)])
