@@ -53,22 +53,11 @@ def _cover(m, tile):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _strip(bounds, tiles, found):
-    """Rectangles whose bounds (umin, umax, vmin, vmax) meet a row of tiles between top and bottom; how many."""
-    low, high, count = tiles[:, 2].min(), tiles[:, 3].max(), 0
-    for r in range(bounds.shape[0]):
-        if bounds[r, 2] <= high and low <= bounds[r, 3]:
-            found[count] = r
-            count += 1
-    return count
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _candidates(h, bounds, strip, tile, chosen, nearest):
-    """Rectangles of a strip that may be seen in a tile; how many. One behind another that fills the tile is not."""
+def _candidates(h, bounds, tile, chosen, nearest):
+    """Rectangles that may be seen in a tile; how many. One behind another that fills the tile is not."""
     count, front = 0, 0.0
     u0, u1, v0, v1 = tile[0], tile[1], tile[2], tile[3]
-    for r in strip:
+    for r in range(bounds.shape[0]):
         if bounds[r, 0] <= u1 and u0 <= bounds[r, 1] and bounds[r, 2] <= v1 and v0 <= bounds[r, 3]:
             near, filled = _cover(h[r], tile)
             if near > 0.0:
@@ -182,11 +171,8 @@ def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, le
     side = TILE * TILE
     chosen, row, sized = (np.empty(bounds.shape[1], np.int64), np.empty(side, np.int64), np.empty(side, np.int64))
     u, v, near, detail, total = np.empty(side), np.empty(side), np.empty(side), np.empty(side), np.empty(side)
-    nearest, strips = np.empty(bounds.shape[1]), np.empty(bounds.shape[:2], np.int64)
-    met = np.empty(bounds.shape[0], np.int64)
+    nearest = np.empty(bounds.shape[1])
     for j in range(tiles.shape[0]):
-        for pose in range(bounds.shape[0]):
-            met[pose] = _strip(bounds[pose], tiles[j], strips[pose])
         for i in range(tiles.shape[1]):
             columns = min(TILE, uv.shape[1] - i * TILE)
             total[:] = 0.0
@@ -196,8 +182,7 @@ def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, le
                 now = moment[k]
                 pose = h[now]
                 if k == 0 or now != moment[k - 1]:
-                    strip = strips[now, : met[now]]
-                    count = _candidates(pose, bounds[now], strip, tiles[j, i], chosen, nearest)
+                    count = _candidates(pose, bounds[now], tiles[j, i], chosen, nearest)
                 n = _rays(uv, slope, j * TILE, i * TILE, shifts[k], u, v)
                 _nearest(pose, chosen, count, u, v, n, near, row)
                 for p in range(n):
@@ -222,11 +207,9 @@ def trace(h, bounds, uv, slope, tiles, inverse_depth, rows):
     side, centre = TILE * TILE, np.zeros(2)
     chosen, row = np.empty(bounds.shape[0], np.int64), np.empty(side, np.int64)
     u, v, near, nearest = np.empty(side), np.empty(side), np.empty(side), np.empty(bounds.shape[0])
-    strip = np.empty(bounds.shape[0], np.int64)
     for j in range(tiles.shape[0]):
-        met = _strip(bounds, tiles[j], strip)
         for i in range(tiles.shape[1]):
-            count = _candidates(h, bounds, strip[:met], tiles[j, i], chosen, nearest)
+            count = _candidates(h, bounds, tiles[j, i], chosen, nearest)
             n = _rays(uv, slope, j * TILE, i * TILE, centre, u, v)
             _nearest(h, chosen, count, u, v, n, near, row)
             columns = min(TILE, uv.shape[1] - i * TILE)
