@@ -3,6 +3,7 @@
 from typing import final
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from rbpf import gaussian
 from rbpf.core.models import Landmark, Records
@@ -41,7 +42,7 @@ class Constellation(Landmark):
             )
         self.points = points.tolist()
         self.dim = 3 * points.shape[0]
-        self._info_points = np.linalg.inv(cov_points + LEAST * np.eye(3)).tolist()
+        self._info_points = block_diag(*np.linalg.inv(cov_points + LEAST * np.eye(3))).tolist()
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         centre = self._points_of(mean).mean(axis=-2)
@@ -80,19 +81,21 @@ class Constellation(Landmark):
         Further its derivative by all points (N, 6, 3M), and its covariances (N, 6, 6): given the points, and of all.
         """
         world, given, weight = self.in_world(records), np.asarray(self.points), np.asarray(self._info_points)
-        frame = np.repeat(SE3.closest(given, world.mean(axis=0)[None]), len(world), axis=0)
+        n = len(world)
+        frame = np.repeat(SE3.closest(given, world.mean(axis=0)[None]), n, axis=0)
         for _ in range(ROUNDS):
             local = SE3.inverse_transform(frame[:, None], world)
-            moved = -SE3.transform_jacobian(local)
-            weighed = np.swapaxes(moved, -1, -2) @ weight
-            info, pull = (weighed @ moved).sum(axis=1), (weighed @ (local - given)[..., None]).sum(axis=1)
-            step = -np.linalg.solve(info, pull)[..., 0]
+            # All points below one another: many small products take longer than one.
+            moved = -SE3.transform_jacobian(local).reshape(n, -1, 6)
+            weighed = weight @ moved
+            info, pull = np.swapaxes(weighed, 1, 2) @ moved, (local - given).reshape(n, 1, -1) @ weighed
+            step = -np.linalg.solve(info, np.swapaxes(pull, 1, 2))[..., 0]
             frame = SE3.retract(frame, step)
             if np.abs(step).max() <= SETTLED:
                 break
-        # −Λ⁻¹ JᵀW Rᵀ, point by point.
-        back = np.swapaxes(SE3.rotation(frame), -1, -2)[:, None]
-        slope = np.moveaxis(-np.linalg.solve(info[:, None], weighed @ back), 1, 2).reshape(len(frame), 6, self.dim)
-        cov_fit = gaussian.inverse(info)
+        # −Λ⁻¹ JᵀW Rᵀ.
+        turned = SE3.rotation(frame)[:, None] @ weighed.reshape(n, -1, 3, 6)
+        slope = -np.linalg.solve(info, np.swapaxes(turned.reshape(n, -1, 6), 1, 2))
+        cov_fit = gaussian.symmetrise(np.linalg.inv(info))
         cov = gaussian.symmetrise(slope @ records.cov[:, 0] @ np.swapaxes(slope, -1, -2) + cov_fit)
         return frame, slope, cov_fit, cov
