@@ -75,14 +75,12 @@ class RobustMotionGate(OutlierGate):
         self, nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, trusted: np.ndarray
     ) -> MotionFit:
         # u ~ N(0, I) with ε = L u, of whitened measurements; the weights are those of the misfit before.
-        chol = gaussian.cholesky(cov[trusted])
-        white = gaussian.solve_lower(chol, nu[trusted])
-        slope = gaussian.solve_lower_matrix(chol, jac[trusted] @ factor)
+        rows = np.concatenate([nu[trusted, :, None], jac[trusted] @ factor], axis=2)
+        rows = np.linalg.solve(gaussian.cholesky(cov[trusted]), rows)
+        white, slope = np.ascontiguousarray(rows[..., 0]), np.ascontiguousarray(rows[..., 1:])
         u, info = np.empty(factor.shape[1]), np.empty((factor.shape[1],) * 2)
-        white, slope = np.ascontiguousarray(white), np.ascontiguousarray(slope)
         fit_robustly(white, slope, ROUNDS, CAUCHY_SCALE, u, info)
-        half = gaussian.solve_lower_matrix(gaussian.cholesky(info), factor.T)
-        increment, spread = factor @ u, half.T @ half
+        increment, spread = factor @ u, gaussian.symmetrise(factor @ np.linalg.solve(info, factor.T))
         squared = np.empty(nu.shape[0])
         squared[trusted] = np.square(white - slope @ u).sum(axis=1)
         jac, cov, off = jac[~trusted], cov[~trusted], (nu - jac @ increment)[~trusted]
