@@ -87,6 +87,32 @@ def test_it_is_honest_where_the_baseline_was_hardly_known():
     assert 0.5 < np.mean(scores) < 2.0 and max(off) < 0.03
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_noise_that_is_larger_than_stated_is_learnt(known):
+    """Pixels with twice the noise that they say: the hand-over sees it already, and its Gaussian has it."""
+    log = desk(1, frames=40, measurements=20, noise_px=2.0)
+    log = replace(log, frames=[replace(frame, cov_z=frame.cov_z / 4.0) for frame in log.frames])
+    factors, scores = [], []
+    for noise in ("stated", "at_least", "learnt"):
+        run = filter_features(log if known else without_known(log), replace(JOINT, noise=noise))
+        assert run.system.joint is not None
+        factors.append(run.system.summary(run.log)["noise_factor"])
+        scores.append(np.mean([np.trace(np.linalg.inv(cov)) for cov in run.log.covs[-10:]]))
+        told = run.system.measurements("", run.log).frames[-1].cov_z
+        np.testing.assert_allclose(told, factors[-1] ** 2 * log.frames[-1].cov_z)
+    assert factors[0] == 1.0
+    np.testing.assert_allclose(factors[1:], 2.0, rtol=0.12)
+    assert scores[1] < 0.5 * scores[0]  # a quarter of the information, but for what is no measurement
+
+
+def test_noise_that_is_smaller_than_stated_is_learnt_where_it_is_asked_for():
+    log = desk(1, frames=40, measurements=20, noise_px=0.3)
+    log = replace(log, frames=[replace(frame, cov_z=frame.cov_z / 0.09) for frame in log.frames])
+    at_least, learnt = (filter_features(log, replace(JOINT, noise=noise)) for noise in ("at_least", "learnt"))
+    assert at_least.system.features.noise_factor == 1.0
+    assert 0.25 < np.sqrt(learnt.system.features.noise_factor) < 0.6
+
+
 def test_features_of_old_sub_maps_are_found_again():
     """What is put away is in the map all the time, and is looked for and found as it is in view."""
     slam = MonoSlam(CAMERA, replace(JOINT, particles=20), None)

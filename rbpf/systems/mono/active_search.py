@@ -120,7 +120,11 @@ class ActiveSearch:
         self.features = features
         self.table, self.config = table, config
         self.gate = gate or RobustMotionGate()
-        self.noise = config.noise_px**2 * np.eye(2)  #: covariance of a found place, px².
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Covariance (2, 2) of a found place, px²; as learnt, but never less than stated: nothing is missed."""
+        return max(self.features.noise_factor, 1.0) * self.config.noise_px**2 * np.eye(2)
 
     def run(self, image: np.ndarray, belief: Belief) -> SearchResult:
         """Looks for features in an image (H, W) uint8; what is found agrees with one motion of the camera."""

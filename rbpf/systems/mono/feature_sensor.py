@@ -6,6 +6,7 @@ inverse depth, unless the system is given something else. Known points may be me
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -23,6 +24,7 @@ from rbpf.maps.rows import BOTH, MAP, STATE
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, EpipolarRay, MembersView
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
+from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.feature_table import directions
 
@@ -205,21 +207,28 @@ class FeatureSensor(Sensor):
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
         self._reach_px = np.inf
+        self.noise: LearntNoise | None = None
         self.point = CameraPoint(camera)
         self._take_group(group)
 
-    def become_joint(self, unknown_depth: UnknownDepth, reach_px: float) -> None:
+    def become_joint(self, unknown_depth: UnknownDepth, reach_px: float, noise: LearntNoise | None = None) -> None:
         """From now on the map is a joint one, which holds the known points one by one.
 
-        What is expected with a greater standard deviation than `reach_px` cannot be looked for.
+        What is expected with a greater standard deviation than `reach_px` cannot be looked for. Without `noise`, what is
+        measured is as exact as it says.
         """
-        self.unknown_depth, self._reach_px = unknown_depth, reach_px
+        self.unknown_depth, self._reach_px, self.noise = unknown_depth, reach_px, noise
         self._take_group(None)
 
     def tune(self, camera: Pinhole, about: np.ndarray) -> None:
         """The camera of a joint map that it is estimated in, at the substate `about` (m,)."""
         self.camera, self.point = camera, CameraPoint(camera, about=about)
         self.unknown_depth.tune(camera, about)
+
+    @property
+    def noise_factor(self) -> float:
+        """Of the variance that what is measured says."""
+        return 1.0 if self.noise is None else self.noise.mean
 
     def _take_group(self, group: KnownPoints | None) -> None:
         self.group = group
@@ -230,6 +239,7 @@ class FeatureSensor(Sensor):
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
         """Groups of observations for known points, points, and features of unknown depth."""
         groups, inside = list[Observations](), self.camera.inside(frame.z)
+        cov_z = self.noise_factor * frame.cov_z
 
         # All members of the constellation that are seen are one measurement of it.
         members, ids = self.members(frame.landmarks), self._ids(belief, frame.landmarks)
@@ -239,7 +249,7 @@ class FeatureSensor(Sensor):
             landmark, view = self._view(members[rows])
             cov = np.zeros((1, view.dim, view.dim))
             for k, row in enumerate(rows.tolist()):
-                cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
+                cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = cov_z[row]
             groups.append(Observations(frame.z[rows].reshape(1, -1), cov, view, ids=landmark))
 
         rows = np.flatnonzero((ids >= 0) & inside)
@@ -247,11 +257,11 @@ class FeatureSensor(Sensor):
         if (~unknown).any():
             k = rows[~unknown]
             updates = STATE if self.fixed else BOTH
-            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], updates=updates))
+            groups.append(Observations(frame.z[k], cov_z[k], self.point, ids=ids[k], updates=updates))
         if unknown.any():
             k = rows[unknown]
             scaled = sum(group.z.size for group in groups) >= 2 * MIN_SCALED
-            groups += self.unknown_depth.observations(belief, frame.z[k], frame.cov_z[k], ids[k], scaled, held)
+            groups += self.unknown_depth.observations(belief, frame.z[k], cov_z[k], ids[k], scaled, held)
         return groups
 
     def new_landmarks(
@@ -305,6 +315,11 @@ class FeatureSensor(Sensor):
 
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """Turns features whose depth is known by now into points; starts one for every new name."""
+        if self.noise is not None:
+            # Of points alone: a young ray is off by more than its covariance says, which is to first order.
+            for group in observed:
+                if group.model is self.point:
+                    self.noise.learn_from(group, partial(belief.project, self.point))
         belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
         is_new = (self.members(frame.landmarks) < 0) & ~belief.map.holds(frame.landmarks)
         if isinstance(belief.map, JointMap):
@@ -316,7 +331,7 @@ class FeatureSensor(Sensor):
         if not new.size:
             return []
         model = self.unknown_depth.starting(self._depths(belief, observed))
-        z, cov, ids = frame.z[new], frame.cov_z[new], frame.landmarks[new]
+        z, cov, ids = frame.z[new], self.noise_factor * frame.cov_z[new], frame.landmarks[new]
         return [NewLandmarks(z, cov, model, self.unknown_depth.landmark, ids=ids)]
 
     def project(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -29,6 +29,7 @@ from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
+from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -42,6 +43,7 @@ from rbpf.systems.mono.start.adjustment import (
     between,
     gathered,
     optimum,
+    residual_px,
     tangents,
 )
 from rbpf.systems.mono.start.known import world_of
@@ -53,6 +55,8 @@ SETTLED = 0.2
 """Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that."""
 LEAST_PARALLAX_PX = 3.0
 """Parallax of one standard deviation of depth from where on it is measured; before, it is considered."""
+RIGHT = 1.1
+"""Times a stated standard deviation, up to which it is right: as much as a report has for right."""
 JOINT = "joint/mean"
 """In the checkpoint of a filter on a joint map."""
 MAX_FRAMES = 150
@@ -117,6 +121,9 @@ class HandOver:
         self.joint: JointMap | None = None
         """The joint map; None as long as every particle has a map of its own."""
         self._rays: JointRays | None = None
+        self.noise: LearntNoise | None = None
+        if wanted and config.noise != "stated":
+            self.noise = LearntNoise(alike=True, right=RIGHT**2 if config.noise == "at_least" else 0.0)
         if wanted:
             if not isinstance(rays, InverseDepthRays):
                 raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
@@ -174,6 +181,12 @@ class HandOver:
             of_points = SE3.identity() if world is None else world.mean[belief.mode]
             start = replace(start, frame=SE3.between(self.first.path[steps[0]], of_points))
         best = optimum(seen, config, start)
+        if best is not None and self.noise is not None:
+            # That noise is less than stated the first frames do not tell: errors grow as the view changes.
+            noise_px = residual_px(seen, config, best)
+            if noise_px > RIGHT * seen.noise_px:
+                self.noise.expect((noise_px / seen.noise_px) ** 2)
+                best = optimum(replace(seen, noise_px=noise_px), config, best.structure)
         return None if best is None else (names, seen, best)
 
     def tune(self, filter_: Filter, sensor: ImageSensor) -> None:
@@ -205,12 +218,15 @@ class HandOver:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return {} if self._rays is None else {"mono/settled": np.array(self._settled)}
+        learnt = {} if self.noise is None or self.joint is None else self.noise.arrays()
+        return {} if self._rays is None else {"mono/settled": np.array(self._settled), **learnt}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         if self._rays is not None:
             self._settled = int(read_one(arrays, "mono/settled", integers(least=0)))
+        if self.noise is not None and self.joint is not None:
+            self.noise.restore(arrays)
 
     def _new_filter(self, rays: JointRays, sensor: ImageSensor, rng: np.random.Generator) -> Filter:
         """On a joint map that holds nothing yet; the parametrisations are named in it."""
@@ -231,7 +247,7 @@ class HandOver:
         assert isinstance(joint, JointMap)
         self.joint = joint
         search = self.config.search
-        sensor.features.become_joint(rays, search.max_radius_px / search.ellipse_sigmas)
+        sensor.features.become_joint(rays, search.max_radius_px / search.ellipse_sigmas, self.noise)
         return filter_
 
     def _begin(self, new: Filter, names: np.ndarray, seen: Window, best: Optimum) -> Revision:

@@ -116,7 +116,7 @@ class MonoSlam(System):
         Ragged("mean", "their predicted places, px", (2,), per="features"),
         Ragged("cov", "covariance of these, with the noise of the measurement, px²", (2, 2), per="features"),
         Ragged("px", "where each was found, px; NaN where not", (2,), per="features"),
-        Ragged("cov_px", "covariance of the noise of px, px²", (2, 2), per="features"),
+        Ragged("cov_px", "covariance of the noise of px, as it is stated, px²", (2, 2), per="features"),
         Ragged("line", "ends of the epipolar line of one whose depth is unknown, px; else NaN", (2, 2), per="features"),
         Ragged("position", "homogeneous point in the reported world; NaN where it was not found", (4,), per="features"),
         Ragged("started", "features that were started", kind="int64"),
@@ -370,7 +370,7 @@ class MonoSlam(System):
         return paths if world is None else SE3.between(world.mean, paths)
 
     def measurements(self, name: str, log: FrameLog) -> FeatureLog:
-        """The features that the filter used, and those that started landmarks, under their numbers.
+        """The features that the filter used, and those that started landmarks, under their numbers, with the noise as learnt.
 
         Of a frame in which too little agreed to be trusted nothing was used.
         """
@@ -381,7 +381,8 @@ class MonoSlam(System):
             names = np.concatenate([seen["features"][kept], seen["started"]])
             px = np.concatenate([seen["px"][kept], seen["started_px"]])
             noise = np.tile(self.config.search.noise_px**2 * np.eye(2), (seen["started"].size, 1, 1))
-            frames.append(FeatureFrame(stamp_ns, names, px, np.concatenate([seen["cov_px"][kept], noise])))
+            cov = self.features.noise_factor * np.concatenate([seen["cov_px"][kept], noise])
+            frames.append(FeatureFrame(stamp_ns, names, px, cov))
         found = self.hand_over.calibration(self.filter)
         return FeatureLog(name, self.camera if found is None else found[0], frames, self.known_points)
 
@@ -395,6 +396,7 @@ class MonoSlam(System):
             "lost_frames": int(lost.sum()),
             "relocalisations": int(log["relocalised"].sum()),
             "map": "particles" if self.joint is None else "joint",
+            "noise_factor": float(np.sqrt(self.features.noise_factor)),
             **self._calibration(),
             "known_points": 0 if self.known_points is None else int(self.known_points.names.size),
             **({} if self.known_map is None else localised),

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from functools import partial
 from typing import Any, Generic, Protocol, Self, TypeVar, final
 
 import numpy as np
@@ -36,8 +37,8 @@ from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_management import LandmarkManager
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
+from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.place_noise import PlaceNoise
 from rbpf.systems.stereo.places import Places, make_room, places_of
 from rbpf.systems.system import MAP_IDS
 
@@ -313,7 +314,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.store = DescriptorStore(length)
         self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height))
         self.places = Places(rig, self.config)
-        self.noise = PlaceNoise() if self.config.kind == "joint" else None
+        self.noise = LearntNoise() if self.config.kind == "joint" else None
         self.ids = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: Pair[StereoFeatures], belief: Belief) -> Sequence[Observations]:
@@ -357,17 +358,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         known = self.ids >= 0
         seen = self.ids[known]
         if self.noise is not None:
-            # From what the update left of the innovations, but for outliers.
             for group in observed:
-                assert group.ids is not None
-                sure = group.ids >= 0
-                if group.log_odds is not None:
-                    sure &= group.log_odds >= 0.0
-                if sure.any():
-                    ids = group.ids[sure]
-                    mean, cov = self.expected(belief, ids)
-                    noise = group.cov[sure] / self.noise.factor(ids)[:, None, None]
-                    self.noise.learn(ids, group.z[sure] - mean, cov, noise)
+                self.noise.learn_from(group, partial(self.expected, belief))
         dropped = self.manager.observe(seen)
         if dropped.size:
             belief.map.remove(dropped)

@@ -54,6 +54,9 @@ The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), 
 a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
 """
 
+CHI2_MEDIAN = float(2.0 * np.log(2.0))
+"""Of χ² with two degrees of freedom."""
+
 MIN_STD_VELOCITY = 1e-6
 """A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s."""
 
@@ -296,6 +299,14 @@ def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | Non
         if gain < MIN_GAIN * (1.0 + now.cost):
             break
     return now.optimum()
+
+
+def residual_px(seen: Window, config: MonoConfig, best: Optimum) -> float:
+    """Standard deviation per axis, px, of what was seen, as the residuals of a minimum say it: by their median."""
+    squared = np.square(Linearised(seen, config, best.structure).misfit).sum(axis=1)
+    free = 2 * squared.size - best.information.shape[0]
+    ratio = float(np.median(squared)) / CHI2_MEDIAN * (2 * squared.size / free) if free > 0 else 0.0
+    return seen.noise_px * float(np.sqrt(ratio))
 
 
 @final
