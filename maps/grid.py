@@ -115,7 +115,7 @@ class GridMap(Conditional):
         few = beams[::_EVERY] * [1.0, 1.0, 1.0, 1.0, _EVERY]
         few = few[np.argsort(np.arange(len(few)) % _APART, kind="stable")]
         rest = np.ascontiguousarray(few[::-1, 4].cumsum()[::-1]) * float(self._stamps.max())
-        cells.search(*place, info, radius, spacing, self._steps, few, rest, found, value, hessian)
+        cells.search(place, (info, radius, spacing, self._steps, few, rest), (found, value, hessian))
         factor = np.broadcast_to(prior.factor, (n, *prior.factor.shape[1:]))
         # What falls off about the maximum, as information; in units in which the steps weigh the same.
         unit = self._steps
@@ -135,7 +135,7 @@ class GridMap(Conditional):
     def log_likelihood(self, state: np.ndarray, beams: np.ndarray) -> np.ndarray:
         """(N,) log p(z | x, m) up to a constant, of a scan (K, 5) at the states (N, 3)."""
         value = np.empty(state.shape[0])
-        cells.scores(*self._place(state, beams), value)
+        cells.scores(self._place(state, beams), value)
         return value
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:

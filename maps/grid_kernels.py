@@ -6,11 +6,12 @@ Cell (x, y) of the world is floor(position / side); `origin` is the tile of inde
 """
 
 import math
+from functools import partial
 
 import numpy as np
-from numba import boolean, float32, float64, int32, njit, prange, types, void
+from numba import boolean, float32, float64, int32, int64, njit, prange, types, void
 
-from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR
+from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR, part_of
 
 TILE = 32  #: Cells of a side of a tile.
 PLANES = 4  #: Of a tile: log-odds; how many beams ended in the cell, and their mean place in it, x and y in [0, 1).
@@ -93,10 +94,13 @@ def own(touched, index, users, pool, free):
                     continue
                 new = free[taken]
                 taken += 1
+                cells = pool[new].reshape(PLANES * TILE * TILE)
                 if tile < 0:
-                    pool[new] = 0.0
+                    cells[:] = 0.0
                 else:
-                    pool[new] = pool[tile]
+                    inherited = pool[tile].reshape(cells.size)
+                    for i in range(cells.size):
+                        cells[i] = inherited[i]
                     users[tile] -= 1
                 users[new] = 1
                 index[n, y, x] = new
@@ -111,38 +115,50 @@ def _tile_of(index, n, origin, x, y):
     return index[n, row, column]
 
 
-@njit(void(MATRIX, MATRIX, float64, INDICES, INDEX, POOL, VECTOR), parallel=True, cache=True, error_model="numpy")
-def insert(state, beams, side, origin, index, pool, change):
+_INSERT = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, VECTOR
+_insert_at, _insert_part = part_of(*_INSERT)
+
+
+@_insert_part
+def _insert_one(n, state, beams, side, origin, index, pool, change):
     """Writes a scan into tiles that nobody shares; `change` is what the log-odds take: of an end, of a crossing, the bound."""
     hit, miss, bound = change[0], change[1], change[2]
-    for n in prange(state.shape[0]):
-        # What is crossed comes first, so that a wall which a grazing beam passes by is a wall again after this scan.
-        for k in range(beams.shape[0]):
-            x0, y0, x1, y1 = _ends(state[n], beams[k])
-            x, step_x, next_x, more_x, y, step_y, next_y, more_y, steps = _walk(x0, y0, x1, y1, side)
-            for _ in range(steps):
-                cx, cy = int(x), int(y)
-                tile = _tile_of(index, n, origin, cx, cy)
-                if tile >= 0:
-                    cell = pool[tile, LOG_ODDS, cy % TILE, cx % TILE]
-                    pool[tile, LOG_ODDS, cy % TILE, cx % TILE] = max(cell - miss, -bound)
-                if next_x < next_y:
-                    x += step_x
-                    next_x += more_x
-                else:
-                    y += step_y
-                    next_y += more_y
-        for k in range(beams.shape[0]):
-            _, _, x1, y1 = _ends(state[n], beams[k])
-            cx, cy = math.floor(x1 / side), math.floor(y1 / side)
+    # What is crossed comes first, so that a wall which a grazing beam passes by is a wall again after this scan.
+    for k in range(beams.shape[0]):
+        x0, y0, x1, y1 = _ends(state[n], beams[k])
+        x, step_x, next_x, more_x, y, step_y, next_y, more_y, steps = _walk(x0, y0, x1, y1, side)
+        for _ in range(steps):
+            cx, cy = int(x), int(y)
             tile = _tile_of(index, n, origin, cx, cy)
             if tile >= 0:
-                row, column = cy % TILE, cx % TILE
-                pool[tile, LOG_ODDS, row, column] = min(pool[tile, LOG_ODDS, row, column] + hit, bound)
-                count = pool[tile, ENDS, row, column] + 1.0
-                pool[tile, ENDS, row, column] = count
-                pool[tile, MEAN_X, row, column] += (x1 / side - cx - pool[tile, MEAN_X, row, column]) / count
-                pool[tile, MEAN_Y, row, column] += (y1 / side - cy - pool[tile, MEAN_Y, row, column]) / count
+                cell = pool[tile, LOG_ODDS, cy % TILE, cx % TILE]
+                pool[tile, LOG_ODDS, cy % TILE, cx % TILE] = max(cell - miss, -bound)
+            if next_x < next_y:
+                x += step_x
+                next_x += more_x
+            else:
+                y += step_y
+                next_y += more_y
+    for k in range(beams.shape[0]):
+        _, _, x1, y1 = _ends(state[n], beams[k])
+        cx, cy = math.floor(x1 / side), math.floor(y1 / side)
+        tile = _tile_of(index, n, origin, cx, cy)
+        if tile >= 0:
+            row, column = cy % TILE, cx % TILE
+            pool[tile, LOG_ODDS, row, column] = min(pool[tile, LOG_ODDS, row, column] + hit, bound)
+            count = pool[tile, ENDS, row, column] + 1.0
+            pool[tile, ENDS, row, column] = count
+            pool[tile, MEAN_X, row, column] += (x1 / side - cx - pool[tile, MEAN_X, row, column]) / count
+            pool[tile, MEAN_Y, row, column] += (y1 / side - cy - pool[tile, MEAN_Y, row, column]) / count
+
+
+@njit(void(int64, *_INSERT), parallel=True, cache=True, error_model="numpy")
+def _insert_all(one, state, beams, side, origin, index, pool, change):
+    for n in prange(state.shape[0]):
+        _insert_at(one)(int64(n), state, beams, side, origin, index, pool, change)
+
+
+insert = partial(_insert_all, _insert_one.address)
 
 
 @njit(cache=True, error_model="numpy")
@@ -284,25 +300,38 @@ def _second_order(field, window, border, side, base, at, beams, steps, state, gr
     return value
 
 
-#: Types of (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all
+#: Types of `place` = (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all
 #: zero.
-PLACE = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED
-_SEARCH = void(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, MATRIX, VECTOR, CUBE)
+PLACE = types.Tuple((MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED))
+#: Of `lattice` = (info, radius, spacing, steps, few, rest) and of `found` = (increment, value, hessian).
+LATTICE = types.Tuple((MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR))
+FOUND = types.Tuple((MATRIX, VECTOR, CUBE))
+_scores_at, _scores_part = part_of(PLACE, VECTOR)
+_search_at, _search_part = part_of(PLACE, LATTICE, FOUND)
 
 
-@njit(void(*PLACE, VECTOR), parallel=True, cache=True, error_model="numpy")
-def scores(state, beams, side, origin, index, pool, stamps, fields, marks, value):
+@_scores_part
+def _scores_of(thread, place, value):
     """Σ of weight · field (N,) at the states."""
+    state, beams, side, origin, index, pool, stamps, fields, marks = place
     border = stamps.shape[2] // 2
     threads = fields.shape[0]
-    for thread in prange(threads):
-        field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
-        for n in range(thread, state.shape[0], threads):
-            margin = (border + 1) * side
-            _prepare(n, state[n], beams, 0.0, margin, side, origin, index, pool, stamps, field, marked, window)
-            cos, sin = math.cos(state[n, 0]), math.sin(state[n, 0])
-            value[n] = _score(field, window, border, side, state[n, 1], state[n, 2], cos, sin, beams)
-            _clear(field, marked, border)
+    field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
+    for n in range(thread, state.shape[0], threads):
+        margin = (border + 1) * side
+        _prepare(n, state[n], beams, 0.0, margin, side, origin, index, pool, stamps, field, marked, window)
+        cos, sin = math.cos(state[n, 0]), math.sin(state[n, 0])
+        value[n] = _score(field, window, border, side, state[n, 1], state[n, 2], cos, sin, beams)
+        _clear(field, marked, border)
+
+
+@njit(void(int64, PLACE, VECTOR), parallel=True, cache=True, error_model="numpy")
+def _scores_all(one, place, value):
+    for thread in prange(place[7].shape[0]):
+        _scores_at(one)(int64(thread), place, value)
+
+
+scores = partial(_scores_all, _scores_of.address)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -311,77 +340,91 @@ def _outward(k):
     return (k + 1) // 2 if k % 2 else -(k // 2)
 
 
-@njit(_SEARCH, parallel=True, cache=True, error_model="numpy")
-def search(
-    state, beams, side, origin, index, pool, stamps, fields, marks, info, radius, spacing, steps, few, rest,
-    increment, value, hessian,
-):  # fmt: skip
+@njit(cache=True, error_model="numpy")
+def _copy(values, out):
+    """Three numbers; a slice would compile what says that shapes differ."""
+    out[0], out[1], out[2] = values[0], values[1], values[2]
+
+
+@_search_part
+def _search_of(thread, place, lattice, found):
     """The increments (N, 3) at which score minus ½ εᵀ info ε is highest, within ±`radius` (3,) of the states.
 
     First on a lattice of `spacing` (3,) from its middle outward, by the nearest cells' values for the beams `few`: those
     from each on can add `rest` at most, so that most points are given up early. Then, from its best point, along the axes
     with steps that are halved (G. Grisetti et al. 2007).
     """
+    state, beams, side, origin, index, pool, stamps, fields, marks = place
+    info, radius, spacing, steps, few, rest = lattice
+    increment, value, hessian = found
     border = stamps.shape[2] // 2
     threads = fields.shape[0]
-    for thread in prange(threads):
-        field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
-        there, best, trial, gradient = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-        counts = np.zeros(3, dtype=np.int64)
-        for a in range(3):
-            counts[a] = math.ceil(radius[a] / spacing[a])
-        ends = np.zeros((few.shape[0], 2))
-        for n in range(thread, state.shape[0], threads):
-            base, turn = state[n], radius[0] + spacing[0]
-            margin = (border + 1) * side + math.hypot(radius[1] + spacing[1], radius[2] + spacing[2])
-            _prepare(n, base, beams, turn, margin, side, origin, index, pool, stamps, field, marked, window)
-            left, low = window[1] * TILE - border, window[0] * TILE - border
-            highest = -np.inf
-            for i in range(2 * counts[0] + 1):
-                trial[0] = _outward(i) * spacing[0]
-                cos, sin = math.cos(base[0] + trial[0]), math.sin(base[0] + trial[0])
-                for k in range(few.shape[0]):
-                    beam = few[k]
-                    ends[k, 0] = (base[1] + cos * beam[2] - sin * beam[3]) / side - left
-                    ends[k, 1] = (base[2] + sin * beam[2] + cos * beam[3]) / side - low
-                # Shifts are along the axes of the robot half way through the turn, where Exp has its chord.
-                half = 0.5 * trial[0]
-                chord = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
-                cos, sin = chord * math.cos(base[0] + half) / side, chord * math.sin(base[0] + half) / side
-                for j in range(2 * counts[1] + 1):
-                    trial[1] = _outward(j) * spacing[1]
-                    for m in range(2 * counts[2] + 1):
-                        trial[2] = _outward(m) * spacing[2]
-                        shift_x = cos * trial[1] - sin * trial[2]
-                        shift_y = sin * trial[1] + cos * trial[2]
-                        total = -_penalty(info, trial)
-                        for k in range(few.shape[0]):
-                            if total + rest[k] <= highest:
-                                break
-                            column, row = int(ends[k, 0] + shift_x), int(ends[k, 1] + shift_y)
-                            if 0 <= column < field.shape[1] and 0 <= row < field.shape[0]:
-                                total += few[k, 4] * field[row, column]
-                        if total > highest:
-                            highest = total
-                            best[:] = trial
-            # Uphill from there.
-            highest = _value(field, window, border, side, base, best, beams, there) - _penalty(info, best)
-            scale = 0.5
-            while scale > 0.01:
-                moved = False
-                for a in range(3):
-                    for sign in (-1.0, 1.0):
-                        trial[:] = best
-                        trial[a] += sign * scale * spacing[a]
-                        if abs(trial[a]) > radius[a] + spacing[a]:
-                            continue
-                        total = _value(field, window, border, side, base, trial, beams, there) - _penalty(info, trial)
-                        if total > highest:
-                            highest = total
-                            best[:] = trial
-                            moved = True
-                if not moved:
-                    scale *= 0.5
-            increment[n] = best
-            value[n] = _second_order(field, window, border, side, base, best, beams, steps, there, gradient, hessian[n])
-            _clear(field, marked, border)
+    field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
+    there, best, trial, gradient = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    counts = np.zeros(3, dtype=np.int64)
+    for a in range(3):
+        counts[a] = math.ceil(radius[a] / spacing[a])
+    ends = np.zeros((few.shape[0], 2))
+    for n in range(thread, state.shape[0], threads):
+        base, turn = state[n], radius[0] + spacing[0]
+        margin = (border + 1) * side + math.hypot(radius[1] + spacing[1], radius[2] + spacing[2])
+        _prepare(n, base, beams, turn, margin, side, origin, index, pool, stamps, field, marked, window)
+        left, low = window[1] * TILE - border, window[0] * TILE - border
+        highest = -np.inf
+        for i in range(2 * counts[0] + 1):
+            trial[0] = _outward(i) * spacing[0]
+            cos, sin = math.cos(base[0] + trial[0]), math.sin(base[0] + trial[0])
+            for k in range(few.shape[0]):
+                beam = few[k]
+                ends[k, 0] = (base[1] + cos * beam[2] - sin * beam[3]) / side - left
+                ends[k, 1] = (base[2] + sin * beam[2] + cos * beam[3]) / side - low
+            # Shifts are along the axes of the robot half way through the turn, where Exp has its chord.
+            half = 0.5 * trial[0]
+            chord = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
+            cos, sin = chord * math.cos(base[0] + half) / side, chord * math.sin(base[0] + half) / side
+            for j in range(2 * counts[1] + 1):
+                trial[1] = _outward(j) * spacing[1]
+                for m in range(2 * counts[2] + 1):
+                    trial[2] = _outward(m) * spacing[2]
+                    shift_x = cos * trial[1] - sin * trial[2]
+                    shift_y = sin * trial[1] + cos * trial[2]
+                    total = -_penalty(info, trial)
+                    for k in range(few.shape[0]):
+                        if total + rest[k] <= highest:
+                            break
+                        column, row = int(ends[k, 0] + shift_x), int(ends[k, 1] + shift_y)
+                        if 0 <= column < field.shape[1] and 0 <= row < field.shape[0]:
+                            total += few[k, 4] * field[row, column]
+                    if total > highest:
+                        highest = total
+                        _copy(trial, best)
+        # Uphill from there.
+        highest = _value(field, window, border, side, base, best, beams, there) - _penalty(info, best)
+        scale = 0.5
+        while scale > 0.01:
+            moved = False
+            for a in range(3):
+                for sign in (-1.0, 1.0):
+                    _copy(best, trial)
+                    trial[a] += sign * scale * spacing[a]
+                    if abs(trial[a]) > radius[a] + spacing[a]:
+                        continue
+                    total = _value(field, window, border, side, base, trial, beams, there) - _penalty(info, trial)
+                    if total > highest:
+                        highest = total
+                        _copy(trial, best)
+                        moved = True
+            if not moved:
+                scale *= 0.5
+        _copy(best, increment[n])
+        value[n] = _second_order(field, window, border, side, base, best, beams, steps, there, gradient, hessian[n])
+        _clear(field, marked, border)
+
+
+@njit(void(int64, PLACE, LATTICE, FOUND), parallel=True, cache=True, error_model="numpy")
+def _search_all(one, place, lattice, found):
+    for thread in prange(place[7].shape[0]):
+        _search_at(one)(int64(thread), place, lattice, found)
+
+
+search = partial(_search_all, _search_of.address)

@@ -179,12 +179,12 @@ class LandmarkMap(Map):
             landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim
             state = belief.state[belief.mode]
             anchor = -self.innovations(model, np.zeros((k, p)), ids, state, belief.mode)[0]
-            access = self.store.access(ids)
+            access = tuple(self.store.access(ids))
             mean, cov = np.empty((k, p)), np.empty((k, p, p))
             state, anchor, spread = map(np.ascontiguousarray, (prior.predicted(), anchor, prior.spread(prior.mean)))
             sizes = np.array([self.space.dim, landmark.dim, landmark.constants])
             fused = kernel.function.address, kernel.params, state
-            project(*fused, *access, anchor, weights, spread, sizes, mean, cov)
+            project(fused, access, anchor, weights, spread, sizes, mean, cov)
             return anchor + mean, cov
         return rows.projected(model, *rows.expected(model, self.read(ids), belief), belief)
 

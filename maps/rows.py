@@ -179,8 +179,8 @@ class RowEngine:
             else:
                 fused, measured, sizes = self._observed(kernel, batch, group, state)
                 out = total.info, total.vector, total.quad, total.log_det, total.rows
-                access, factor = self.store.access(batch.ids), np.ascontiguousarray(prior.factor)
-                run_driver(refine, state.shape[0] * batch.ks.size, *fused, *access, *measured, factor, sizes, *out)
+                access, factor = tuple(self.store.access(batch.ids)), np.ascontiguousarray(prior.factor)
+                run_driver(refine, state.shape[0] * batch.ks.size, fused, access, measured, factor, sizes, out)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
@@ -214,7 +214,7 @@ class RowEngine:
                 access, targets = self.store.rewrite(batch.ids)
                 fused, measured, sizes = self._observed(kernel, batch, group, state)
                 pairs = state.shape[0] * batch.ks.size
-                run_driver(update, pairs, *fused, *access, targets, *measured, sizes, log_density)
+                run_driver(update, pairs, fused, tuple(access), targets, measured, sizes, log_density)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
         after_sampling = np.zeros(state.shape[0])

@@ -26,7 +26,8 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
     pixels, seen, slope = np.empty(3), np.empty(3), np.empty((3, 3))
     chol, gain, gained = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for k in range(z_prev.shape[0]):
-        pixels[:] = z_prev[k]
+        for i in range(3):
+            pixels[i] = z_prev[k, i]
         change = np.inf
         for sweep in range(sweeps + 1):
             depth = _see(matrix, pixels, seen, slope)
@@ -36,7 +37,8 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
             _innovate(k, pixels, seen, slope, z_prev, z_now, cov_prev, cov_now, noisy, rows, gain, chol)
             if sweep == sweeps or change <= swept:
                 break
-            gained[:] = rows[k, :, 0]
+            for i in range(3):
+                gained[i] = rows[k, i, 0]
             solve(chol, gained)
             change = 0.0
             for i in range(3):
@@ -45,13 +47,18 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
                     moved += gain[i, j] * gained[j]
                 change = max(change, abs(moved - pixels[i]))
                 pixels[i] = moved
-        best[k] = pixels
+        for i in range(3):
+            best[k, i] = pixels[i]
         if front[k]:
             x, y = (seen[0] - camera[2]) * depth / camera[0], (seen[1] - camera[3]) * depth / camera[1]
             _pixel_jacobian((x, y, depth), (pixels[0] - pixels[2]) / camera[4], seen, camera, rows[k, :, 1:])
             rows[k, :, 1:] *= -1.0
             for n in range(7):
-                solve_lower(chol, rows[k, :, n])
+                for i in range(3):
+                    gained[i] = rows[k, i, n]
+                solve_lower(chol, gained)
+                for i in range(3):
+                    rows[k, i, n] = gained[i]
         else:
             rows[k] = 0.0
 

@@ -1,7 +1,7 @@
 """Compiled kernels: which there are, whether they are in the cache, and compiling them with a word of warning."""
 
+import re
 from importlib import import_module
-from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,17 +9,24 @@ import rbpf
 from rbpf.cli.showing import progress, say
 
 _ROOT = Path(rbpf.__file__).parent
+#: Of a source: that it imports compiled functions that others import, too.
+_SHARED = re.compile(r"^from rbpf\.kernels(\.(?!signature)\w+)? import", re.MULTILINE)
 
 
 def kernel_modules() -> list[str]:
-    """Modules of `rbpf` with compiled functions of their own, longest first, without those only compiled into others."""
+    """Modules of `rbpf` with compiled functions of their own, without those only compiled into others, in a good order.
+
+    Longest first; but what compiles functions of `rbpf.kernels` into its own waits until the drivers there, which do the same,
+    have them in the cache: two processes would compile them twice.
+    """
     paths = [*(_ROOT / "kernels").glob("*.py")]
     for folder in ("sensors", "motion", "maps", "systems", "validation"):
         paths += (_ROOT / folder).rglob("*kernel*.py")
     sources = {path: path.read_text(encoding="utf-8") for path in paths}
     compiled = {path: s.count("@njit(") + s.count("@observation_kernel") for path, s in sources.items()}
     chosen = [path for path, count in compiled.items() if count > sources[path].count('inline="always"')]
-    chosen.sort(key=lambda path: (-len(sources[path]), path))
+    waits = {path: path.parent.name != "kernels" and bool(_SHARED.search(sources[path])) for path in chosen}
+    chosen.sort(key=lambda path: (path.stem != "landmarks", waits[path], -len(sources[path]), path))
     return [".".join(["rbpf", *path.relative_to(_ROOT).with_suffix("").parts]) for path in chosen]
 
 
@@ -49,11 +56,10 @@ def compile_kernels(every: bool = False) -> list[str]:
         from joblib import Parallel, delayed
 
         with progress() as bar, Parallel(n_jobs=-1, return_as="generator_unordered") as parallel:
-            report, done = bar("compiling"), count(1)
-            # First calls need what is compiled as it is loaded.
-            for jobs in ([delayed(_load)(name) for name in missing], [delayed(call)() for call in FIRST_CALLS]):
-                for _ in parallel(jobs):
-                    report(next(done), len(missing) + len(FIRST_CALLS))
+            report = bar("compiling")
+            jobs = [delayed(_load)(name) for name in missing] + [delayed(call)() for call in FIRST_CALLS]
+            for done, _ in enumerate(parallel(jobs), 1):
+                report(done, len(jobs))
     if every:
         for name in modules:
             _load(name)
@@ -66,22 +72,8 @@ def _load(module: str) -> None:
     import_module(module)
 
 
-def _search() -> None:
-    """A search for patches, as the systems do it, on a few numbers; likewise those below."""
-    import numpy as np
-
-    from rbpf.sensors.features import CornerDetector
-    from rbpf.sensors.patches.search import cut, search, warp
-
-    image = np.random.default_rng(0).integers(0, 256, (30, 40)).repeat(5, axis=0).repeat(5, axis=1).astype(np.uint8)
-    px = CornerDetector().detect(image, 4).px
-    windows = [window for place in px if (window := cut(image, place)) is not None]
-    templates = warp(np.array(windows), np.tile(np.eye(2), (len(windows), 1, 1)))
-    search(image, templates, px[: len(windows)], np.tile(4.0 * np.eye(2), (len(windows), 1, 1)))
-
-
 def _move() -> None:
-    """The motion of a stereo pair."""
+    """The motion of a stereo pair, as the systems do it, on a few numbers; likewise below."""
     import numpy as np
 
     from rbpf.motion.stereo_geometry import Matches
@@ -107,4 +99,4 @@ def _drive() -> None:
 
 
 #: What is compiled at its first call.
-FIRST_CALLS = (_search, _move, _drive)
+FIRST_CALLS = (_move, _drive)

@@ -37,7 +37,8 @@ def advance(nodes, free, n_free, leaves, ancestors, now):
             node = nodes[node, PARENT]
             if node >= 0:
                 nodes[node, CHILDREN] -= 1
-    leaves[:] = fresh
+    for i in range(n):
+        leaves[i] = fresh[i]
     return n_free
 
 

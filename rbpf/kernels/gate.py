@@ -28,8 +28,10 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
     column = np.empty((p, BLOCK))
     squared = np.zeros(BLOCK)
     scale = np.ones(BLOCK)
-    spread[:, :, :count] = total[:, :, :count]
-    white[:, :count] = nu[:, :count]
+    _copy_lower(total, count, spread)
+    for a in range(p):
+        for i in range(count):
+            white[a, i] = nu[a, i]
     add_spread(jac_state, factor, start, count, column, spread)
     cholesky(spread, count, scale)
     whiten_vector(spread, count, white)
@@ -39,7 +41,7 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
         for i in range(count):
             squared[i] -= 2.0 * math.log(scale[i])
             scale[i] = 1.0
-        spread[:, :, :count] = total[:, :, :count]
+        _copy_lower(total, count, spread)
         cholesky(spread, count, scale)
         for i in range(count):
             squared[i] += 2.0 * math.log(scale[i])
@@ -52,6 +54,14 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
         else:
             weight[i] = 0.0
             penalty[i] -= 2.0 * (params[1] if kernel_id == 2 else -0.5 * params[0])
+
+
+@njit(cache=True, error_model="numpy")
+def _copy_lower(total, count, out):
+    for a in range(total.shape[0]):
+        for b in range(a + 1):
+            for i in range(count):
+                out[a, b, i] = total[a, b, i]
 
 
 @njit(cache=True, error_model="numpy")

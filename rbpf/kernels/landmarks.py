@@ -5,9 +5,10 @@ compiled once for all models.
 """
 
 import math
+from functools import partial
 
 import numpy as np
-from numba import int64, njit, prange, void
+from numba import int64, njit, prange, types, void
 
 from rbpf.kernels import block as lanes
 from rbpf.kernels.block import packed
@@ -24,84 +25,97 @@ from rbpf.kernels.signature import (
     MATRIX,
     VECTOR,
     kernel_at,
+    part_of,
 )
 
-#: Types of (pool, slabs, which, maps) and of (z, noise, mask, kernel_id, kernel_params), see `refine`.
-RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
-OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
-_REFINE = void(int64, VECTOR, MATRIX, *RECORDS, *OBSERVED, CUBE, INDICES, CUBE, MATRIX, VECTOR, VECTOR, VECTOR)
-_UPDATE = void(int64, VECTOR, MATRIX, *RECORDS, INDICES, *OBSERVED, INDICES, VECTOR)
+#: Types of `fused` = (address, params, state), `records` = (pool, slabs, which, maps), and
+#: `observed` = (z, noise, mask, kernel_id, kernel_params), see `refine`.
+FUSED = types.Tuple((int64, VECTOR, MATRIX))
+RECORDS = types.Tuple((CUBE, INDICES, INDICES, INDEX_MATRIX))
+OBSERVED = types.Tuple((MATRIX, CUBE, MASK, int64, VECTOR))
+_REFINE = FUSED, RECORDS, OBSERVED, CUBE, INDICES, types.Tuple((CUBE, MATRIX, VECTOR, VECTOR, VECTOR))
+_UPDATE = FUSED, RECORDS, INDICES, OBSERVED, INDICES, VECTOR
 #: Types of (address, params, state, mean, columns, clones, origins), see `linearise_group`.
 _GROUP = int64, VECTOR, MATRIX, MATRIX, INDEX_MATRIX, INDEX_MATRIX, MATRIX
-_PROJECT = void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE)
+_PROJECT = void(FUSED, RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE)
+
+_refine_at, _refine_part = part_of(*_REFINE)
 
 
-@njit(_REFINE, parallel=True, cache=True, error_model="numpy")
-def refine(
-    address, params, state, pool, slabs, which, maps, z, noise, mask, kernel_id, kernel_params, factor, sizes,
-    info, vector, quad, log_det, rows,
-):  # fmt: skip
+@_refine_part
+def _refine_block(block, fused, records, observed, factor, sizes, sums):
     """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
 
-    `rows` (N,) counts the scalar measurements that entered these sums.
+    The last of `sums`, `rows` (N,), counts the scalar measurements that entered.
 
     `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
     `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
     saw it; `kernel_id` and `kernel_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
     `sizes` = (d, D, A).
     """
+    address, params, state = fused
+    pool, slabs, which, maps = records
+    z, noise, mask, kernel_id, kernel_params = observed
+    info, vector, quad, log_det, rows = sums
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    for block in prange((n_particles + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        count = min(BLOCK, n_particles - start)
-        kernel = kernel_at(address)
-        x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
-        weight = np.ones(BLOCK)
-        scale = np.ones(BLOCK)
-        sum_info = np.zeros((dim * (dim + 1) // 2, BLOCK))
-        sum_vector = np.zeros((dim, BLOCK))
-        sum_quad = np.zeros(BLOCK)
-        sum_log = np.zeros(BLOCK)
-        penalty = np.zeros(BLOCK)
-        used = np.zeros(BLOCK)
-        pivots = 0
-        lanes.load_states(state, start, count, x)
-        for k in range(n_obs):
-            lanes.load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
-            kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
-            lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
-            partial = mask.shape[0] > 0 or kernel_id != 0
-            if partial:
-                for i in range(count):
-                    weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
-                accept_predicted(kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty)
-                leave_out(weight, count, nu, jac_state, total)
-            lanes.cholesky(total, count, scale)
-            lanes.whiten_vector(total, count, nu)
-            lanes.whiten_matrix(total, count, jac_state)
-            lanes.add_squares(nu, count, sum_quad)
-            lanes.add_gram(jac_state, 1.0, count, sum_info)
-            lanes.add_transposed_product(jac_state, nu, count, sum_vector)
-            pivots += p
+    start = block * BLOCK
+    count = min(BLOCK, n_particles - start)
+    kernel = kernel_at(address)
+    x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
+    weight = np.ones(BLOCK)
+    scale = np.ones(BLOCK)
+    sum_info = np.zeros((dim * (dim + 1) // 2, BLOCK))
+    sum_vector = np.zeros((dim, BLOCK))
+    sum_quad = np.zeros(BLOCK)
+    sum_log = np.zeros(BLOCK)
+    penalty = np.zeros(BLOCK)
+    used = np.zeros(BLOCK)
+    pivots = 0
+    lanes.load_states(state, start, count, x)
+    for k in range(n_obs):
+        lanes.load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
+        kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
+        lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
+        if mask.shape[0] > 0 or kernel_id != 0:
             for i in range(count):
-                used[i] += weight[i]
-            if pivots + p > FACTORS_PER_LOG or k == n_obs - 1:
-                for i in range(count):
-                    sum_log[i] -= 2.0 * math.log(scale[i])
-                    scale[i] = 1.0
-                pivots = 0
+                weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
+            accept_predicted(kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty)
+            leave_out(weight, count, nu, jac_state, total)
+        lanes.cholesky(total, count, scale)
+        lanes.whiten_vector(total, count, nu)
+        lanes.whiten_matrix(total, count, jac_state)
+        lanes.add_squares(nu, count, sum_quad)
+        lanes.add_gram(jac_state, 1.0, count, sum_info)
+        lanes.add_transposed_product(jac_state, nu, count, sum_vector)
+        pivots += p
         for i in range(count):
-            quad[start + i] += sum_quad[i]
-            rows[start + i] += used[i] * p
-            log_det[start + i] += penalty[i]
-            if kernel_id == 0 or kernel_id == 2:
-                log_det[start + i] += sum_log[i] + used[i] * p * math.log(2.0 * math.pi)
-            for a in range(dim):
-                vector[start + i, a] += sum_vector[a, i]
-                for b in range(dim):
-                    info[start + i, a, b] += sum_info[packed(a, b), i]
+            used[i] += weight[i]
+        if pivots + p > FACTORS_PER_LOG or k == n_obs - 1:
+            for i in range(count):
+                sum_log[i] -= 2.0 * math.log(scale[i])
+                scale[i] = 1.0
+            pivots = 0
+    for i in range(count):
+        quad[start + i] += sum_quad[i]
+        rows[start + i] += used[i] * p
+        log_det[start + i] += penalty[i]
+        if kernel_id == 0 or kernel_id == 2:
+            log_det[start + i] += sum_log[i] + used[i] * p * math.log(2.0 * math.pi)
+        for a in range(dim):
+            vector[start + i, a] += sum_vector[a, i]
+            for b in range(dim):
+                info[start + i, a, b] += sum_info[packed(a, b), i]
+
+
+@njit(void(int64, *_REFINE), parallel=True, cache=True, error_model="numpy")
+def _refine_blocks(one, fused, records, observed, factor, sizes, sums):
+    for block in prange((fused[2].shape[0] + BLOCK - 1) // BLOCK):
+        _refine_at(one)(int64(block), fused, records, observed, factor, sizes, sums)
+
+
+refine = partial(_refine_blocks, _refine_block.address)
 
 
 @njit(cache=True, error_model="numpy")
@@ -120,76 +134,87 @@ def _store_record(pool, slab, source, rows, start, count, mean, cov):
                 pool[slab, f, start + i] = pool[source, f, rows[start + i]]
 
 
-@njit(_UPDATE, parallel=True, cache=True, error_model="numpy")
-def update(
-    address, params, state, pool, slabs, which, maps, targets, z, noise, mask, kernel_id, kernel_params, sizes,
-    log_density,
-):  # fmt: skip
+_update_at, _update_part = part_of(*_UPDATE)
+
+
+@_update_part
+def _update_block(block, fused, records, targets, observed, sizes, log_density):
     """Adds Σ log p(z | x) to `log_density` (N,) and writes the updated landmarks to the slabs `targets`.
 
     Given the sampled pose, each landmark is an independent EKF: with S = J P Jᵀ + R = L Lᵀ, A = L⁻¹ J P and
     y = L⁻¹ν the update is m += Aᵀy, P −= AᵀA. Arguments as in `refine`; particle i reads row `maps[...][i]` of the
     slab it inherits and writes row i of the target, so that descendants of one parent never share what they write.
     """
+    address, params, state = fused
+    pool, slabs, which, maps = records
+    z, noise, mask, kernel_id, kernel_params = observed
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    for block in prange((n_particles + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        count = min(BLOCK, n_particles - start)
-        kernel = kernel_at(address)
-        x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
-        weight = np.ones(BLOCK)
-        scale = np.ones(BLOCK)
-        squared = np.zeros(BLOCK)
-        used = np.zeros(BLOCK)
-        pivots = 0
-        sum_log = np.zeros(BLOCK)
-        lanes.load_states(state, start, count, x)
-        for k in range(n_obs):
-            rows = maps[which[k]]
-            lanes.load_record(pool, slabs[k], rows, start, count, mean, cov, const)
-            kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
-            lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
-            if mask.shape[0] > 0:
+    start = block * BLOCK
+    count = min(BLOCK, n_particles - start)
+    kernel = kernel_at(address)
+    x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
+    weight = np.ones(BLOCK)
+    scale = np.ones(BLOCK)
+    squared = np.zeros(BLOCK)
+    used = np.zeros(BLOCK)
+    pivots = 0
+    sum_log = np.zeros(BLOCK)
+    lanes.load_states(state, start, count, x)
+    for k in range(n_obs):
+        rows = maps[which[k]]
+        lanes.load_record(pool, slabs[k], rows, start, count, mean, cov, const)
+        kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
+        lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
+        if mask.shape[0] > 0:
+            for i in range(count):
+                weight[i] = 1.0 if mask[k, start + i] else 0.0
+            leave_out(weight, count, nu, cross, total)
+        if kernel_id != 0:
+            for i in range(count):
+                squared[i] = 0.0
+                scale[i] = 1.0
+        lanes.cholesky(total, count, scale)
+        lanes.whiten_vector(total, count, nu)
+        lanes.add_squares(nu, count, squared)
+        rejected = False
+        if kernel_id == 0:
+            pivots += p
+            for i in range(count):
+                used[i] += weight[i]
+            if pivots + p > FACTORS_PER_LOG or k == n_obs - 1:
                 for i in range(count):
-                    weight[i] = 1.0 if mask[k, start + i] else 0.0
-                leave_out(weight, count, nu, cross, total)
-            if kernel_id != 0:
-                for i in range(count):
-                    squared[i] = 0.0
+                    sum_log[i] += math.log(scale[i])
                     scale[i] = 1.0
-            lanes.cholesky(total, count, scale)
-            lanes.whiten_vector(total, count, nu)
-            lanes.add_squares(nu, count, squared)
-            rejected = False
-            if kernel_id == 0:
-                pivots += p
-                for i in range(count):
-                    used[i] += weight[i]
-                if pivots + p > FACTORS_PER_LOG or k == n_obs - 1:
-                    for i in range(count):
-                        sum_log[i] += math.log(scale[i])
-                        scale[i] = 1.0
-                    pivots = 0
-            else:
-                for i in range(count):
-                    if weight[i] != 0.0:
-                        sum_log[i] += log_likelihood(kernel_id, kernel_params, squared[i], scale[i], p)
-                        weight[i] = 1.0 if is_inlier(kernel_id, kernel_params, squared[i], scale[i], p) else 0.0
-                        rejected = rejected or weight[i] == 0.0
-            lanes.whiten_matrix(total, count, cross)
-            if rejected:
-                leave_out(weight, count, nu, cross, total)
-            lanes.add_transposed_product(cross, nu, count, mean)
-            lanes.add_gram(cross, -1.0, count, cov)
-            _store_record(pool, targets[k], slabs[k], rows, start, count, mean, cov)
-            if kernel_id != 0 and mask.shape[0] == 0:
-                weight[:] = 1.0
-        for i in range(count):
-            if kernel_id == 0:
-                sum_log[i] -= 0.5 * (squared[i] + used[i] * p * math.log(2.0 * math.pi))
-            log_density[start + i] += sum_log[i]
+                pivots = 0
+        else:
+            for i in range(count):
+                if weight[i] != 0.0:
+                    sum_log[i] += log_likelihood(kernel_id, kernel_params, squared[i], scale[i], p)
+                    weight[i] = 1.0 if is_inlier(kernel_id, kernel_params, squared[i], scale[i], p) else 0.0
+                    rejected = rejected or weight[i] == 0.0
+        lanes.whiten_matrix(total, count, cross)
+        if rejected:
+            leave_out(weight, count, nu, cross, total)
+        lanes.add_transposed_product(cross, nu, count, mean)
+        lanes.add_gram(cross, -1.0, count, cov)
+        _store_record(pool, targets[k], slabs[k], rows, start, count, mean, cov)
+        if kernel_id != 0 and mask.shape[0] == 0:
+            weight[:] = 1.0
+    for i in range(count):
+        if kernel_id == 0:
+            sum_log[i] -= 0.5 * (squared[i] + used[i] * p * math.log(2.0 * math.pi))
+        log_density[start + i] += sum_log[i]
+
+
+@njit(void(int64, *_UPDATE), parallel=True, cache=True, error_model="numpy")
+def _update_blocks(one, fused, records, targets, observed, sizes, log_density):
+    for block in prange((fused[2].shape[0] + BLOCK - 1) // BLOCK):
+        _update_at(one)(int64(block), fused, records, targets, observed, sizes, log_density)
+
+
+update = partial(_update_blocks, _update_block.address)
 
 
 @njit(cache=True, error_model="numpy")
@@ -210,12 +235,14 @@ def _add_between(weights, offset, mean, cov):
 
 
 @njit(_PROJECT, cache=True, error_model="numpy")
-def project(address, params, state, pool, slabs, which, maps, anchor, weights, factor, sizes, mean, cov):
+def project(fused, records, anchor, weights, factor, sizes, mean, cov):
     """Fills `mean` (K, p), relative to `anchor` (K, p), and `cov` (K, p, p) = within + between particles.
 
     The kernel's residual of `anchor`, with the sign reversed, is where a particle expects the landmark. Within is
     J P Jᵀ + H L (H L)ᵀ, with the `factor` L (N or 1, d, r) of the state. Other arguments as in `refine`.
     """
+    address, params, state = fused
+    pool, slabs, which, maps = records
     kernel = kernel_at(address)
     n_particles, size = state.shape
     p = anchor.shape[1]
@@ -312,8 +339,7 @@ def linearise_group(address, params, state, mean, columns, clones, origins, z, f
     tangent, jacobian = np.empty((1, 6)), np.empty((1, 6, 6))
     for start in range(0, particles, BLOCK):
         n = min(BLOCK, particles - start)
-        for i in range(n):
-            x[:, i] = state[start + i]
+        lanes.load_states(state, start, n, x)
         for k in range(count):
             _load(mean, columns[k], clones[k], origins[k], start, n, landmark, anchor)
             kernel(x, landmark, anchor, z[k], params, n, nu, by_state, by_landmark)
@@ -349,8 +375,7 @@ def expect_group(address, params, state, mean, columns, clones, origins, cov, ro
     zero, carried, moved = np.zeros(p), np.empty((p, dim)), np.empty((p, rank))
     for start in range(0, particles, BLOCK):
         n = min(BLOCK, particles - start)
-        for i in range(n):
-            x[:, i] = state[start + i]
+        lanes.load_states(state, start, n, x)
         for k in range(count):
             _load(mean, columns[k], clones[k], origins[k], start, n, landmark, anchor)
             kernel(x, landmark, anchor, zero, params, n, nu, by_state, by_landmark)

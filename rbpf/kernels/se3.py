@@ -271,14 +271,17 @@ def inverse_transform(a, p, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_rotation(w, linear, square, out):
-    """I + linear W + square W², with W² = ω ωᵀ − θ² I."""
+def _fill_rotations(w, linear, square, out):
+    """Both 3x3 blocks on the diagonal: I + linear W + square W², with W² = ω ωᵀ − θ² I."""
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     for j in range(3):
         for k in range(3):
             out[j, k] = square * (w[j] * w[k])
         out[j, j] += 1.0 - square * squared
     _add_skew(out, linear, w)
+    for j in range(3):
+        for k in range(3):
+            out[3 + j, 3 + k] = out[j, k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -324,8 +327,7 @@ def left_jacobian(xi, out):
         # (1 − cos θ)/θ² from the half angle, which does not cancel.
         theta = math.sqrt(squared + TINY)
         fraction = math.sin(0.5 * theta) / theta
-        _fill_rotation(w, 2.0 * (fraction * fraction), c, out[i, :3, :3])
-        out[i, 3:, 3:] = out[i, :3, :3]
+        _fill_rotations(w, 2.0 * (fraction * fraction), c, out[i])
         _fill_coupling(w, v, c, d, e, out[i, 3:, :3])
 
 
@@ -341,13 +343,14 @@ def left_jacobian_inverse(xi, out):
         shifted = squared + TINY
         angle = 0.5 * math.sqrt(shifted)
         cotangent = (1.0 - angle * math.cos(angle) / math.sin(angle)) / shifted
-        _fill_rotation(w, -0.5, cotangent, out[i, :3, :3])
-        out[i, 3:, 3:] = out[i, :3, :3]
+        _fill_rotations(w, -0.5, cotangent, out[i])
         c, d, e = _coefficients(squared)
         _fill_coupling(w, v, c, d, e, middle)
         _product(out[i, :3, :3], middle, half)
         _product(half, out[i, :3, :3], middle)
-        out[i, 3:, :3] = -middle
+        for j in range(3):
+            for k in range(3):
+                out[i, 3 + j, k] = -middle[j, k]
 
 
 @njit(void(READ_ONLY, CUBE), cache=True, error_model="numpy")

@@ -28,8 +28,6 @@ INDEX_MATRIX = types.Array(int64, 2, "C")
 MASK = types.Array(types.boolean, 2, "C")
 
 _SIGNATURE = void(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE)
-#: First-class function type: the drivers call a kernel through a pointer, so they compile once for all models.
-KERNEL_TYPE = types.FunctionType(_SIGNATURE)
 
 
 @final
@@ -41,17 +39,35 @@ class ObservationKernel:
         self.address = int(compiled.address)  #: Where the machine code starts.
 
 
-@intrinsic
-def kernel_at(_typing: Any, address: Any) -> Any:
-    """Inside a driver: the kernel that starts at an address (int64), as something to call."""
+def function_at(signature: Any) -> Any:
+    """What gives, inside a compiled function, the function that starts at an address (int64), as something to call."""
+    kind = types.FunctionType(signature)
 
-    def build(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        made = cgutils.create_struct_proxy(KERNEL_TYPE)(context, builder)
-        made.c_addr = builder.inttoptr(arguments[0], cgutils.voidptr_t)
-        made.py_addr = made.jit_addr = cgutils.get_null_value(cgutils.voidptr_t)
-        return made._getvalue()
+    @intrinsic
+    def at(_typing: Any, address: Any) -> Any:
+        def build(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            made = cgutils.create_struct_proxy(kind)(context, builder)
+            made.c_addr = builder.inttoptr(arguments[0], cgutils.voidptr_t)
+            made.py_addr = made.jit_addr = cgutils.get_null_value(cgutils.voidptr_t)
+            return made._getvalue()
 
-    return KERNEL_TYPE(address), build
+        return kind(address), build
+
+    return at
+
+
+def part_of(*arguments: Any) -> tuple[Any, Callable[[Callable[..., None]], Any]]:
+    """For a loop whose parts run on threads: `function_at` of what does one part, and the decorator that compiles that.
+
+    It is `function(part, *arguments)`. A parallel loop that calls it by its address compiles in a tenth of the time that the
+    same loop takes with the body in place, which Numba compiles four times over.
+    """
+    signature = void(int64, *arguments)
+    return function_at(signature), cfunc(signature, cache=True, error_model="numpy")
+
+
+#: The drivers call a kernel by its address, so they compile once for all models.
+kernel_at = function_at(_SIGNATURE)
 
 
 def observation_kernel(function: Callable[..., None]) -> ObservationKernel:

@@ -6,37 +6,21 @@ not the template's: the noise of both then comes out smaller than with gradients
 """
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numba import njit, prange
+from numba import float32, float64, int64, njit, prange, types, uint8, void
 
-from rbpf.kernels.signature import discard_stale
+from rbpf.kernels.signature import MATRIX, READ_ONLY, discard_stale, part_of
 
+discard_stale(Path(__file__).parent)
 
-@njit(cache=True, error_model="numpy")
-def warp_all(sources, affines, templates):
-    """Fills templates (K, size, size) from sources (K, S, S) and affines (K, 2, 2); NaN where one leaves its source."""
-    size, middle = templates.shape[1], 0.5 * (sources.shape[1] - 1)
-    templates[:] = np.nan
-    for k in range(templates.shape[0]):
-        source = sources[k]
-        a, b, c, d = affines[k, 0, 0], affines[k, 0, 1], affines[k, 1, 0], affines[k, 1, 1]
-        if not math.isfinite(a * a + b * b + c * c + d * d):
-            continue
-        samples = footprint(a, b, c, d, source.shape[0])
-        reach = 0.0
-        for s in range(samples.shape[0]):
-            reach = max(reach, abs(samples[s, 0]), abs(samples[s, 1]))
-        if max(abs(a) + abs(b), abs(c) + abs(d)) * (size // 2) + reach > middle:
-            continue
-        for j in range(size):
-            for i in range(size):
-                dx, dy, total = float(i - size // 2), float(j - size // 2), 0.0
-                x, y = middle + a * dx + b * dy, middle + c * dx + d * dy
-                for s in range(samples.shape[0]):
-                    total += cubic(source, x + samples[s, 0], y + samples[s, 1])
-                templates[k, j, i] = total / samples.shape[0]
+# What is read may be locked.
+IMAGE = types.Array(uint8, 2, "C", readonly=True)
+_WINDOWS = types.Array(uint8, 3, "C", readonly=True)
+_TEMPLATES = types.Array(float32, 3, "C", readonly=True)
+_READ_ONLY_CUBE = types.Array(float64, 3, "C", readonly=True)
 
 
 @njit(cache=True, error_model="numpy")
@@ -92,7 +76,32 @@ def weights(t):
     return (-0.5 * t * s * s, 1.0 + t * t * (1.5 * t - 2.5), 1.0 + s * s * (1.5 * s - 2.5), -0.5 * s * t * t)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(void(_WINDOWS, _READ_ONLY_CUBE, types.Array(float32, 3, "C")), cache=True, error_model="numpy")
+def warp_all(sources, affines, templates):
+    """Fills templates (K, size, size) from sources (K, S, S) and affines (K, 2, 2); NaN where one leaves its source."""
+    size, middle = templates.shape[1], 0.5 * (sources.shape[1] - 1)
+    templates[:] = np.nan
+    for k in range(templates.shape[0]):
+        source = sources[k]
+        a, b, c, d = affines[k, 0, 0], affines[k, 0, 1], affines[k, 1, 0], affines[k, 1, 1]
+        if not math.isfinite(a * a + b * b + c * c + d * d):
+            continue
+        samples = footprint(a, b, c, d, source.shape[0])
+        reach = 0.0
+        for s in range(samples.shape[0]):
+            reach = max(reach, abs(samples[s, 0]), abs(samples[s, 1]))
+        if max(abs(a) + abs(b), abs(c) + abs(d)) * (size // 2) + reach > middle:
+            continue
+        for j in range(size):
+            for i in range(size):
+                dx, dy, total = float(i - size // 2), float(j - size // 2), 0.0
+                x, y = middle + a * dx + b * dy, middle + c * dx + d * dy
+                for s in range(samples.shape[0]):
+                    total += cubic(source, x + samples[s, 0], y + samples[s, 1])
+                templates[k, j, i] = total / samples.shape[0]
+
+
+@njit(void(IMAGE, float64, float64, types.Array(uint8, 2, "C")), cache=True, error_model="numpy")
 def cut_window(image, x, y, window):
     """Fills window (S, S) uint8 around column x and row y."""
     half = window.shape[0] // 2
@@ -182,7 +191,14 @@ def levels(part, padding):
     Their mean is taken off: a template without mean does not feel it, and rounding comes down.
     """
     grey = np.zeros((part.shape[0], part.shape[1] + padding), np.float32)
-    grey[:, : part.shape[1]] = part.astype(np.float32) - np.float32(np.int64(part.sum()) // part.size)
+    total = 0
+    for j in range(part.shape[0]):
+        for i in range(part.shape[1]):
+            total += part[j, i]
+    mean = np.float32(total // part.size)
+    for j in range(part.shape[0]):
+        for i in range(part.shape[1]):
+            grey[j, i] = np.float32(part[j, i]) - mean
     return grey
 
 
@@ -336,46 +352,6 @@ def _slopes(window, w, unit, norm):
 APART_PX = 3  #: Two peaks of the score are two places from this distance on, along rows or columns.
 OUTSIDE = np.float32(-2.0)  #: In a map of scores: not searched.
 
-discard_stale(Path(__file__).parent)
-
-
-@njit(cache=True, error_model="numpy", parallel=True)
-def search_all(image, templates, centres, covs, limits, found):
-    """Fills found (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv, of one template in one ellipse each.
-
-    limits = (sigmas, most_px, least_std). What was not found keeps what the caller put there.
-    """
-    for k in prange(templates.shape[0]):
-        search_one(image, templates[k], centres[k], covs[k], limits, found[k])
-
-
-@njit(cache=True, error_model="numpy")
-def search_one(image, template, centre, cov, limits, found):
-    """One template in one ellipse."""
-    unit = normalised(template, limits[2])
-    if unit.shape[0] == 0:
-        return
-    columns, rows = interval(centre, cov, limits, image.shape, template.shape[0])
-    width, height = columns[1] - columns[0] + 1, rows[1] - rows[0] + 1
-    if width <= 0 or height <= 0:
-        return
-    scores = np.full((height, width), OUTSIDE, np.float32)
-    score_ellipse(image, unit, template.shape[0], centre, cov, limits[0], columns, rows, scores)
-    v, u = divmod(scores.argmax(), width)
-    if scores[v, u] <= -1.0:
-        return
-    found[2] = scores[v, u]
-    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found)
-    p, q = second(scores, v, u)
-    if p >= 0:
-        other = np.full(found.shape[0], float(scores[p, q]))
-        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
-        # The better of two peaks, with the other one's score as the second.
-        found[3] = other[2]
-        if other[2] > found[2]:
-            other[3] = found[2]
-            found[:] = other
-
 
 @njit(cache=True, error_model="numpy")
 def interval(centre, cov, limits, shape, size):
@@ -407,6 +383,57 @@ def second(scores, row, column):
             if not (scores[y, x] > highest and max(abs(y - row), abs(x - column)) >= APART_PX):
                 continue
             # A peak has no searched neighbour that scores higher.
-            if scores[y, x] == scores[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].max():
+            peak = True
+            for b in range(max(y - 1, 0), min(y + 2, height)):
+                for a in range(max(x - 1, 0), min(x + 2, width)):
+                    peak = peak and not scores[b, a] > scores[y, x]
+            if peak:
                 v, u, highest = y, x, scores[y, x]
     return v, u
+
+
+#: Types of (image, templates, centres, covs, limits, places), see `_search_one`.
+_SEARCH = IMAGE, _TEMPLATES, READ_ONLY, _READ_ONLY_CUBE, types.UniTuple(float64, 3), MATRIX
+_search_at, _search_part = part_of(*_SEARCH)
+
+
+@_search_part
+def _search_one(k, image, templates, centres, covs, limits, places):
+    """Fills places (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv, of one template in one ellipse each.
+
+    limits = (sigmas, most_px, least_std). What was not found keeps what the caller put there.
+    """
+    template, centre, cov, found = templates[k], centres[k], covs[k], places[k]
+    unit = normalised(template, limits[2])
+    if unit.shape[0] == 0:
+        return
+    columns, rows = interval(centre, cov, limits, image.shape, template.shape[0])
+    width, height = columns[1] - columns[0] + 1, rows[1] - rows[0] + 1
+    if width <= 0 or height <= 0:
+        return
+    scores = np.full((height, width), OUTSIDE, np.float32)
+    score_ellipse(image, unit, template.shape[0], centre, cov, limits[0], columns, rows, scores)
+    v, u = divmod(scores.argmax(), width)
+    if scores[v, u] <= -1.0:
+        return
+    found[2] = scores[v, u]
+    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found)
+    p, q = second(scores, v, u)
+    if p >= 0:
+        other = np.full(found.shape[0], float(scores[p, q]))
+        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
+        # The better of two peaks, with the other one's score as the second.
+        found[3] = other[2]
+        if other[2] > found[2]:
+            other[3] = found[2]
+            for i in range(found.shape[0]):
+                found[i] = other[i]
+
+
+@njit(void(int64, *_SEARCH), cache=True, error_model="numpy", parallel=True)
+def _search_all(one, image, templates, centres, covs, limits, places):
+    for k in prange(templates.shape[0]):
+        _search_at(one)(int64(k), image, templates, centres, covs, limits, places)
+
+
+search_all = partial(_search_all, _search_one.address)
