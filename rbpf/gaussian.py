@@ -24,6 +24,7 @@ _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
+_KEPT = 64  #: Entries of what is small enough for its factor to be looked up.
 
 
 def symmetrise(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
@@ -203,6 +204,19 @@ def _distinct(cov: Array) -> Array:
 
 
 def _factored(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
+    if cov.size > _KEPT:
+        return _factors(cov, floor)
+    chol, definite = _kept_factors(cov.tobytes(), cov.shape, floor)
+    return chol.copy(), definite.copy()
+
+
+@lru_cache(maxsize=64)
+def _kept_factors(cov: bytes, shape: tuple[int, ...], floor: float) -> tuple[Array, NDArray[np.bool_]]:
+    # A sensor's noise is the same at every step.
+    return _factors(np.frombuffer(cov).reshape(shape), floor)
+
+
+def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
     with (
         suppress(np.linalg.LinAlgError),
         np.errstate(invalid="ignore"),

@@ -508,12 +508,11 @@ def checked_observations(group: Observations) -> Observations:
     if group.data is not None:
         return group
     name, ids = type(group.model).__name__, group.ids
-    group = replace(
-        group,
-        z=numbers(group.z, f"z of {name}"),
-        cov=numbers(group.cov, f"cov of {name}"),
-        ids=np.require(ids, np.int64, ["C", "W"]) if ids is not None and ids.dtype.kind in "iu" else ids,
-    )
+    if ids is not None and ids.dtype.kind in "iu":
+        ids = np.require(ids, np.int64, ["C", "W"])
+    z, cov = numbers(group.z, f"z of {name}"), numbers(group.cov, f"cov of {name}")
+    if not (z is group.z and cov is group.cov and ids is group.ids):
+        group = replace(group, z=z, cov=cov, ids=ids)
     count, p = group.z.shape[0], group.model.dim
     if group.z.shape != (count, p) or group.cov.shape != (count, p, p):
         raise InputError(

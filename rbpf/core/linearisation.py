@@ -31,11 +31,16 @@ def numeric_jacobians(
     Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
     """
     plus_minus = np.array([STEP, -STEP])
+    constrains = type(model).innovation is not ObservationModel.innovation
+    z = model.predict(state, landmark, const, substate) if constrains else None
 
-    z = model.predict(state, landmark, const, substate)
-
-    def differences(nu: np.ndarray) -> np.ndarray:
-        return np.moveaxis(nu[1] - nu[0], 0, -1) / (2 * STEP)
+    def differences(state: Array, landmark: Array | None, const: Array | None, substate: Array | None) -> np.ndarray:
+        if z is not None:
+            nu = model.innovation(z, state, landmark, const, substate)
+            difference = nu[1] - nu[0]
+        else:  # half as many residuals
+            difference = model.residual(*model.predict(state, landmark, const, substate))
+        return np.moveaxis(difference, 0, -1) / (2 * STEP)
 
     def perturbed(x: np.ndarray) -> np.ndarray:
         steps = plus_minus[:, None, None] * np.eye(x.shape[-1])
@@ -46,11 +51,11 @@ def numeric_jacobians(
     if Part.STATE in wanted:
         steps = plus_minus[:, None, None] * np.eye(space.dim)
         moved = space.retract(state, steps.reshape(2, space.dim, *(1,) * (state.ndim - 1), space.dim))
-        state_part = differences(model.innovation(z, moved, landmark, const, substate))
+        state_part = differences(moved, landmark, const, substate)
     if landmark is not None and Part.LANDMARK in wanted:
-        landmark_part = differences(model.innovation(z, state, perturbed(landmark), const, substate))
+        landmark_part = differences(state, perturbed(landmark), const, substate)
     if substate is not None and Part.SUBSTATE in wanted:
-        substate_part = differences(model.innovation(z, state, landmark, const, perturbed(substate)))
+        substate_part = differences(state, landmark, const, perturbed(substate))
     return Jacobians(state_part, landmark_part, substate_part)
 
 

@@ -298,11 +298,11 @@ class Marginals(Conditional):
         # What may move the state weighs it, too, unless a likelihood says otherwise.
         ahead = [group.likelihood and group.likelihood.of_look_ahead() for group in groups]
         is_other = any(likelihood is not group.likelihood for likelihood, group in zip(ahead, groups, strict=True))
-        weighing = [replace(group, likelihood=other) for other, group in zip(ahead, groups, strict=True)]
 
         def information_at(state: np.ndarray) -> Information:
             found = self.information(state, groups, prior)
             if is_other:
+                weighing = [replace(group, likelihood=other) for other, group in zip(ahead, groups, strict=True)]
                 others = self.information(state, weighing, prior), _all_outliers(weighing, found)
                 found = replace(found, otherwise=tuple(other for other in others if other is not None))
             return found
@@ -317,12 +317,12 @@ class Marginals(Conditional):
         return linearise_at
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        total, after_sampling = np.zeros(state.shape[0]), np.zeros(state.shape[0])
-        for supplies, routed in self._routed(groups).items():
-            densities = self.parts[supplies].correct(state, increment, routed)
-            total += densities.all
-            after_sampling += densities.after_sampling
-        return LogDensities(total, after_sampling)
+        routed = self._routed(groups)
+        found = [self.parts[supplies].correct(state, increment, own) for supplies, own in routed.items()]
+        if len(found) == 1:
+            return found[0]
+        zeros = np.zeros(state.shape[0])
+        return LogDensities(*(sum(terms, zeros) for terms in zip(*found, strict=True)))
 
     def resample(self, ancestors: np.ndarray) -> None:
         for part in self.parts.values():

@@ -113,9 +113,8 @@ class Prior:
         return np.asarray(self.space.right_jacobian(self.mean) @ self.factor)
 
     def take(self, ancestors: Int[np.ndarray, " N"] | slice) -> "Prior":
-        return replace(
-            self, base=self.base[ancestors], mean=take(self.mean, ancestors), factor=take(self.factor, ancestors)
-        )
+        mean, factor = take(self.mean, ancestors), take(self.factor, ancestors)
+        return Prior(self.space, self.base[ancestors], mean, factor, self.centred)
 
 
 @dataclass
