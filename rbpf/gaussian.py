@@ -3,8 +3,8 @@
 Every function broadcasts over leading axes and is meant for n up to about twelve. Covariances are full symmetric matrices
 (..., n, n); a chol_* is lower triangular (..., n, n), a factor L is any matrix with L L^T = covariance. A result may lie in
 memory entry by entry, so that what is computed from it runs along the batch: code that insists on C order takes its
-`numpy.ascontiguousarray`. But for LAPACK's factors the loops run over the entries of a matrix and the arithmetic along the
-batch. Sums use no BLAS: equal input gives equal bytes.
+`numpy.ascontiguousarray`. But for LAPACK's factors, of a few matrices or large ones, the loops run over the entries of a
+matrix and the arithmetic along the batch. Sums use no BLAS: equal input gives equal bytes.
 """
 
 from collections.abc import Callable
@@ -24,6 +24,7 @@ _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
+_UNROLLED, _MANY = 8, 200  #: Up to this size and from so many matrices on, loops take less time than LAPACK.
 _KEPT = 64  #: Entries of what is small enough for its factor to be looked up.
 
 
@@ -217,6 +218,9 @@ def _kept_factors(cov: bytes, shape: tuple[int, ...], floor: float) -> tuple[Arr
 
 
 def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
+    n = cov.shape[-1]
+    if n <= _UNROLLED and cov.size > _MANY * n * n:
+        return _cholesky_batch(cov, floor)
     with (
         suppress(np.linalg.LinAlgError),
         np.errstate(invalid="ignore"),
