@@ -121,8 +121,9 @@ class HandOver:
         self.joint: JointMap | None = None
         """The joint map; None as long as every particle has a map of its own."""
         self._rays: JointRays | None = None
+        # What a camera that is not known yet leaves of the innovations is not noise.
         self.noise: LearntNoise | None = None
-        if wanted and config.noise != "stated":
+        if wanted and config.noise != "stated" and config.calibrate == "off":
             self.noise = LearntNoise(alike=True, right=RIGHT**2 if config.noise == "at_least" else 0.0)
         if wanted:
             if not isinstance(rays, InverseDepthRays):
