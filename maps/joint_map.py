@@ -608,8 +608,9 @@ class JointMap(Map):
             return expected(model, self.read(ids), belief)
         predicted = np.empty((self.n, len(kind.rows), model.dim))
         within, held = np.empty((*predicted.shape, model.dim)), (kind.columns, kind.clones, kind.origins)
-        mean, cov, root = map(np.ascontiguousarray, (self.mean, self.cov, prior.spread(prior.mean)))
-        expect_group(kernel.function.address, kernel.params, belief.state, mean, *held, cov, root, predicted, within)
+        arrays = belief.state, self.mean, self.cov, prior.spread(prior.mean)
+        state, mean, cov, root = (np.require(each, np.float64, ["C", "W"]) for each in arrays)
+        expect_group(kernel.function.address, kernel.params, state, mean, *held, cov, root, predicted, within)
         return predicted, within
 
     def project_jointly(

@@ -29,7 +29,7 @@ __all__ = ["Bool", "Float", "Int", "Like", "numbers"]
 
 def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:
     """Float64 of this machine, in C order, writable; copied only where it is not. Raises InputError: no real numbers."""
-    if isinstance(array, np.ndarray) and array.dtype == np.float64 and array.flags.carray and array.dtype.isnative:
+    if type(array) is np.ndarray and array.dtype == np.float64 and array.flags.carray:
         return array
     given = np.asarray(array)
     if given.dtype.kind not in "fiub":

@@ -177,7 +177,7 @@ class Reading:
         world.
         """
         held, space, (n, d) = self.held, self.held.space, (len(state), self.held.space.dim)
-        mean = np.ascontiguousarray(mean)
+        state, mean = (np.require(each, np.float64, ["C", "W"]) for each in (state, mean))
         count, parts = len(self._at), list[Group]()
         said, by_held = np.zeros((n, 1 + d, count)), np.zeros(self._at.shape)
         for group, (seen, kind, rows, kernel) in zip(groups, self._parts, strict=True):

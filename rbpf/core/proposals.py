@@ -66,8 +66,8 @@ def refined(prior: Prior, information: Information) -> Proposed:
     n, rank = len(information.quad), prior.factor.shape[2]
     mean, root, squared, log_det = np.empty((n, rank)), np.empty((n, rank, rank)), np.empty(n), np.empty(n)
     # With M = C Cᵀ the covariance of u is C⁻ᵀC⁻¹, and its mean C⁻ᵀ of C⁻¹Lᵀη. What a model spoils makes the weight NaN.
-    info, vector, factor = map(np.ascontiguousarray, (information.info, information.vector, prior.factor))
-    refine(info, vector, factor, mean, root, squared, log_det)
+    given = (np.require(each, np.float64, ["C", "W"]) for each in (information.info, information.vector, prior.factor))
+    refine(*given, mean, root, squared, log_det)
     nis = information.quad - squared
     log_w1 = information.log_factor - 0.5 * (nis + information.log_det + log_det)
     for other in information.otherwise:

@@ -165,8 +165,13 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
 
 
 def test_the_loops_do_what_numpy_does():
-    """More particles than a block of lanes has, of which the last one is not full; points, and rays at two clones."""
+    """More particles than a block of lanes has, of which the last one is not full; points, and rays at two clones.
+
+    States may lie in another order, and be locked.
+    """
     joint, particles = rays(150)
+    state = np.asfortranarray(particles.state)
+    state.flags.writeable = False
     prior = Prior(SE3, particles.state, np.full((1, 6), 0.01), 0.01 * np.eye(6)[None], centred=False)
     belief = Belief(particles.log_weights, prior, {Part.LANDMARK: joint})
     kinds = (CameraRay(CAMERA), np.array([11, 20, 23])), (CameraPoint(CAMERA), np.array([9, 5]))
@@ -175,7 +180,7 @@ def test_the_loops_do_what_numpy_does():
     found = []
     for compiled in (True, False):
         joint.compiled, joint._reading = compiled, None
-        rows = joint._rows(particles.state, joint.mean, joint.cov, groups)
+        rows = joint._rows(state, joint.mean, joint.cov, groups)
         expected = [joint.project(model, ids, belief) for model, ids in kinds]
         found.append([rows.said, rows.slope, rows.carried, rows.cov, *(each for pair in expected for each in pair)])
     for first, second in zip(*found, strict=True):
