@@ -260,8 +260,11 @@ def read_one(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, **sizes:
 
 def require(what: str, values: Mapping[str, Any], schema: Schema, **sizes: int) -> None:
     """Refuses arrays in memory, of `what` in words, that are not what the schema says; errors as `read`."""
+    for name in schema:
+        if not isinstance(values[name], np.ndarray):
+            raise InputError(f"{what}: {name} must be an array, got a {type(values[name]).__name__}")
     try:
-        read({name: np.asarray(values[name]) for name in schema}, schema, "", **sizes)
+        read(values, schema, "", **sizes)
     except InputError as error:
         raise InputError(f"{what}: {error}") from None
 

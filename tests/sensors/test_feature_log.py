@@ -62,6 +62,7 @@ WRONG = [
     ("frame 1 of walk", "landmarks", np.array([1, 2, 3]),
      "the array z must hold numbers of shape (K = 3, p = 2), got (2, 2) float64"),
     ("frame 1 of walk", "z", np.array([[1.0, 2.0], [np.nan, 4.0]]), "the array z must hold finite numbers, got nan at 1, 0"),
+    ("frame 1 of walk", "z", [[1.0, 2.0], [3.0, 4.0]], "z must be an array, got a list"),
     ("frame 1 of walk", "cov_z", np.stack([np.eye(2), np.diag([1.0, -1.0])]), "cov_z is no covariance: "),
     ("the known points", "names", np.array([4, 4]), "landmark 4 comes twice, keep one of the two"),
     ("the known points", "positions", np.zeros((2, 2)),
