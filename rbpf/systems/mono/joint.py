@@ -185,8 +185,10 @@ class HandOver:
         if best is not None and self.noise is not None:
             # That noise is less than stated the first frames do not tell: errors grow as the view changes.
             noise_px = residual_px(seen, config, best)
-            if noise_px > RIGHT * seen.noise_px:
-                self.noise.expect((noise_px / seen.noise_px) ** 2)
+            is_noisier = noise_px > RIGHT * seen.noise_px
+            # What an attempt before this one found, from which nothing began, is forgotten: no checkpoint has it.
+            self.noise.expect((noise_px / seen.noise_px) ** 2 if is_noisier else 1.0)
+            if is_noisier:
                 best = optimum(replace(seen, noise_px=noise_px), config, best.structure)
         return None if best is None else (names, seen, best)
 
