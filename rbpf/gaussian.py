@@ -221,10 +221,8 @@ def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
     n = cov.shape[-1]
     if n <= _UNROLLED and cov.size > _MANY * n * n:
         return _cholesky_batch(cov, floor)
-    with (
-        suppress(np.linalg.LinAlgError),
-        np.errstate(invalid="ignore"),
-    ):  # it does not say which one of the batch failed
+    # An error does not say which one of the batch failed: the loops do.
+    with suppress(np.linalg.LinAlgError), np.errstate(invalid="ignore"):
         chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
         variances, pivots = (np.diagonal(each, axis1=-2, axis2=-1) for each in (cov, chol))
         if (np.square(pivots) > floor * variances).all() and np.isfinite(chol).all():

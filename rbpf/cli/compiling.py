@@ -16,8 +16,8 @@ _SHARED = re.compile(r"^from rbpf\.kernels(\.(?!signature)\w+)? import", re.MULT
 def kernel_modules() -> list[str]:
     """Modules of `rbpf` with compiled functions of their own, without those only compiled into others, in a good order.
 
-    Longest first; but what compiles functions of `rbpf.kernels` into its own waits until the drivers there, which do the same,
-    have them in the cache: two processes would compile them twice.
+    The drivers of landmarks first, which take longest, then by length; but what compiles functions of `rbpf.kernels` into its
+    own waits until the drivers there, which do the same, have them in the cache: two processes would compile them twice.
     """
     paths = [*(_ROOT / "kernels").glob("*.py")]
     for folder in ("sensors", "motion", "maps", "systems", "validation"):

@@ -43,8 +43,6 @@ STILL_CHI2 = 4.0
 LINEAR = 3.0
 """Times the greatest standard deviation at which something is looked for: so far off a measurement is taken as linear."""
 
-"""Measurements of several known points at once."""
-
 
 class UnknownDepth(ABC):
     """How features are kept and used as long as their depth is not known well enough for a world point."""

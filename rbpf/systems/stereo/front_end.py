@@ -40,9 +40,8 @@ class FrontEnd(ABC, Generic[F]):
 
     takes: ClassVar[type[Any]]  #: of the frames.
     names_landmarks: ClassVar[bool] = False  #: whether the frames themselves say which landmark each feature is.
-    kept: ClassVar[
-        Schema
-    ]  #: attributes of the features of a pair from which `features` makes them again, for checkpoints.
+    #: attributes of the features of a pair from which `features` makes them again, for checkpoints.
+    kept: ClassVar[Schema]
     rig: RectifiedStereo
     config: StereoConfig
     landmarks: Landmarks[F]  #: the map's side: finds landmarks among the features.
@@ -119,7 +118,8 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         landmarks: finds landmarks among the features; None for `DescriptorLandmarks`.
     """
 
-    takes, kept = ImageFrame, KEPT
+    takes = ImageFrame
+    kept = KEPT
 
     def __init__(
         self,
@@ -189,7 +189,9 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
     The frames' stamps are `ns_per_stamp` nanoseconds long: 10⁹ where they count frames of unknown time.
     """
 
-    takes, kept, names_landmarks = FeatureFrame, {"landmarks": integers("features", least=0), **_PIXELS}, True
+    takes = FeatureFrame
+    kept: ClassVar[Schema] = {"landmarks": integers("features", least=0), **_PIXELS}
+    names_landmarks = True
 
     def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
         self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
