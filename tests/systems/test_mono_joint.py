@@ -105,6 +105,17 @@ def test_noise_that_is_larger_than_stated_is_learnt(known):
     assert scores[1] < 0.5 * scores[0]  # a quarter of the information, but for what is no measurement
 
 
+def test_an_attempt_to_begin_leaves_no_noise_to_the_next_one(monkeypatch):
+    log = desk(1, frames=16, measurements=20)
+    slam = MonoSlam(log.camera, replace(JOINT, settled_frames=100), log.known)
+    for frame in log.frames:
+        slam.take(frame)
+    for times in (3.0, 1.0):
+        monkeypatch.setattr("rbpf.systems.mono.joint.residual_px", lambda seen, *_, times=times: times * seen.noise_px)
+        assert slam.hand_over._adjusted(slam.filter, slam.features) is not None
+        assert slam.hand_over.noise.mean == pytest.approx(times**2)
+
+
 def test_noise_that_is_smaller_than_stated_is_learnt_where_it_is_asked_for():
     log = desk(1, frames=40, measurements=20, noise_px=0.3)
     log = replace(log, frames=[replace(frame, cov_z=frame.cov_z / 0.09) for frame in log.frames])
