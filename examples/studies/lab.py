@@ -425,7 +425,7 @@ class RenderLab(RenderOptions):
     texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are drawn sooner.
 
 
-def main(options: Annotated[RenderLab, tyro.conf.arg(name="")]) -> None:
+def simulate_lab(options: Annotated[RenderLab, tyro.conf.arg(name="")]) -> None:
     """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
     check_ranges(options)
     drive = LabDrive(options.trajectory, options.frames, options.every)
@@ -435,4 +435,4 @@ def main(options: Annotated[RenderLab, tyro.conf.arg(name="")]) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    tyro.cli(simulate_lab)

@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 from examples.studies.drives import Drive, along_corners
-from examples.studies.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, TexturedLab, main, world_from_camera
+from examples.studies.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, TexturedLab, simulate_lab, world_from_camera
 from examples.studies.wheel_odometry import WheelOdometry, read_wheel_odometry, write_wheel_odometry
 from rbpf.lie import SE2, SE3
 from rbpf.runs.trajectory import in_space, read_tum
@@ -188,7 +188,7 @@ SMALL = ["--width", "96", "--height", "72", "--texel-m", "0.05"]
 
 
 def render_lab(out: Path, *arguments: str) -> None:
-    tyro.cli(main, args=["--out", str(out), *SMALL, *arguments])
+    tyro.cli(simulate_lab, args=["--out", str(out), *SMALL, *arguments])
 
 
 @pytest.mark.slow
