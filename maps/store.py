@@ -79,19 +79,19 @@ class Layout:
             raise InputError(f"{name} needs log_weights exactly if it has several components")
         if (records.const is None) != (self.landmark.constants == 0):
             raise InputError(f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const")
-        body = np.concatenate([records.mean, gaussian.pack(records.cov)], axis=-1)
-        body = body.reshape(n, k, self.landmark.components * self.gaussian_fields)
-        parts = [body]
+        columns, end = np.empty((k, self.fields, n)), components * self.gaussian_fields
+        rows = np.moveaxis(columns, -1, 0)
+        rows[..., :end] = np.concatenate([records.mean, gaussian.pack(records.cov)], axis=-1).reshape(n, k, end)
+        if not np.isfinite(rows[..., :end]).all():
+            raise InputError(f"a new {name} has a mean or covariance that is not finite")
         if records.log_weights is not None:
-            parts.append(records.log_weights)
+            rows[..., end : end + components] = records.log_weights
+            end += components
         if records.const is not None:
-            parts.append(np.broadcast_to(records.const, (n, k, self.landmark.constants)))
+            rows[..., end : end + self.landmark.constants] = records.const
         if self.evidence:
-            parts.append(np.zeros((n, k, 1)) if log_odds is None else log_odds[..., None])
-        columns = np.concatenate(parts, axis=-1)
-        if not np.isfinite(body).all():
-            raise InputError(f"a new {type(self.landmark).__name__} has a mean or covariance that is not finite")
-        return np.ascontiguousarray(np.moveaxis(columns, 0, -1))
+            rows[..., -1] = 0.0 if log_odds is None else log_odds
+        return columns
 
     def unpack(self, columns: np.ndarray) -> Records:
         """Columns (K, fields, N) as records."""
@@ -224,8 +224,9 @@ class Pool:
     def take(self, count: int) -> np.ndarray:
         """Free slabs, (count,) int; the pool doubles where there are too few."""
         while len(self._free) < count:
-            old = self.data.shape[0]
-            self.data = np.concatenate([self.data, self._slabs(*self.data.shape)])
+            held, old = self.data, self.data.shape[0]
+            self.data = self._slabs(2 * old, *held.shape[1:])
+            self.data[:old] = held  # what is not used yet needs no memory
             self._free = list(range(2 * old - 1, old - 1, -1)) + self._free
         taken = self._free[: -count - 1 : -1]
         del self._free[len(self._free) - count :]
