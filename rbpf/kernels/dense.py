@@ -52,9 +52,11 @@ def fit_robustly(white, slope, rounds, scale, u, info):
     Iteratively reweighted least squares with a Cauchy loss; what is as far off as `scale` keeps half of its weight.
     """
     (count, p, rank), total = slope.shape, np.empty(u.size)
-    off, u[:] = np.empty(p), 0.0
+    off = np.empty(p)
+    u[:] = 0.0
     for _ in range(rounds):
-        info[:], total[:] = np.eye(rank), 0.0
+        info[:] = np.eye(rank)
+        total[:] = 0.0
         for k in range(count):
             squared = 0.0
             for a in range(p):

@@ -332,11 +332,18 @@ def linearise_group(address, params, state, mean, columns, clones, origins, z, f
     `origins` (K, A). The slopes are ∂z/∂landmark, then by the clone.
     """
     kernel = kernel_at(address)
-    (particles, size), (count, dim), p = said.shape[:2], columns.shape, z.shape[1]
+    particles, size = said.shape[:2]
+    count, dim = columns.shape
+    p = z.shape[1]
     anchored = clones.shape[1] > 0
-    x, landmark, anchor = np.empty((state.shape[1], BLOCK)), np.empty((dim, BLOCK)), np.empty((origins.shape[1], BLOCK))
-    nu, by_state, by_landmark = np.empty((p, BLOCK)), np.zeros((p, size - 1, BLOCK)), np.empty((p, dim, BLOCK))
-    tangent, jacobian = np.empty((1, 6)), np.empty((1, 6, 6))
+    x = np.empty((state.shape[1], BLOCK))
+    landmark = np.empty((dim, BLOCK))
+    anchor = np.empty((origins.shape[1], BLOCK))
+    nu = np.empty((p, BLOCK))
+    by_state = np.zeros((p, size - 1, BLOCK))
+    by_landmark = np.empty((p, dim, BLOCK))
+    tangent = np.empty((1, 6))
+    jacobian = np.empty((1, 6, 6))
     for start in range(0, particles, BLOCK):
         n = min(BLOCK, particles - start)
         lanes.load_states(state, start, n, x)
@@ -369,10 +376,18 @@ def expect_group(address, params, state, mean, columns, clones, origins, cov, ro
     Arguments as of `linearise_group`; further the map's covariance (n, n), and L (N or 1, d, r) of the predicted states.
     """
     kernel = kernel_at(address)
-    (particles, count, p), dim, (_, size, rank) = predicted.shape, columns.shape[1], root.shape
-    x, landmark, anchor = np.empty((state.shape[1], BLOCK)), np.empty((dim, BLOCK)), np.empty((origins.shape[1], BLOCK))
-    nu, by_state, by_landmark = np.empty((p, BLOCK)), np.zeros((p, size, BLOCK)), np.empty((p, dim, BLOCK))
-    zero, carried, moved = np.zeros(p), np.empty((p, dim)), np.empty((p, rank))
+    particles, count, p = predicted.shape
+    dim = columns.shape[1]
+    size, rank = root.shape[1:]
+    x = np.empty((state.shape[1], BLOCK))
+    landmark = np.empty((dim, BLOCK))
+    anchor = np.empty((origins.shape[1], BLOCK))
+    nu = np.empty((p, BLOCK))
+    by_state = np.zeros((p, size, BLOCK))
+    by_landmark = np.empty((p, dim, BLOCK))
+    zero = np.zeros(p)
+    carried = np.empty((p, dim))
+    moved = np.empty((p, rank))
     for start in range(0, particles, BLOCK):
         n = min(BLOCK, particles - start)
         lanes.load_states(state, start, n, x)
