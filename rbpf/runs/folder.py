@@ -1,35 +1,4 @@
-"""Everything that a run leaves in its folder. Each file is written under a temporary name, then renamed.
-
-trajectory.tum           online filtered mean at every frame
-trajectory.npz           the same with covariances, and the last particles, see `rbpf.runs.results`
-truth.npz                the ground truth at these frames, see `rbpf.runs.truth`
-odometry.tum, batch.tum  the path by odometry alone, and the batch optimum of the same measurements, where there is one
-map.npz, map.csv         landmarks: id, mean, covariance (within + between particles), and what the system adds
-observations*.csv        the measurements used, see `rbpf.runs.measurement_files`
-timings.csv              milliseconds per frame and stage
-diagnostics.csv          the system's figures of every frame: sample size, evidence, NIS, what was found
-config.yaml              everything needed to repeat the run
-checkpoint.npz           what --resume goes on from
-summary.json             the figures
-*.png, *.pdf             pictures, as pixels and as vectors
-annotated.mp4            every frame with what was looked for in it
-report.html              one page with all figures and pictures
-
-What else a system leaves stands in its `files`; of the monocular one and the laser's
-
-posterior.npz            the paths (T, N, E) of the last frame's particles, and the particles' log-weights
-posterior.tum            their weighted mean, which later frames have sharpened
-
-of the monocular one
-
-known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
-camera.yaml              of one that calibrated itself: the camera, for --calibration of the next run
-
-and of the laser's
-
-grid.npz                 log-odds of the cells of the particle of highest weight, see `rbpf.maps.grid.Picture`
-grid.pgm, grid.yaml      the same as ROS's map_server and its successors read it
-"""
+"""Everything that a run leaves in its folder; which files there are, and what stands in them, docs/run_folder.md says."""
 
 import json
 import math

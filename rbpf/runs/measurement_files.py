@@ -1,35 +1,6 @@
 """Measurements in files: what every run leaves behind for the comparison with a batch optimiser.
 
-Text files in the run's folder, numbers with every digit (reading gives back the same bits). Each begins with named
-values; below a line with the columns' names there is one line per row. Covariances are their lower triangles by rows.
-
-observations.csv    one line per measurement, in the order of the frames
-
-    # rbpf observations 1 recording: NAME space: SE2 | SE3 measurement: range_bearing | position | pinhole | stereo
-    …                 what the sensor is: see below
-    # rows: how many lines follow the columns' names
-    step,stamp_ns,landmark,z0,z1[,z2],c00,c10,c11[,c20,c21,c22]
-
-of a robot with
-
-    # pitch_sign: 1 | -1 robot_from_sensor: E numbers, SE2 [theta, x, y], SE3 [qx, qy, qz, qw, tx, ty, tz] start: E
-    # numbers, the known pose of step 0 start_stamp_ns: time of step 0
-
-of a camera, whose columns are u_px,v_px or u_left_px,v_px,u_right_px in place of z0,…, with
-
-    # size: width and height of the images, px lens: equidistant, where it is a fisheye lens; else this line is left out
-    # camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, or four numbers of an equidistant lens baseline: between the cameras
-    # of a rectified stereo pair, m; else this line is left out
-
-observations_odometry.csv    of a robot: one line per step from 1 on, previous_robot_from_robot and its covariance in
-                             the right chart there, [ω, v]; `rbpf odometry 1`
-    step,stamp_ns,d0,…,c00,c10,c11,…
-
-observations_frames.csv    of a camera: one line per frame, with measurements or without; `rbpf frames 1`
-    step,stamp_ns
-
-observations_known_points.csv    of a camera: points known beforehand, if there are any, m; `rbpf known points 1`
-    landmark,x_m,y_m,z_m,c00,c10,c11,c20,c21,c22
+Their format stands in docs/run_folder.md.
 """
 
 import re

@@ -1,12 +1,5 @@
 """Pictures of a run of any system, from its folder, drawn without a screen: one set for all.
 
-path.png        the path beside the truth, the odometry and the batch optimum
-map.png         landmarks with 3σ ellipses, rays, known points; of a laser scanner the occupancy grid
-particles.png   the last frame's particles
-error.png       error of the position along the truth's axes beside what the filter itself believes
-tracking.png    what was looked for and found, effective sample size, innovations (a robot's: ess.png)
-timings.png     time per frame by stage
-
 All are drawn in one world, the truth's where the recording has one (`World`), each as vectors, too (.pdf), for print.
 A further figure of every run is one function from `RunFolder` to a matplotlib figure, entered into `FIGURES`.
 """

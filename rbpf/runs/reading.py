@@ -2,10 +2,6 @@
 
 Each part is read when it is asked for, so that a folder that lacks one still has the others. What is missing, damaged or of
 another version of the program raises an InputError.
-
-trajectory.npz   stamps_ns (T,), mean (T, E) and cov (T, d, d) in the right chart at it: the online filtered poses;
-                 correction (T, r), cov_correction (T, r, r) of the motions, see `rbpf.core.diagnostics.Correction`, r = 0
-                 where the system does not report them; particles (N, E) and weights (N,) of the last frame; version
 """
 
 import csv

@@ -1,8 +1,4 @@
-"""Ground truth of a recording at a run's own frames, and the file that keeps it (truth.npz).
-
-truth.npz    rows (R,) of the frames with a true pose, poses (R, E); ids (M,) and landmarks (M, D); alignment: what
-             brings the estimate into the truth's world, "none" where both are expressed in the same one
-"""
+"""Ground truth of a recording at a run's own frames, and the file that keeps it (truth.npz)."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
