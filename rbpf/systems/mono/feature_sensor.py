@@ -335,7 +335,7 @@ class FeatureSensor(Sensor):
     def project(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where features (K,) should be seen under all particles: which of them, means (k, 2), covariances (k, 2, 2)."""
         which, means, covs = [], [], []
-        for model, chosen, ids in self._by_model(belief, names):
+        for model, chosen, ids in self.by_model(belief, names):
             mean, cov = belief.project(model, ids)
             which.append(chosen)
             means.append(mean.reshape(-1, 2))
@@ -347,7 +347,7 @@ class FeatureSensor(Sensor):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of features (K,) found at px (K, 2), in the heaviest particle: which, ν (k, 2), H (k, 2, d), J P Jᵀ (k, 2, 2)."""
         which, nus, jacs, covs = [], [], [], []
-        for model, chosen, ids in self._by_model(belief, names):
+        for model, chosen, ids in self.by_model(belief, names):
             z = px[chosen].reshape(1, -1) if isinstance(model, MembersView) else px[chosen]
             nu, jac, cov = belief.innovations(model, z, ids)
             which.append(chosen)
@@ -370,7 +370,7 @@ class FeatureSensor(Sensor):
         """Likewise in the worlds of some particles: which features, homogeneous points (n, k, 4)."""
         n = belief.log_weights[particles].size
         which, out = [np.zeros(0, dtype=np.int64)], [np.zeros((n, 0, 4))]
-        for model, chosen, ids in self._by_model(belief, names):
+        for model, chosen, ids in self.by_model(belief, names):
             records = belief.read(ids, particles)
             which.append(chosen)
             if isinstance(model, MembersView):
@@ -384,7 +384,7 @@ class FeatureSensor(Sensor):
     def depth_known(self, belief: Belief, names: np.ndarray, std_ratio: float) -> np.ndarray:
         """Whether the heaviest particle knows the depth of features (K,) to this fraction of it, (K,) bool."""
         out = np.zeros(names.size, dtype=bool)
-        for model, chosen, ids in self._by_model(belief, names):
+        for model, chosen, ids in self.by_model(belief, names):
             out[chosen] = True
             if model is self.unknown_depth.model:
                 out[chosen] = self.unknown_depth.depth_std_ratio(belief.read_mode(ids))[0] <= std_ratio
@@ -430,7 +430,7 @@ class FeatureSensor(Sensor):
         """Landmarks (K,) of features (K,), −1 where the map has none of their own."""
         return np.where((self.members(names) < 0) & belief.map.holds(names), names, -1)
 
-    def _by_model(
+    def by_model(
         self, belief: Belief, names: np.ndarray
     ) -> list[tuple[CameraModel | MembersView, np.ndarray, np.ndarray]]:
         """Features (K,) by how they are measured: the model, which of them, and the landmarks' ids."""

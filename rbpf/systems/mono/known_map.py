@@ -1,9 +1,4 @@
-"""The map of a run: as Gaussians, for reports; and as a place in which later runs find their camera, with its file.
-
-The file, `known_map.npz`, holds only plain arrays: version, camera (9,), or (10,) with the kind of a fisheye lens,
-image_size (2,), alignment, names (K,), positions (K, 3), cov (K, 3, 3), windows (K, S, S) uint8,
-first_px (K, 2), first_pose (K, 7), views (V, 7).
-"""
+"""The map of a run: as Gaussians, for reports; and as a place in which later runs find their camera, with its file."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,6 +16,7 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.calibration import spread_rows
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
+from rbpf.sensors.camera.points import MembersView
 from rbpf.sensors.feature_log import KnownPoints
 from rbpf.systems.anchoring import Anchored
 from rbpf.systems.map_estimate import MapEstimate, relative_points
@@ -154,43 +150,34 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
     A ray is linearised at its mean inverse depth; its ends are those in the heaviest particle. `world` is the reported world
     in each particle's own; None where they are one.
     """
-    belief, unknown_depth = filter_.belief(), features.unknown_depth
-    landmark_map, weights, mode = belief.map, belief.weights, belief.mode
-    if isinstance(landmark_map, JointMap):
-        names, means, covs = landmark_map.landmarks(filter_.particles)
-        spans, order = np.full((names.size, 2, 3), np.nan), np.argsort(names)
-        which, ends = features.extents(belief, names, RAY_SIGMAS, MIN_RHO)
-        spans[which] = ends[..., :3] / ends[..., 3:]
-        columns = {"ray": np.isfinite(spans[order]).all(axis=(1, 2)).astype(int)}
-        return MapEstimate(names[order], means[order], covs[order], columns, spans[order])
-    if world is None:
-        n = weights.size
-        world = Anchored(np.tile(SE3.identity(), (n, 1)), np.zeros((n, 6, 6)))
-    nowhere = np.full((2, 3), np.nan)
-    rows: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
-    for landmark_id in landmark_map.ids.tolist():
-        landmark = landmark_map.landmark_of(landmark_id)
-        records = landmark_map.read(np.array([landmark_id]))
-        if isinstance(landmark, Constellation):
-            assert features.group is not None
-            points, within = landmark.in_group(records)
-            for member in range(points.shape[1]):
-                moments = gaussian.mixture_moments(weights, points[:, member], within[:, member])
-                rows.append((int(features.group.names[member]), *moments, nowhere))
-            continue
-        ends = nowhere
-        if landmark_map.are(np.array([landmark_id]), unknown_depth.landmark)[0]:
-            extent = unknown_depth.extent(belief.read_mode([landmark_id]), RAY_SIGMAS, MIN_RHO)[0, 0]
-            ends = SE3.inverse_transform(world.mean[mode], extent[:, :3] / extent[:, 3:])
-            records = unknown_depth.as_points(records)
-        (mean,), (cov,) = gaussian.mixture_moments(weights, *relative_points(SE3, world, records))
-        rows.append((landmark_id, mean, cov, ends))
-    names = np.array([row[0] for row in rows], dtype=np.int64)
-    order = np.argsort(names, kind="stable")
-    means, covs, spans = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
-    spans = spans.reshape(-1, 2, 3)[order]
-    columns = {"ray": np.isfinite(spans).all(axis=(1, 2)).astype(int)}
-    return MapEstimate(names[order], means.reshape(-1, 3)[order], covs.reshape(-1, 3, 3)[order], columns, spans)
+    belief = filter_.belief()
+    held, n = belief.map, belief.weights.size
+    if isinstance(held, JointMap):
+        names, means, covs = held.landmarks(filter_.particles)
+    else:
+        no_world = Anchored(SE3.identity((n,)), np.zeros((n, 6, 6)))
+        group = features.group
+        names = held.ids if group is None or not held.ids.size else np.union1d(held.ids, group.names)
+        means, covs = np.empty((names.size, 3)), np.empty((names.size, 3, 3))
+        for model, chosen, ids in features.by_model(belief, names):
+            records = held.read(ids)
+            if isinstance(model, MembersView):
+                kind = held.landmark_of(int(ids[0]))
+                assert isinstance(kind, Constellation)
+                points = tuple(each[:, model.places] for each in kind.in_group(records))
+            else:
+                is_ray = model is features.unknown_depth.model
+                records = features.unknown_depth.as_points(records) if is_ray else records
+                points = relative_points(SE3, world or no_world, records)
+            means[chosen], covs[chosen] = gaussian.mixture_moments(belief.weights, *points)
+    spans = np.full((names.size, 2, 3), np.nan)
+    which, ends = features.extents(belief, names, RAY_SIGMAS, MIN_RHO)
+    spans[which] = ends[..., :3] / ends[..., 3:]
+    if world is not None:
+        spans = SE3.inverse_transform(world.mean[belief.mode], spans)
+    order = np.argsort(names)
+    columns = {"ray": np.isfinite(spans[order]).all(axis=(1, 2)).astype(int)}
+    return MapEstimate(names[order], means[order], covs[order], columns, spans[order])
 
 
 def distant_views(positions: np.ndarray, poses: np.ndarray) -> np.ndarray:
