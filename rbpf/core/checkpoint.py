@@ -19,7 +19,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -256,6 +256,23 @@ def read(arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **s
 def read_one(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, **sizes: int) -> np.ndarray:
     """One array; errors as `read`."""
     return _read(arrays, name, entry, sizes)
+
+
+class Kept:
+    """An object of which a checkpoint holds the attributes that `kept` names: after `prefix`, without their underscore."""
+
+    kept: ClassVar[Schema]
+    prefix: ClassVar[str]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {self.prefix + name.lstrip("_"): np.asarray(getattr(self, name)) for name in self.kept}
+
+    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
+        """The inverse of `arrays`, where sizes are known beforehand; errors as `read`."""
+        found = read(arrays, {name.lstrip("_"): entry for name, entry in self.kept.items()}, self.prefix, **sizes)
+        for name, array in zip(self.kept, found.values(), strict=True):
+            setattr(self, name, array if array.ndim else array.item())
 
 
 def require(what: str, values: Mapping[str, Any], schema: Schema, **sizes: int) -> None:

@@ -118,7 +118,7 @@ def test_a_pose_is_found_in_each_particles_own_world():
     sensor = SimpleNamespace(camera=CAMERA, config=slam.config.search, features=slam.features, table=table)
     loss = TrackingLoss(sensor, slam.config)
     found, cov = SE3.exp(np.array([0.05, -0.1, 0.02, 0.1, 0.2, -0.1])), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
-    loss.relocaliser.find = lambda *_: Attempt(12, prior=PosePrior(found, cov))
+    loss.relocaliser.find = lambda *_: Attempt(prior=PosePrior(found, cov))
     prior, _ = loss.prior(slam.filter, GREY)
     np.testing.assert_allclose(SE3.local(SE3.compose(worlds, found), prior.mean), 0.0, atol=1e-9)
     expected = slam.filter.expect(prior, 0)

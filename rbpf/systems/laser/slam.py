@@ -11,11 +11,11 @@ the filter corrects by the exact ratio w₂ = p(z|x) p(x|x⁻) / (q(x) w₁). A 
 one that was; the pose of every other one is that of the odometry from there on.
 """
 
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import elements, integers, numbers, read
+from rbpf.core.checkpoint import Kept, elements, integers, numbers
 from rbpf.core.filter import Filter
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Prior, Proposed
@@ -30,18 +30,6 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, FILTER_COLUMNS, Column, FrameLog, System, Tracked, TrackingState
 
 BARELY = 0.1  #: A scan that fits its map less than this, of 1, says nothing of where the robot is.
-
-_STATE = {
-    "pose": elements(SE2),
-    "cov": numbers(3, 3),
-    "since": elements(SE2),
-    "moved": numbers(3, least=0),
-    "odometry": elements(SE2),
-    "measured": numbers(3, values="any"),
-    "twist": numbers(3),
-    "stamp_ns": integers(),
-    "ess": numbers(),
-}
 
 
 @final
@@ -59,7 +47,7 @@ class ScanMatching(Proposal):
 
 
 @final
-class LaserSlam(System):
+class LaserSlam(Kept, System):
     """Grid SLAM.
 
     Args:
@@ -70,6 +58,18 @@ class LaserSlam(System):
     name = "laser"
     frame_word = "scan"
     space = SE2
+    kept: ClassVar = {
+        "_pose": elements(SE2),
+        "_cov": numbers(3, 3),
+        "_since": elements(SE2),
+        "_moved": numbers(3, least=0),
+        "_odometry": elements(SE2),
+        "_measured": numbers(3, values="any"),
+        "_twist": numbers(3),
+        "_stamp_ns": integers(),
+        "_ess": numbers(),
+    }
+    prefix = "laser/"
 
     def __init__(self, scanner: Scanner, config: LaserConfig | None = None) -> None:
         self.scanner, self.config = scanner, (config := config or LaserConfig())
@@ -95,10 +95,8 @@ class LaserSlam(System):
         # Odometry composed, its last reading (NaN where there is none), the speed between the last two steps.
         self._odometry, self._measured = SE2.identity(), np.full(3, np.nan)
         self._twist = np.zeros(3)
-        self._stamp_ns, self._ess = (
-            -1,
-            float(config.particles),
-        )  # of the last scan, −1 before the first; of the last step
+        self._stamp_ns = -1  # of the last scan, −1 before the first
+        self._ess = float(config.particles)  # of the last step
 
     def track(self, ranges: np.ndarray, odometry: np.ndarray | None = None, stamp_ns: int | None = None) -> Tracked:
         """A scan, and what it says of where the robot is.
@@ -185,16 +183,6 @@ class LaserSlam(System):
             "log_weights": self.filter.particles.log_weights,
         }
         return {"posterior.npz": paths, "grid.npz": grid}
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        poses = self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist
-        values = *poses, np.array(self._stamp_ns), np.array(self._ess)
-        return {f"laser/{name}": value for name, value in zip(_STATE, values, strict=True)}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        *poses, stamp_ns, ess = read(arrays, _STATE, "laser/").values()
-        self._pose, self._cov, self._since, self._moved, self._odometry, self._measured, self._twist = poses
-        self._stamp_ns, self._ess = int(stamp_ns), float(ess)
 
     def _move(self, odometry: np.ndarray | None, seconds: float, messages: list[str]) -> None:
         """Takes in the motion since the last scan, as the odometry says it, or as it was between the last two steps."""

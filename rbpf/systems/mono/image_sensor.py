@@ -1,13 +1,13 @@
 """Measures a frame: is its image usable; finds the map's features in it, judges them, and starts new ones at corners."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import grey, integers, read, read_one, truths
+from rbpf.core.checkpoint import Kept, grey, integers, read_one, truths
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -29,8 +29,6 @@ MIN_CONTRAST = 10
 """Grey levels that are all nearer to each other are those of a lens cap."""
 MAX_REPEATS = 5
 """Times that an image may come again: drivers repeat single images when the camera is late."""
-
-_SCREEN = {"last": grey("", ""), "repeats": integers(least=0), "was_unusable": truths()}
 
 
 def no_features(stamp_ns: int = 0) -> FeatureFrame:
@@ -66,20 +64,26 @@ class Measurement:
         )
 
 
-def held_image(array: np.ndarray, camera: Pinhole) -> np.ndarray | None:
-    """An image of a checkpoint, None where it is empty."""
-    if array.shape not in ((0, 0), (camera.height, camera.width)):
+NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
+"""What a checkpoint holds where there was none."""
+
+
+def require_image(array: np.ndarray, camera: Pinhole) -> None:
+    """Refuses, by an InputError, an image of a checkpoint that is another camera's."""
+    if array.size and array.shape != (camera.height, camera.width):
         raise InputError(f"an image has shape {array.shape}, the camera's is {camera.height, camera.width}")
-    return array if array.size else None
 
 
 @final
-class ImageScreen:
+class ImageScreen(Kept):
     """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen."""
+
+    kept: ClassVar = {"_last": grey("", ""), "_repeats": integers(least=0), "_was_unusable": truths()}
+    prefix = "screen/"
 
     def __init__(self, camera: Pinhole) -> None:
         self.camera = camera
-        self._last: np.ndarray | None = None
+        self._last = NO_IMAGE
         self._repeats = 0
         self._was_unusable = False
 
@@ -94,7 +98,7 @@ class ImageScreen:
             expected = f"{self.camera.width}x{self.camera.height} grey levels of 8 bits"
             return None, f"the image is not used: expected {expected}, got {found}"
         image = image.copy()  # a camera's driver may write the next image into the same memory
-        is_same = self._last is not None and np.array_equal(image, self._last)
+        is_same = np.array_equal(image, self._last)
         self._last, self._repeats = image, self._repeats + 1 if is_same else 0
         reason = None
         if int(image.max()) - int(image.min()) < MIN_CONTRAST:
@@ -107,19 +111,10 @@ class ImageScreen:
             return image, None
         return None, None if was_unusable else reason
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
-        return {
-            "screen/last": np.zeros((0, 0), dtype=np.uint8) if self._last is None else self._last,
-            "screen/repeats": np.array(self._repeats),
-            "screen/was_unusable": np.array(self._was_unusable),
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
         """The inverse of `arrays`."""
-        found = read(arrays, _SCREEN, "screen/")
-        self._last = held_image(found["last"], self.camera)
-        self._repeats, self._was_unusable = int(found["repeats"]), bool(found["was_unusable"])
+        super().restore(arrays, **sizes)
+        require_image(self._last, self.camera)
 
 
 @final

@@ -24,6 +24,7 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.resection import resect_consensus
 from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.relocalisation import CORNER_PX, MIN_FITTED, SCALES, Attempt, Relocaliser, Sighting
 
@@ -254,7 +255,9 @@ class PlaceRecognition:
         if not rows.size:
             return rows
         new = np.array([row for row in rows.tolist() if row not in self._described], dtype=np.int64)
-        self._described |= dict(zip(new.tolist(), self.relocaliser.describe_as_first_seen(new), strict=True))
+        scale, patches = np.full(new.size, WINDOW_SCALE_PX), self.sensor.table.first_patch[new]
+        described = self.sensor.descriptor.describe_windows(patches, scale, np.zeros(new.size))
+        self._described |= dict(zip(new.tolist(), described, strict=True))
         known = np.array([self._described[row] for row in rows.tolist()])
         voters = self.relocaliser.corners(image)[1][SCALES.index(1.0), :VOTERS]
         alike = np.full((len(joint.old.maps), len(voters)), -1.0, dtype=np.float32)

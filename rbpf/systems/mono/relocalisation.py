@@ -6,19 +6,19 @@ a prediction: corners of the image are matched with the map's features by descri
 corners say how the camera has turned since and in which direction it went.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from typing import ClassVar, NamedTuple, final
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import grey, integers, numbers, poses, read, truths
+from rbpf.core.checkpoint import Kept, grey, integers, numbers, poses, truths
 from rbpf.core.filter import Filter
 from rbpf.core.models import Belief
 from rbpf.core.particles import Particles, Prior, mixture_estimate
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.resection import (
     GATE,
     Resected,
@@ -34,7 +34,7 @@ from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, patch_affines
-from rbpf.systems.mono.image_sensor import ImageSensor, held_image
+from rbpf.systems.mono.image_sensor import NO_IMAGE, ImageSensor, require_image
 
 VIEWS_PER_FRAME = 2
 """Views of a known map from which a lost camera is looked for in a frame, in turn."""
@@ -71,15 +71,6 @@ MIN_VIEW_CORNERS = 30
 MIN_VIEW_FRACTION = 0.8
 """Of the corners of the last view that are found again, so many must show the motion that the map shows."""
 
-_LOSS = {
-    "pose": poses(),
-    "cov": numbers(6, 6),
-    "stamp_ns": integers(),
-    "image": grey("", ""),
-    "mode": poses(),
-    "never_found": truths(),
-}
-
 
 class Sighting(NamedTuple):
     """From where an image was taken, by what it shows of landmarks."""
@@ -94,24 +85,30 @@ class Sighting(NamedTuple):
 class Attempt:
     """How far the recognition of one image came."""
 
-    landmarks: int  #: of known depth in the map.
-    corners: int = 0  #: of the image.
     matches: int = 0  #: of a landmark and a corner that are like each other and like nothing else.
     agreeing: int = 0  #: matches that a pose explains, after the search around it; 0 where no pose was computed.
-    matched: int = 0  #: corners of the last view before the loss that are found again; 0 where they were too few.
-    confirming: int = 0  #: of these, how many the pose explains.
     prior: PosePrior | None = None  #: the pose, for the heaviest particle's world; None where it was not convincing.
     certain: bool = False  #: whether the image was recognised beyond doubt.
     sighting: Sighting | None = None  #: the pose, convincing or not; None where none was computed.
 
 
 @final
-class TrackingLoss:
+class TrackingLoss(Kept):
     """Remembers where the camera was last trusted, and says where it may be while it is lost.
 
     A map that was made before this run has views (V, 7) to look from as well, and a size_m: so far from where it is assumed
     the camera may be as long as it was never found.
     """
+
+    kept: ClassVar = {
+        "_pose": poses(),
+        "_cov": numbers(6, 6),
+        "stamp_ns": integers(),
+        "_image": grey("", ""),
+        "_mode": poses(),
+        "never_found": truths(),
+    }
+    prefix = "loss/"
 
     def __init__(
         self, sensor: ImageSensor, config: MonoConfig, views: np.ndarray | None = None, size_m: float = 0.0
@@ -126,9 +123,9 @@ class TrackingLoss:
         """Whether the camera has not been found yet in a map that was made before."""
         self.stamp_ns = 0
         """When the pose was trusted last."""
-        self._trusted = self.views[0] if self.never_found else SE3.identity(), np.zeros((6, 6))
+        self._pose, self._cov = self.views[0] if self.never_found else SE3.identity(), np.zeros((6, 6))
         self._particles: Particles | None = None
-        self._image: np.ndarray | None = None
+        self._image = NO_IMAGE
         self._mode = SE3.identity()
         self._view: LastView | None = None
 
@@ -138,7 +135,7 @@ class TrackingLoss:
         particles = filter_.particles
         state = filter_.belief().map.world(particles.state[:, :7])
         self._particles, self.stamp_ns = Particles(state, particles.log_weights), filter_.stamp_ns
-        self._image, self._view = image, None
+        self._image, self._view = NO_IMAGE if image is None else image, None
         self.never_found = False
 
     @property
@@ -148,9 +145,9 @@ class TrackingLoss:
             # Averaged only when it is needed: tracking has no time for it.
             poses, log_weights = self._particles.state, self._particles.log_weights
             estimate = mixture_estimate(Prior.exactly(SE3, poses), None, log_weights)
-            self._trusted, self._particles = (estimate.mean, estimate.cov), None
+            self._pose, self._cov, self._particles = estimate.mean, estimate.cov, None
             self._mode = poses[log_weights.argmax()].copy()
-        return self._trusted
+        return self._pose, self._cov
 
     def prior(self, filter_: Filter, image: np.ndarray | None) -> tuple[PosePrior, Attempt | None]:
         """Where a lost camera may be in the next frame: where it is recognised, else near the last trusted pose.
@@ -165,7 +162,7 @@ class TrackingLoss:
         attempt = None
         if image is not None:
             belief, count = filter_.belief(), len(self.views)
-            if self._view is None and self._image is not None:
+            if self._view is None and self._image.size:
                 self._view = LastView(self.sensor, self._image, self._mode, self.config)
             attempt = self.relocaliser.find(belief, image, pose, self._view)
             tried = min(count, VIEWS_PER_FRAME if filter_.steps else count)
@@ -190,38 +187,24 @@ class TrackingLoss:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        pose, cov = self.trusted
-        return {
-            "loss/pose": pose,
-            "loss/cov": cov,
-            "loss/stamp_ns": np.array(self.stamp_ns),
-            "loss/image": np.zeros((0, 0), dtype=np.uint8) if self._image is None else self._image,
-            "loss/mode": self._mode,
-            "loss/never_found": np.array(self.never_found),
-        }
+        self._pose, self._cov = self.trusted
+        return super().arrays()
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
         """The inverse of `arrays`."""
-        found = read(arrays, _LOSS, "loss/")
-        self._trusted, self._particles = (found["pose"], found["cov"]), None
-        self.stamp_ns, self._mode = int(found["stamp_ns"]), found["mode"]
-        self._image, self._view = held_image(found["image"], self.sensor.camera), None
-        self.never_found = bool(found["never_found"])
+        super().restore(arrays, **sizes)
+        require_image(self._image, self.sensor.camera)
+        self._particles = self._view = None
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """What is matched: an image and its corners (K, 2), and landmarks with their rows (L,) and points (L, 3)."""
+    """What is matched: an image and its corners (K, 2), and landmarks with their rows (L,) and homogeneous points (L, 4)."""
 
     image: np.ndarray
     rows: np.ndarray
-    points: np.ndarray
+    positions: np.ndarray
     px: np.ndarray
-
-    @property
-    def positions(self) -> np.ndarray:
-        """The points (L, 4), homogeneous."""
-        return np.concatenate([self.points, np.ones((self.rows.size, 1))], axis=-1)
 
 
 @final
@@ -250,23 +233,21 @@ class Relocaliser:
         """
         config, camera = self.config, self.camera
         rows, points = self.known_landmarks(belief) if among is None else among
-        attempt = Attempt(rows.size)
         if rows.size < (config.min_inliers if last is None else config.min_inliers_with_last_view):
-            return attempt
+            return Attempt()
         px, descriptors = self.corners(image)
-        attempt = replace(attempt, corners=px.shape[0])
         if px.shape[0] < config.min_inliers:
-            return attempt
+            return Attempt()
 
         # Landmarks as they should look from near by are matched with the corners; and so is the last view.
-        candidates = Candidates(image, rows, points, px)
+        candidates = Candidates(image, rows, np.insert(points, 3, 1.0, axis=1), px)
         products = similarities(self.describe_landmarks(candidates, near), descriptors)
         distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
         pairs = match_by_ratio(distances, points / size, px / config.spacing_px, config.descriptor_ratio)
         again = None if last is None else last.match(descriptors, px, points)
-        view = None if again is None else again[1]
-        attempt = replace(attempt, matches=pairs[0].size, matched=0 if again is None else int(again[0].size))
+        view, matched = (None, 0) if again is None else (again[1], again[0].size)
+        attempt = Attempt(pairs[0].size)
         first = rows[pairs[0]], px[pairs[1]]
 
         # A pose that most of them agree with, and then all that is seen around it.
@@ -279,7 +260,7 @@ class Relocaliser:
         for _ in range(MAX_ROUNDS):
             # Few landmarks in one part of the image determine a pose that is right for them alone; from there it has
             # to reach their neighbours first.
-            pairs = match_near(camera, rough, points, px, distances, config.match_radius_px)
+            pairs = self._match_near(rough, points, px, distances)
             at = self.refine_px(candidates, pairs, rough)
             found = self._refined(rough, points[pairs[0]], at, view)
             if found is None or (best is not None and found.inliers.sum() <= best.inliers.sum()):
@@ -294,8 +275,8 @@ class Relocaliser:
         noise = max(best.rms_px, self.sensor.config.noise_px)
         seen = rows[best_pairs][best.inliers], places[best.inliers]
         sighting = Sighting(best.world_from_camera, first, seen, noise)
-        attempt = replace(attempt, agreeing=agreeing, confirming=confirming, sighting=sighting)
-        confirmed = is_confirmed(agreeing, confirming, attempt.matched, config)
+        attempt = replace(attempt, agreeing=agreeing, sighting=sighting)
+        confirmed = is_confirmed(agreeing, confirming, matched, config)
         if not (confirmed or is_convincing(best, places, camera.width, config)):
             return attempt
         cov = gaussian.symmetrise((config.std_inflation * noise) ** 2 * np.linalg.inv(best.information))
@@ -340,7 +321,7 @@ class Relocaliser:
 
     def describe_landmarks(self, candidates: Candidates, near: np.ndarray) -> np.ndarray:
         """Descriptors (L, d) of landmarks, turned and scaled as they would be seen from a pose near by."""
-        known, asked = self._described, (candidates.rows, candidates.points, near)
+        known, asked = self._described, (candidates.rows, candidates.positions, near)
         if known is not None and all(map(np.array_equal, known, asked)):
             return known[3]
         positions = candidates.positions
@@ -358,13 +339,6 @@ class Relocaliser:
         self._described = *asked, descriptors
         return descriptors
 
-    def describe_as_first_seen(self, rows: np.ndarray) -> np.ndarray:
-        """Descriptors (L, d) of landmarks as they looked at first."""
-        patches = self.sensor.table.first_patch[rows]
-        return self.sensor.descriptor.describe_windows(
-            patches, np.full(rows.size, WINDOW_SCALE_PX), np.zeros(rows.size)
-        )
-
     def refine_px(
         self, candidates: Candidates, pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
     ) -> np.ndarray:
@@ -381,6 +355,17 @@ class Relocaliser:
         sigmas, most_px = config.ellipse_sigmas, config.max_radius_px
         matches = search(candidates.image, templates, at, cov, sigmas=sigmas, most_px=most_px)
         return np.where((matches.score >= MIN_CORRELATION)[:, None], matches.px, at)
+
+    def _match_near(
+        self, world_from_camera: np.ndarray, points: np.ndarray, px: np.ndarray, distances: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (M,), (M,) of landmark and the corner most like it near to where it should be seen from a pose."""
+        seen = SE3.inverse_transform(world_from_camera, points)
+        near = np.linalg.norm(self.camera.project(seen)[:, None] - px, axis=-1) <= self.config.match_radius_px
+        masked = np.where(near & self.camera.visible(seen)[:, None], distances, np.inf)
+        best = masked.argmin(axis=1)
+        chosen = masked[np.arange(best.size), best]
+        return _one_each(best, chosen, chosen <= MAX_DISTANCE)
 
     def _consensus(
         self, points: np.ndarray, places: np.ndarray, view: Sights | None, rng: np.random.Generator
@@ -528,23 +513,6 @@ def match_by_ratio(
     next_corner = np.where(other_corner, distances, np.inf).min(axis=1)
     next_point = np.where(other_point, distances[:, best].T, np.inf).min(axis=1)
     return _one_each(best, chosen, chosen <= ratio * np.minimum(next_corner, next_point))
-
-
-def match_near(
-    camera: Pinhole,
-    world_from_camera: np.ndarray,
-    points: np.ndarray,
-    px: np.ndarray,
-    distances: np.ndarray,
-    radius_px: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (M,), (M,) of landmark and the corner most like it near to where it should be seen from a pose."""
-    seen = SE3.inverse_transform(world_from_camera, points)
-    near = np.linalg.norm(camera.project(seen)[:, None] - px, axis=-1) <= radius_px
-    masked = np.where(near & camera.visible(seen)[:, None], distances, np.inf)
-    best = masked.argmin(axis=1)
-    chosen = masked[np.arange(best.size), best]
-    return _one_each(best, chosen, chosen <= MAX_DISTANCE)
 
 
 def _one_each(best: np.ndarray, chosen: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

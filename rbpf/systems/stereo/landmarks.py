@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import partial
-from typing import Any, Generic, Protocol, Self, TypeVar, final
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, final
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import integers, read
+from rbpf.core.checkpoint import Kept, integers, read
 from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Particles, Prior
 from rbpf.errors import InputError
@@ -46,12 +46,6 @@ SEEN_AGAIN = 2
 """Observations of a landmark that stands still: one that moves is not where it was seen first."""
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
-
-_NAMES = {
-    "held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
-    "observations": integers("landmarks", least=1),
-    "unseen_for": integers("landmarks", least=0),
-}
 
 
 class FeatureKind(IntEnum):
@@ -506,7 +500,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.manager.restore(arrays)
         if not np.array_equal(self.store.ids, self.manager.names):
             raise InputError("the landmarks that have descriptors are not those that are counted")
-        self.places.restore(arrays, len(self.store))
+        self.places.restore(arrays, landmarks=len(self.store))
         if self.noise is not None:
             self.noise.restore(arrays)
 
@@ -528,14 +522,21 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
 
 
 @final
-class NamedLandmarks(Landmarks[FeatureFrame]):
+class NamedLandmarks(Kept, Landmarks[FeatureFrame]):
     """Landmarks by the names that the recording gives them."""
+
+    # (M,) landmarks of the map, ascending, how often each was seen, and for how many pairs it has not been.
+    kept: ClassVar = {
+        "_held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
+        "_observations": integers("landmarks", least=1),
+        "_unseen_for": integers("landmarks", least=0),
+    }
+    prefix = "names/"
 
     def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
         self.rig, self.config, self.model, self.landmark = rig, config.map, StereoPoint(rig), Point(3)
         self.ids = np.zeros(0, dtype=np.int64)
         self._sensor = NamedLandmarkSensor(self.model, self.landmark, config.likelihood.build())
-        # (M,) landmarks of the map, ascending, how often each was seen, and for how many pairs it has not been.
         self._held = np.zeros(0, dtype=np.int64)
         self._observations, self._unseen_for = np.zeros((2, 0), dtype=np.int64)
 
@@ -568,10 +569,3 @@ class NamedLandmarks(Landmarks[FeatureFrame]):
 
     def seen_again(self) -> np.ndarray:
         return self._held[self._observations >= SEEN_AGAIN]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        counted = self._held, self._observations, self._unseen_for
-        return {f"names/{name}": array for name, array in zip(_NAMES, counted, strict=True)}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._held, self._observations, self._unseen_for = read(arrays, _NAMES, "names/").values()

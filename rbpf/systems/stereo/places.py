@@ -1,8 +1,10 @@
 """Where landmarks are and were seen last, by which those that a view may show are found; which a full joint map puts away."""
 
+from typing import ClassVar
+
 import numpy as np
 
-from rbpf.core.checkpoint import numbers, read
+from rbpf.core.checkpoint import Kept, numbers
 from rbpf.core.models import Belief, Map
 from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
@@ -12,16 +14,16 @@ from rbpf.systems.stereo.config import MapConfig
 SIGMAS = 3.0
 """The image is widened by so many standard deviations of the camera's direction."""
 
-_PLACES = {"place": numbers("landmarks", 3), "seen_from": numbers("landmarks", 3)}
 
-
-class Places:
+class Places(Kept):
     """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
 
     Landmarks go by their rows in the store of descriptors.
     """
 
     place: np.ndarray  #: (M, 3) in the world of the heaviest particle.
+    kept: ClassVar = {"place": numbers("landmarks", 3), "_seen_from": numbers("landmarks", 3)}
+    prefix = "places/"
 
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
         self.rig, self.config = rig, config
@@ -59,13 +61,6 @@ class Places:
         ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
         alike = cosine >= np.cos(np.deg2rad(self.config.max_turn_deg))
         return np.asarray(rows[alike & (ratio <= np.log(self.config.max_scale_change))])
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"places/place": self.place, "places/seen_from": self._seen_from}
-
-    def restore(self, arrays: dict[str, np.ndarray], count: int) -> None:
-        """The inverse of `arrays`, of so many landmarks; errors as `rbpf.core.checkpoint.read`."""
-        self.place, self._seen_from = read(arrays, _PLACES, "places/", landmarks=count).values()
 
 
 def places_of(belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
