@@ -67,34 +67,6 @@ def camera_motion(
     return best if scores[best] >= none else -1
 
 
-def propagated(
-    count: int,
-    matches: tuple[np.ndarray, np.ndarray],
-    labels: np.ndarray,
-    inliers: np.ndarray,
-    moving: np.ndarray,
-    mapped: np.ndarray,
-) -> np.ndarray:
-    """Labels (K,) of a pair's features, from those of the pair before.
-
-    Args:
-        count: K.
-        matches: rows (M,) of the earlier pair and (M,) of this one.
-        labels: (M,) of the matches in the earlier pair.
-        inliers: (M,) which agree with the camera's motion; where none does, all stay what they were.
-        moving: (M,) which agree on another motion.
-        mapped: rows of features that are where the map has them.
-    """
-    out = np.full(count, UNKNOWN, dtype=np.int8)
-    if inliers.any():
-        out[matches[1][inliers]] = STATIC
-    else:
-        out[matches[1]] = labels
-    out[matches[1][moving]] = MOVING
-    out[mapped] = STATIC
-    return out
-
-
 def _log_past(labels: np.ndarray) -> float:
     """Log B of a group with these labels: bounded, for a thing begins or stops as a whole."""
     odds = np.log((1.0 - MISTAKEN) / MISTAKEN) * labels.sum()

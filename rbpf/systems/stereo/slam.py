@@ -35,7 +35,7 @@ from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd
 from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks, Pair
-from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
+from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN, camera_motion, contradicts
 from rbpf.systems.stereo.odometry import DeadReckoning
 from rbpf.systems.stereo.tracks import tracked_features
 from rbpf.systems.system import (
@@ -257,8 +257,7 @@ class StereoSlam(System):
         # 4. Remember the pair, with what stood still in it: the next one is matched with it.
         if measured:
             static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
-            labels = propagated(len(pair), motion.rows, motion.labels, motion.inliers, motion.moving, static)
-            self._kept = replace(pair, labels=labels)
+            self._kept = replace(pair, labels=motion.labelled(len(pair), static))
         self.frames += 1
 
         # 5. Report: between updates the odometry moves the estimate.
@@ -501,3 +500,17 @@ class _Motion(NamedTuple):
     inliers: np.ndarray = _NO_MATCHES  # (M,) which agree with the camera's motion
     moving: np.ndarray = _NO_MATCHES  # (M,) which agree on another one: they are of things that move
     message: str = ""  # in words, what had to be assumed
+
+    def labelled(self, count: int, mapped: np.ndarray) -> np.ndarray:
+        """Labels (K,) of this pair's features, some rows of which are where the map has them; see `motion_segmentation`.
+
+        Where no match agrees with the camera's motion, all stay what they were.
+        """
+        out = np.full(count, UNKNOWN, dtype=np.int8)
+        if self.inliers.any():
+            out[self.rows[1][self.inliers]] = STATIC
+        else:
+            out[self.rows[1]] = self.labels
+        out[self.rows[1][self.moving]] = MOVING
+        out[mapped] = STATIC
+        return out
