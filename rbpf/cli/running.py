@@ -1,11 +1,14 @@
 """`rbpf run`: one class per system, and the same run again."""
 
+import signal
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
 
 import tyro
@@ -13,7 +16,6 @@ from tyro.conf import OmitArgPrefixes as Group  # in the help; its options have 
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
-from rbpf.cli.interrupts import StoppedError, patient
 from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
 from rbpf.cli.showing import OnProgress, answer, progress, say
 from rbpf.errors import InputError
@@ -306,6 +308,41 @@ def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
         report(len(run.log), run.expected or 0, ", ".join(said))
 
     return tell
+
+
+class StoppedError(KeyboardInterrupt):
+    """Someone stopped a command; the text says how to go on."""
+
+
+@contextmanager
+def patient(report: OnProgress) -> Iterator[OnProgress]:
+    """What a run reports its progress to, in place of `report`: after Ctrl-C it stops the run at the next frame.
+
+    A second Ctrl-C stops it at once, without a checkpoint of its own.
+    """
+    asked = threading.Event()
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise StoppedError("stopped; the same command with --resume goes on from the last checkpoint")
+        asked.set()
+        say("stopping after this frame; Ctrl-C again stops at once …")
+
+    def listening(done: int, total: int | None, words: str = "") -> None:
+        report(done, total, words)
+        if asked.is_set():
+            raise StoppedError(
+                f"stopped after {done} of {total or 'an unknown number'}; the same command with --resume goes on from there"
+            )
+
+    if threading.current_thread() is not threading.main_thread():
+        yield listening
+        return
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield listening
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _run(
