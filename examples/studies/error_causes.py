@@ -308,7 +308,7 @@ def main(
 
 def picture(causes: list[Cause]) -> Figure:
     """The error that remains with each change."""
-    figure, axes = new_axes("one thing changed at a time", "", "position error [m]", equal=False)
+    figure, axes = new_axes("one thing changed at a time", "", "position error [m]")
     errors = [cause.row()[1] for cause in causes]
     axes.barh([cause.name for cause in causes], errors, color=COLOURS["filter"])
     axes.invert_yaxis()

@@ -239,7 +239,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
 
 def picture(found: list[ErrorRatio]):
     """Filter and batch side by side, on a logarithmic scale."""
-    figure, axes = new_axes("filter beside the batch optimum", "position error [m]", "", equal=False)
+    figure, axes = new_axes("filter beside the batch optimum", "position error [m]", "")
     places = range(len(found))
     names = {"filter": [ratio.row()[3] for ratio in found], "batch": [ratio.row()[6] for ratio in found]}
     for shift, (name, errors) in zip((-0.2, 0.2), names.items(), strict=True):

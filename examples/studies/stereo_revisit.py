@@ -166,7 +166,7 @@ def scores(run: Run) -> dict[str, float]:
 
 def picture(rows: list[list]):
     """Odometry and filter side by side, on a logarithmic scale."""
-    figure, axes = new_axes("what the map brings", "position error [m]", "", equal=False)
+    figure, axes = new_axes("what the map brings", "position error [m]", "")
     places = range(len(rows))
     for shift, at, name in ((-0.2, 1, "odometry"), (0.2, 2, "filter")):
         errors = [found[at] for found in rows]

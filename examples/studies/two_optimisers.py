@@ -353,7 +353,7 @@ def main(run: Path | None = None, out: Path = Path("demo/two_optimisers"), quick
     found = adjust_by_both(log, path)
     entries = {name: float(value) for name, value in found.as_dict().items()}
     write_table(out / "two_optimisers.csv", ("figure", "value"), list(entries.items()))
-    figure, axes = new_axes("GTSAM and COLMAP", "frame", "difference of the pose", equal=False)
+    figure, axes = new_axes("GTSAM and COLMAP", "frame", "difference of the pose")
     axes.semilogy(np.abs(found.pose_differences), label=["ωx", "ωy", "ωz", "x [m]", "y", "z"])
     axes.legend(fontsize="small")
     save_figures({"two_optimisers.png": figure}, out)

@@ -232,7 +232,7 @@ def main(out: Path = Path("demo/verdict"), quick: bool = False) -> dict[str, boo
         "with the truth", "right",
     ]  # fmt: skip
     write_table(out / "verdicts.csv", header, rows)
-    figure, axes = new_axes("How many times larger than claimed the errors are", "", "times", equal=False)
+    figure, axes = new_axes("How many times larger than claimed the errors are", "", "times")
     places = np.arange(len(rows))
     for column, what, marker in ((2, "poses", "o"), (3, "landmarks", "s")):
         axes.plot([row[column] for row in rows], places, marker, label=what)

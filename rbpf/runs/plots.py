@@ -66,12 +66,12 @@ def plot_trajectory(*runs: RunFolder, ax: Any = None) -> Any:
     paths = [world.brought(run.trajectory) for run in runs]
     names = [run.folder.name for run in runs] if len(runs) > 1 else ["filter"]
     colours = [f"C{k}" for k in range(len(runs))] if len(runs) > 1 else [COLOURS["filter"]]
+    others = [each for each in other_paths(first, world) if len(runs) == 1 or each[0] == "truth"]
     figure, shown = Views.of(first.system, paths[0]).axes(f"{first.name}: path in {world.name}", ax)
     for axes, (right, up) in shown:
-        for name, label_, at in other_paths(first, world) if len(runs) == 1 else truth_path(first, world):
-            axes.plot(
-                at[:, right], at[:, up], "--" if name == "truth" else "-", color=COLOURS[name], lw=1.2, label=label_
-            )
+        for name, label_, at in others:
+            style = "--" if name == "truth" else "-"
+            axes.plot(at[:, right], at[:, up], style, color=COLOURS[name], lw=1.2, label=label_)
         for run, path, name, colour in zip(runs, paths, names, colours, strict=True):
             at, lost = path.positions, lost_frames(run)
             axes.plot(at[:, right], at[:, up], "-", color=colour, lw=1.2, label=name)
@@ -82,16 +82,11 @@ def plot_trajectory(*runs: RunFolder, ax: Any = None) -> Any:
     return figure
 
 
-def truth_path(found: RunFolder, world: "World") -> list[tuple[str, str, np.ndarray]]:
-    """The true positions (T, 3) with a name in `COLOURS` and a label; nothing where there is no truth."""
-    if world.truth is None or not (found.folder / TRUTH).is_file():
-        return []
-    return [("truth", "truth", world.truth.positions)]
-
-
 def other_paths(found: RunFolder, world: "World") -> list[tuple[str, str, np.ndarray]]:
-    """What the path of a run is drawn beside: truth, odometry and batch optimum, as `truth_path` has them."""
-    others = truth_path(found, world)
+    """What the path of a run is drawn beside: name in `COLOURS`, label and positions (T, 3) of truth, odometry and batch."""
+    others = []
+    if world.truth is not None and (found.folder / TRUTH).is_file():
+        others.append(("truth", "truth", world.truth.positions))
     for name, label_ in (("odometry", "odometry alone"), ("batch", "batch optimum")):
         if (found.folder / f"{name}.tum").is_file():
             others.append((name, label_, world.brought(read_tum(found.folder / f"{name}.tum")).positions))
@@ -254,7 +249,7 @@ def plot_error(*runs: RunFolder, ax: Any = None) -> Any:
         raise InputError(f"{runs[0].folder} has no ground truth to draw errors from")
     world = World.of(*runs)
     assert world.truth is not None
-    figure, axes = new_axes(f"{runs[0].name}: error in {world.name}", "error [m]", "frame", False, ax)
+    figure, axes = new_axes(f"{runs[0].name}: error in {world.name}", "error [m]", "frame", ax)
     for run in runs:
         moved = world.brought(run.trajectory)
         at, true = associate(moved, world.truth, 0)
@@ -483,12 +478,10 @@ def blank(width: float, height: float) -> Any:
     return ShownFigure(figsize=(width, height), layout="constrained")
 
 
-def new_axes(
-    title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True, ax: Any = None
-) -> tuple[Any, Any]:
-    """A figure of one pair of axes, by default of equal scale; that of `ax`, if it is given."""
+def new_axes(title: str, ylabel: str, xlabel: str, ax: Any = None) -> tuple[Any, Any]:
+    """A figure of one pair of axes; that of `ax`, if it is given."""
     axes = blank(7.0, 5.6).subplots() if ax is None else ax
-    label(axes, title, xlabel, ylabel, equal)
+    label(axes, title, xlabel, ylabel, equal=False)
     return axes.figure, axes
 
 

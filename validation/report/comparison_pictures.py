@@ -100,7 +100,7 @@ def plot_against_colmap(found: "ColmapComparison", reference: PathAndMap, out: P
     figures = {"colmap_map.png": figure}
     if found.cloud is not None:
         title = f"{found.reconstruction.name}: landmarks to the surface of COLMAP's points"
-        figure, axes = new_axes(title, "landmarks", "distance [m]", equal=False)
+        figure, axes = new_axes(title, "landmarks", "distance [m]")
         axes.hist(found.cloud.surface_m, bins=20, color=COLOURS["filter"])
         axes.axvline(float(np.median(found.cloud.surface_m)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
         axes.legend(loc="best", fontsize="small")
@@ -140,7 +140,7 @@ def consistency_figure(
     title: str, words: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], dim: int, banded: bool, ax: Any = None
 ) -> Any:
     """Normalised squared errors (R,) over the steps (R,) by name, their mean, and where an honest filter's would lie."""
-    (figure, axes), band = new_axes(title, words, "step", equal=False, ax=ax), chi_square_band(dim)
+    (figure, axes), band = new_axes(title, words, "step", ax=ax), chi_square_band(dim)
     low = band.low if banded else 0.1
     if banded:
         axes.axhspan(low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
@@ -158,7 +158,7 @@ def consistency_figure(
 
 def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
     """Distances of landmarks (M,) in σ, in order, beside those that an honest filter's would have."""
-    figure, axes = new_axes(title, "distance [σ of the filter]", "landmark", equal=False)
+    figure, axes = new_axes(title, "distance [σ of the filter]", "landmark")
     places = np.arange(1, squares.size + 1)
     right = np.sqrt(chi_square_quantile((places - 0.5) / squares.size, dim))
     axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
