@@ -7,6 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+#: What a run of every system leaves, of one with ground truth.
+FILES = {
+    "checkpoint.npz", "trajectory.tum", "trajectory.npz", "map.npz", "map.csv", "truth.npz", "observations.csv", "timings.csv",
+    "diagnostics.csv", "config.yaml", "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png",
+    "timings.png", "validation_groundtruth.json", "groundtruth_nees.png",
+}  # fmt: skip
+BATCH = {"batch.tum", "validation_gtsam.json", "gtsam_nees.png", "gtsam_landmarks.png", "gtsam_map.png"}
+#: Entries of its summary.json.
+REQUIRED = {"system", "recording", "frames", "particles", "seed", "ms_per_frame", "ate_rmse_m", "peak_memory_mb"}
+#: Further ones of cameras.
+OF_CAMERAS = {"ate_sim3_rmse_m", "rpe_translation_rmse_m", "rpe_rotation_rmse_deg"}
+
 TIMED_FILES = {"timings.csv", "timings.png", "timings.pdf", "report.html", "checkpoint.npz"}
 TIMED_ENTRIES = {"ms_per_frame", "ms_per_update", "peak_memory_mb", "finished"}
 

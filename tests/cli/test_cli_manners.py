@@ -86,12 +86,12 @@ _MAIN = "import sys; from rbpf.cli import main; sys.exit(main())"
 
 
 def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
-    assert main(quick(log, tmp_path / "a", "--seed", "4", "--set", "proposal.iterations=1")) == 0
+    assert main(quick(log, tmp_path / "a", "--seed", "4", "--set", "resampling.scheme=residual")) == 0
     config = tmp_path / "a" / "config.yaml"
     entries = yaml.safe_load(config.read_text())
     assert entries["versions"]["numpy"] == np.__version__ and len(entries["input_sha256"]) == 64
     assert entries["versions"]["instructions"] == instruction_set() and instruction_set()
-    assert entries["batch"] is False
+    assert entries["batch"] is False and entries["resampling"]["scheme"] == "residual"
     again = ["run", "--from", str(config)]
     assert main([*again, "--out", str(tmp_path / "b")]) == 0
     assert outputs(tmp_path / "a") == outputs(tmp_path / "b")

@@ -6,7 +6,8 @@ recordings exist under the names that the page uses.
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from rbpf.cli import main
-from rbpf.sensors.readers import open_images, open_stereo
+from rbpf.sensors.readers import ImageSequence, open_images, open_stereo
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
@@ -45,20 +46,12 @@ LEFT_OUT = {("sweep",): "--scheduler"}
 """An option with its value: tests/validation/test_sweep.py starts a cluster."""
 
 NAMES = {
-    "IMAGES": "desk",
-    "SEQUENCE": "desk",
+    **{name: name for name in ("log", "robot.clf", "phone.mp4", "board.mp4", "drive.bag", "stereo.bag", "wide.mp4")},
+    **dict.fromkeys(
+        ("IMAGES", "SEQUENCE", "DATA/mono_redkitchen_a", "DATA/stereo_zed_room1", "DATA/mono_robot_lateral"), "desk"
+    ),
     "PAIRS": "pairs",
     "LOG": "log",
-    "log": "log",
-    "DATA/mono_redkitchen_a": "desk",
-    "DATA/stereo_zed_room1": "desk",
-    "DATA/mono_robot_lateral": "desk",
-    "robot.clf": "robot.clf",
-    "phone.mp4": "phone.mp4",
-    "board.mp4": "board.mp4",
-    "drive.bag": "drive.bag",
-    "stereo.bag": "stereo.bag",
-    "wide.mp4": "wide.mp4",
 }
 """Names on the pages, and the recordings of `Shelf` that they stand for."""
 
@@ -107,53 +100,37 @@ class Shelf:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        long_enough = TexturedDesk(frames=120, texel_m=0.002)  # for a map in which a camera can be found
+        self.makers: dict[str, Callable[[Path], object]] = {
+            "desk": render_desk,
+            "longer": partial(simulate_images, long_enough, Imaging(jpeg=90), DESK_CAMERA, seed=3),
+            "log": partial(simulate_robot, RobotWorld(steps=20, landmarks=20), seed=0),
+            "robot.clf": self._robot,
+            "pairs": render_room,
+            "phone.mp4": lambda path: _film(_images(self.get("desk")), path),
+            "camera.mp4": self._camera,
+            "board.mp4": lambda path: _film(_coloured(pictures()), path),
+            "drive.bag": lambda path: _bagged(path, film_images, open_images(self.get("desk"))),
+            "stereo.bag": lambda path: _bagged(path, film_pairs, open_stereo(self.get("pairs"))),
+            "wide.mp4": lambda path: _film(_coloured(pictures(20, FISHEYE)), path),
+            "walk.mp4": self._walk,
+        }
 
     def get(self, name: str) -> Path:
         """Folder or file of a recording."""
         path = self.folder / name
         if not path.exists():
-            getattr(self, "_" + name.split(".")[0])(path)
+            self.makers[name](path)
         return path
-
-    def _desk(self, path: Path) -> None:
-        render_desk(path)
-
-    def _longer(self, path: Path) -> None:
-        """Long enough for a map in which a camera can be found."""
-        simulate_images(TexturedDesk(frames=120, texel_m=0.002), Imaging(jpeg=90), DESK_CAMERA, path, seed=3)
-
-    def _log(self, path: Path) -> None:
-        simulate_robot(RobotWorld(steps=20, landmarks=20), path, seed=0)
 
     def _robot(self, path: Path) -> None:
         simulate_laser(LaserWorld(scans=20, laps=1), self.folder / "corridor", seed=0)
         shutil.copy(self.folder / "corridor" / "robot.clf", path)
 
-    def _pairs(self, path: Path) -> None:
-        render_room(path)
-
-    def _phone(self, path: Path) -> None:
-        _film(_images(self.get("desk")), path)
-
     def _camera(self, path: Path) -> None:
         """The desk's images, with the camera that took them."""
         _film(_images(self.get("desk")), path)
         shutil.copy(self.get("desk") / "camera.yaml", path.with_suffix(".yaml"))
-
-    def _board(self, path: Path) -> None:
-        _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures()], path)
-
-    def _drive(self, path: Path) -> None:
-        """The desk's images and poses."""
-        with recorded(path) as bag:
-            film_images(bag, open_images(self.get("desk")))
-
-    def _stereo(self, path: Path) -> None:
-        with recorded(path) as bag:
-            film_pairs(bag, open_stereo(self.get("pairs")))
-
-    def _wide(self, path: Path) -> None:
-        _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures(20, FISHEYE)], path)
 
     def _walk(self, path: Path) -> None:
         """The camera that took the board's pictures, over a desk on which the board lies."""
@@ -204,6 +181,15 @@ def shortened(arguments: list[str], page: str = "") -> list[str]:
             if tuple(arguments[: len(start)]) == start:
                 arguments = arguments + [word for word in more if word.partition("=")[0] not in as_given]
     return arguments
+
+
+def _bagged(path: Path, film: Callable[..., object], sequence: ImageSequence) -> None:
+    with recorded(path) as bag:
+        film(bag, sequence)
+
+
+def _coloured(grey: Sequence[np.ndarray]) -> list[np.ndarray]:
+    return [np.repeat(image[..., None], 3, axis=-1) for image in grey]
 
 
 def _images(sequence: Path) -> list[np.ndarray]:

@@ -41,10 +41,7 @@ def test_images_from_anywhere_give_the_bytes_of_a_run_over_a_recording():
     log = FrameLog(slam)
     for frame in images(10):
         buffer[:] = frame.image
-        tracked = slam.track(buffer, frame.stamp_ns)
-        assert tracked.values.keys() == {column.name for column in slam.columns}
-        assert tracked.observed.keys() == {ragged.name for ragged in slam.observed}
-        log.append(tracked, 0.0)
+        log.append(slam.track(buffer, frame.stamp_ns), 0.0)
     assert log.poses.tobytes() == run.log.poses.tobytes()
     assert log.covs.tobytes() == run.log.covs.tobytes()
     for name in ("searched", "found", "ess", "log_evidence", "nis"):
