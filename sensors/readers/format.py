@@ -46,16 +46,13 @@ def recognised(path: str | Path, formats: Sequence[AnyFormat], what: str, kind: 
     for one in formats:
         if one.recognises(path):
             return path, one
+    # No format recognises what is there.
     kinds = "; or ".join(getattr(one, kind) for one in formats)
-    raise InputError(f"{path}: found {_content(path, kinds)}, expected {kinds}.")
-
-
-def _content(path: Path, expected: str) -> str:
-    """What is at a path that no format recognises."""
     if path.is_dir():
         names = sorted(entry.name for entry in path.iterdir())
-        if not names:
-            return "an empty folder"
-        return f"a folder with {', '.join(names[:5])}{' and more' if len(names) > 5 else ''}"
-    first = read_bytes(path, expected)[:80].decode(errors="replace").split("\n")[0]
-    return f"a file that begins with {quoted(first)}" if first else "an empty file"
+        some = f"with {', '.join(names[:5])}{' and more' if len(names) > 5 else ''}"
+        found = f"a folder {some}" if names else "an empty folder"
+    else:
+        first = read_bytes(path, kinds)[:80].decode(errors="replace").split("\n")[0]
+        found = f"a file that begins with {quoted(first)}" if first else "an empty file"
+    raise InputError(f"{path}: found {found}, expected {kinds}.")

@@ -230,8 +230,19 @@ class Carmen(Format[LaserOptions, ScansOfFile]):
         for number, one in found:
             if one.beams != first.beams:
                 raise line_error(path, number, f"expected {first.beams} as in line {line}, found {one.beams}")
+        count = first.ranges.size
+        if first.head:
+            start, view, step = first.head[1:4]
+            step = step or view / max(count - 1, 1)
+            if problem := _not_beams(start, step, count):
+                raise line_error(path, line, problem)
+            angles = start + step * np.arange(count)
+        else:
+            usual = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5, 400: 0.25, 401: 0.25}
+            step = usual.get(count, 180.0 / max(count - 1, 1))
+            angles = np.radians((-50.0 if count in (400, 401) else -90.0) + step * np.arange(count))
         scans = ScansOfFile(
-            first.angles(path, line),
+            np.asarray(angles, dtype=float),
             np.array([f"line {number}" for number, _ in found]),
             np.array([one.stamp_ns for _, one in found], dtype=np.int64),
             np.stack([one.ranges for _, one in found]),
@@ -242,7 +253,18 @@ class Carmen(Format[LaserOptions, ScansOfFile]):
         else:
             laser, odometry = np.stack([one.poses for _, one in found if one.poses is not None], axis=1)
             scans, mounts = replace(scans, odometry=odometry), SE2.between(odometry, laser)
-        mount = _mount(path, name, mounts, np.array([params.get(key, 0.0) for key in offsets]), rear)
+        # Where it sits: as all lines imply, else as the parameters tell, zero where they do not.
+        told = np.array([params.get(key, 0.0) for key in offsets])
+        same = len(mounts) > 0 and float(np.abs(SE2.local(mounts[0], mounts)).max()) < 1e-3
+        if same and (np.abs(mounts[0]).max() > 1e-3 or not told.any()):
+            mount = np.asarray(mounts[0])
+        elif not rear:
+            mount = np.asarray(SE2.normalise(told))
+        else:
+            _log.warning(
+                "%s: nothing says where %s sits; taken as in the robot's middle, looking backwards.", path, name
+            )
+            mount = np.array([np.pi, 0.0, 0.0])
         farthest = first.head[4] if first.head else min(params.get(f"robot_{side}_laser_max", 0.0), _FAR_M)
         return replace(scans, max_range_m=farthest if farthest > 0.0 else None, robot_from_sensor=mount)
 
@@ -272,15 +294,14 @@ class _Line(NamedTuple):
             if not (count == int(count) and 0 <= count < len(words) - at):
                 problem = f"expected {count:g} {what} and what follows them, found {len(words) - at} words"
                 raise line_error(path, number, problem)
-            values = np.empty(int(count))  # which may be nan or inf
-            for k in range(values.size):
+            values = []  # which may be nan or inf
+            for word in words[at : at + int(count)]:
                 try:
-                    values[k] = float(words[at + k])
+                    values.append(float(word))
                 except ValueError:
-                    wrong = f"expected {what} to be numbers, found {quoted(words[at + k])}"
-                    raise line_error(path, number, wrong) from None
-            at += values.size
-            return values
+                    raise line_error(path, number, f"expected {what} to be numbers, found {quoted(word)}") from None
+            at += len(values)
+            return np.array(values)
 
         head = () if old else tuple(take(_HEAD).tolist())
         ranges = take_list("readings")
@@ -304,20 +325,6 @@ class _Line(NamedTuple):
         told = [f"{name} {value:g}" for name, value in zip(_HEAD[1:5], self.head[1:5], strict=False)]
         return ", ".join([f"{self.ranges.size} readings", *told])
 
-    def angles(self, path: Path, number: int) -> Array:
-        """(B,) of the beams."""
-        count = self.ranges.size
-        if not self.head:
-            usual = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5, 400: 0.25, 401: 0.25}
-            step = usual.get(count, 180.0 / max(count - 1, 1))
-            start = -50.0 if count in (400, 401) else -90.0
-            return np.radians(start + step * np.arange(count))
-        start, view, step = self.head[1:4]
-        step = step or view / max(count - 1, 1)
-        if problem := _not_beams(start, step, count):
-            raise line_error(path, number, problem)
-        return np.asarray(start + step * np.arange(count), dtype=float)
-
 
 def _not_beams(start: float, step: float, count: int) -> str:
     """What is wrong with so many beams, the first at an angle and each a step further; empty where nothing is."""
@@ -333,17 +340,6 @@ def _numbers(path: Path, line: int, names: Iterable[str], words: list[str]) -> A
     if len(words) < len(names):
         raise line_error(path, line, f"expected {names[len(words)]}, found the end of the line")
     return np.array([parse_number(path, line, *pair) for pair in zip(names, words, strict=True)])
-
-
-def _mount(path: Path, name: str, implied: Array, told: Array, rear: bool) -> Array:
-    """robot_from_sensor (E,), from those that lines imply and the one that parameters tell, zero where they do not."""
-    same = len(implied) > 0 and float(np.abs(SE2.local(implied[0], implied)).max()) < 1e-3
-    if same and (np.abs(implied[0]).max() > 1e-3 or not told.any()):
-        return np.asarray(implied[0])
-    if not rear:
-        return np.asarray(SE2.normalise(told))
-    _log.warning("%s: nothing says where %s sits; taken as in the robot's middle, looking backwards.", path, name)
-    return np.array([np.pi, 0.0, 0.0])
 
 
 @final

@@ -25,14 +25,13 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import robot_log
 from rbpf.sensors.readers.format import Format
 from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, assemble
-from rbpf.sensors.readers.text import Table, read_csv
+from rbpf.sensors.readers.text import read_csv
 from rbpf.sensors.readers.yaml_files import read_yaml
 
 _POSE = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
@@ -79,7 +78,23 @@ class Mrpt(Format[LogNoise, RobotLog]):
             delta = SE3.from_ypr(odometry.block("dx_m", "dz_m"), *ypr.T)
             cov_delta = robot_log.spatial_to_chart(delta, ypr, robot_log.read_covariances(odometry, "cov00", "cov55"))
         cov_delta *= noise.odometry_variance_factor()
-        step, landmarks = _require_order(table, odometry)
+        # Observations in steps that the odometry reaches, in order.
+        counted = np.arange(1, len(odometry.rows) + 1)
+        odometry.require(odometry["step"] == counted, "step", "one more than in the row before, from 1")
+        step, named = table.integers("step"), "landmark_id" in table.columns
+        landmarks = table.integers("landmark_id") if named else np.full(len(step), UNNAMED)
+        last = counted[-1]
+        table.require((step >= 0) & (step <= last), "step", f"one with odometry, 0 to {last}")
+        ordered = np.diff(step, prepend=0) >= 0
+        if not ordered.all():
+            row = int(np.argmin(ordered))
+            backwards = f"time runs backwards from step {step[row - 1]} to {step[row]}"
+            raise table.error(row, f"{backwards}, expected rows in order")
+        # Those without a name may be many in a step; each counts as one of its own here.
+        apart = np.where(landmarks == UNNAMED, UNNAMED - 1 - np.arange(len(step)), landmarks)
+        if named:
+            table.require(landmarks >= UNNAMED, "landmark_id", f"{UNNAMED} or the number of a landmark")
+        table.require_distinct(step, apart, "step")
         # Measurements and their covariances.
         robot_log.require_ranges(table, "range_m", "yaw_rad")
         std = [
@@ -105,27 +120,6 @@ class Mrpt(Format[LogNoise, RobotLog]):
             pitch_sign=pitch_sign,
             truth=_read_truth(path, planar),
         )
-
-
-def _require_order(table: Table, odometry: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Steps and landmarks of the observations, all of them in steps that the odometry reaches, in order."""
-    counted = np.arange(1, len(odometry.rows) + 1)
-    odometry.require(odometry["step"] == counted, "step", "one more than in the row before, from 1")
-    step = table.integers("step")
-    named = "landmark_id" in table.columns
-    landmarks = table.integers("landmark_id") if named else np.full(len(step), UNNAMED)
-    last = counted[-1]
-    table.require((step >= 0) & (step <= last), "step", f"one with odometry, 0 to {last}")
-    ordered = np.diff(step, prepend=0) >= 0
-    if not ordered.all():
-        row = int(np.argmin(ordered))
-        raise table.error(row, f"time runs backwards from step {step[row - 1]} to {step[row]}, expected rows in order")
-    # Those without a name may be many in a step; each counts as one of its own here.
-    apart = np.where(landmarks == UNNAMED, UNNAMED - 1 - np.arange(len(step)), landmarks)
-    if named:
-        table.require(landmarks >= UNNAMED, "landmark_id", f"{UNNAMED} or the number of a landmark")
-    table.require_distinct(step, apart, "step")
-    return step, landmarks
 
 
 def _read_truth(path: Path, planar: bool) -> Truth | None:

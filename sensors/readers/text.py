@@ -60,28 +60,22 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
         raise InputError(f"{path}: cannot be read ({error}).") from None
 
 
-def _unpacked(path: Path, data: bytes) -> bytes:
-    """What a file holds that may be packed by gzip; no more than `MOST_BYTES` of it."""
-    if not data.startswith(b"\x1f\x8b"):
-        return data
-    unpacking = zlib.decompressobj(wbits=31)
-    try:
-        text = unpacking.decompress(data, MOST_BYTES)
-    except zlib.error as error:
-        raise InputError(f"{path}: it is packed by gzip and damaged ({error}); copy it again.") from None
-    if unpacking.unconsumed_tail:
-        raise InputError(f"{path}: the file is larger than {MOST_BYTES >> 20} MiB once it is unpacked.")
-    if not unpacking.eof:
-        raise InputError(f"{path}: it is packed by gzip and cut off; copy it again.")
-    return text
-
-
 def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
     """Text of a file, which may be packed by gzip, without a byte-order mark.
 
     Raises InputError: as `read_bytes`, or the file is empty, but for a byte-order mark, or not UTF-8.
     """
-    data = _unpacked(path, read_bytes(path, hint, most))
+    data = read_bytes(path, hint, most)
+    if data.startswith(b"\x1f\x8b"):  # packed by gzip
+        unpacking = zlib.decompressobj(wbits=31)
+        try:
+            data = unpacking.decompress(data, MOST_BYTES)
+        except zlib.error as error:
+            raise InputError(f"{path}: it is packed by gzip and damaged ({error}); copy it again.") from None
+        if unpacking.unconsumed_tail:
+            raise InputError(f"{path}: the file is larger than {MOST_BYTES >> 20} MiB once it is unpacked.")
+        if not unpacking.eof:
+            raise InputError(f"{path}: it is packed by gzip and cut off; copy it again.")
     if not data.removeprefix(BOM_UTF8).strip():
         raise InputError(f"{path}: the file is empty{hint and '; expected ' + hint}.")
     try:

@@ -282,13 +282,6 @@ class CameraInfo:
             raise InputError(f"{where}: {error}; give --calibration.") from None
         return cls(Calibration(where, camera), rotation, projection, is_rectified)
 
-    def rectified_from_camera(self) -> Array:
-        """R as a pose (7,)."""
-        placed = np.column_stack([self.rotation, np.zeros(3)])
-        if not np.isfinite(placed).all() or rigid_motion_error(placed):
-            raise InputError(f"{self.calibration.where}: R is no rotation; calibrate the two as a pair.")
-        return pose_of_matrix(placed)
-
     @property
     def shift_m(self) -> float:
         """How far to the right of the pair's left camera this one is, rectified; 0 where P does not say."""
@@ -351,25 +344,33 @@ class RosBag(ImageFormat):
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         topics, cameras = options.topics, 2 if options.stereo else 1
         with opened(path) as bag:
-            names = _image_topics(bag, topics.images[:cameras], cameras)
+            # The topics of images that are named, or those that there are; as many as cameras.
+            held, named = bag.of_type(IMAGE, COMPRESSED), topics.images[:cameras]
+            found = f"the bag's image topics are {', '.join(held)}" if held else "the bag has no topic of images"
+            if missing := [topic for topic in named if topic not in held]:
+                raise InputError(f"{path}: {missing[0]} is no topic of images; {found}.")
+            names = list(named) or held
+            if len(names) != cameras:
+                what = "one of them with --image-topic" if cameras == 1 else "two of them with --image-topic LEFT,RIGHT"
+                raise InputError(f"{path}: {found}; name {what}." if held else f"{path}: {found}.")
             # The cameras, by a file or as the bag says.
             if options.calibration is None:
                 infos = [CameraInfo.read(bag, name) for name in names]
                 used = infos[0].calibration
             else:
                 infos, used = [], read_calibration(options.calibration)
-            streams = [ImageStream.read(bag, name) for name in names]
-            shape, where = streams[0].shape, f"{path}, {' and '.join(names)}"
-            sizes = [f"{stream.shape[1]}x{stream.shape[0]}" for stream in streams]
+            stamps, shapes, frames = zip(*(_gone_through(bag, name) for name in names), strict=True)
+            shape, where = shapes[0], f"{path}, {' and '.join(names)}"
+            sizes = [f"{width}x{height}" for height, width in shapes]
             if sizes[0] != sizes[-1]:
                 raise InputError(f"{where}: the images have {sizes[0]} and {sizes[1]} px, expected one size.")
             for name, calibration in zip(names, [info.calibration for info in infos] or [used], strict=False):
                 calibration.require_shape(shape, f"{path}, {name}")
-            rows, notes = [np.arange(len(streams[0].stamps_ns))], tuple[str, ...]()
+            rows, notes = [np.arange(len(stamps[0]))], tuple[str, ...]()
             if cameras == 2:
-                *rows, notes = pair_stamps(streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where)
-            stamps_ns = streams[0].stamps_ns[rows[0]]
-            truth = topics.truth and read_poses(bag, topics.truth, stamps_ns, streams[0].frame)
+                *rows, notes = pair_stamps(stamps[0], stamps[1], options.tolerance_s, where)
+            stamps_ns = stamps[0][rows[0]]
+            truth = topics.truth and read_poses(bag, topics.truth, stamps_ns, frames[0])
         source = BagImages(path, stamps_ns, shape, tuple(names), tuple(rows))
         whole = path.resolve()
         name = whole.stem if whole.is_file() else whole.name
@@ -392,53 +393,48 @@ class RosBag(ImageFormat):
         if left.is_rectified:
             return replace(sequence, baseline_m=apart_m)
         # The right camera in the frame of the left one, by way of the rectified frames.
-        aside = np.array([0.0, 0.0, 0.0, 1.0, apart_m, 0.0, 0.0])
-        from_left, from_right = (info.rectified_from_camera() for info in infos)
-        left_from_right = SE3.compose(SE3.inverse(from_left), SE3.compose(aside, from_right))
+        aside, turns = np.array([0.0, 0.0, 0.0, 1.0, apart_m, 0.0, 0.0]), []
+        for info in infos:
+            turn = np.column_stack([info.rotation, np.zeros(3)])
+            if not np.isfinite(turn).all() or rigid_motion_error(turn):
+                raise InputError(f"{info.calibration.where}: R is no rotation; calibrate the two as a pair.")
+            turns.append(pose_of_matrix(turn))
+        left_from_right = SE3.compose(SE3.inverse(turns[0]), SE3.compose(aside, turns[1]))
         note = f"{path}: the two cameras are not rectified; their images are, by the two CameraInfo."
         return rectified(sequence, right.calibration.camera, left_from_right, where, note)
 
 
-@dataclass(frozen=True)
-class ImageStream:
-    """A topic of images: times (T,) of its messages' headers, not decreasing, height and width of the first that can be read.
+def _gone_through(bag: Bag, topic: str) -> tuple[np.ndarray, tuple[int, int], str]:
+    """Of a topic of images the times (T,) of its messages' headers, not decreasing, and what the first image says.
 
-    `frame` is the name of the camera's frame.
+    That is the first that can be read: height and width, and the name of the camera's frame.
     """
-
-    stamps_ns: np.ndarray
-    shape: tuple[int, int]
-    frame: str
-
-    @classmethod
-    def read(cls, bag: Bag, topic: str) -> "ImageStream":
-        """Goes through a topic once, for its times and its first image."""
-        where, stamps = f"{bag.path}, {topic}", list[int]()
-        first: tuple[tuple[int, int], str] | None = None
-        problems = []
-        try:
-            for raw in bag.messages(topic):
-                stamps.append(raw.stamp_ns)
-                if first is None:
-                    try:
-                        first = read_image(bag, raw, where).shape, bag.message(raw).header.frame_id
-                    except InputError as error:
-                        problems.append(str(error))
-        except InputError as error:
+    where, stamps = f"{bag.path}, {topic}", list[int]()
+    first: tuple[tuple[int, int], str] | None = None
+    problems = []
+    try:
+        for raw in bag.messages(topic):
+            stamps.append(raw.stamp_ns)
             if first is None:
-                raise
-            _log.warning("%s The %d images before it are kept.", error, len(stamps))
+                try:
+                    first = read_image(bag, raw, where).shape, bag.message(raw).header.frame_id
+                except InputError as error:
+                    problems.append(str(error))
+    except InputError as error:
         if first is None:
-            said = f"; the first is {problems[0]}" if problems else ""
-            raise InputError(f"{where}: none of {len(stamps)} images can be read{said}")
-        stamps_ns = np.array(stamps, np.int64)
-        gaps = np.diff(stamps_ns)
-        if (late := np.flatnonzero(gaps < 0)).size:
-            raise InputError(f"{where}: the stamp of image {late[0] + 1} is before the one it follows.")
-        if gaps.size and not gaps.any():
-            alike = f"all {len(stamps)} images have the time {stamps_ns[0]}"
-            raise InputError(f"{where}: {alike}, their headers are not filled in.")
-        return cls(stamps_ns, *first)
+            raise
+        _log.warning("%s The %d images before it are kept.", error, len(stamps))
+    if first is None:
+        said = f"; the first is {problems[0]}" if problems else ""
+        raise InputError(f"{where}: none of {len(stamps)} images can be read{said}")
+    stamps_ns = np.array(stamps, np.int64)
+    gaps = np.diff(stamps_ns)
+    if (late := np.flatnonzero(gaps < 0)).size:
+        raise InputError(f"{where}: the stamp of image {late[0] + 1} is before the one it follows.")
+    if gaps.size and not gaps.any():
+        alike = f"all {len(stamps)} images have the time {stamps_ns[0]}"
+        raise InputError(f"{where}: {alike}, their headers are not filled in.")
+    return stamps_ns, *first
 
 
 @final
@@ -483,16 +479,3 @@ class BagImages(Source):
         if read is None:
             raise InputError(f"{self.path}: the bag has changed and ends before.")
         return read()
-
-
-def _image_topics(bag: Bag, named: tuple[str, ...], count: int) -> list[str]:
-    """The topics of images that are named, or those that there are; as many as there should be cameras, 1 or 2."""
-    held = bag.of_type(IMAGE, COMPRESSED)
-    found = f"the bag's image topics are {', '.join(held)}" if held else "the bag has no topic of images"
-    if missing := [topic for topic in named if topic not in held]:
-        raise InputError(f"{bag.path}: {missing[0]} is no topic of images; {found}.")
-    chosen = list(named) or held
-    if len(chosen) != count:
-        what = "one of them with --image-topic" if count == 1 else "two of them with --image-topic LEFT,RIGHT"
-        raise InputError(f"{bag.path}: {found}; name {what}." if held else f"{bag.path}: {found}.")
-    return chosen

@@ -11,7 +11,6 @@ between others is a frame without an image.
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
@@ -49,7 +48,7 @@ class Kitti(ImageFormat):
         if stereo and not folders[1].is_dir():
             raise InputError(f"{folders[1]}: no such folder, expected the images of the right camera.")
         calib = path / "calib.txt"
-        projection = Projection.read(calib, self.kind, left)
+        _, intrinsics, first_from_camera = _projection(calib, self.kind, left)
         rows = read_stamped(path / "times.txt", self.kind)
         count = len(rows.stamps_ns)
         # Files of the left camera, and of the right one.
@@ -58,7 +57,7 @@ class Kitti(ImageFormat):
         if options.calibration is not None:
             used = read_calibration(options.calibration)
         else:
-            fx, fy, cx, cy = projection.intrinsics.tolist()
+            fx, fy, cx, cy = intrinsics.tolist()
             height, width = shape
             if not (0.0 < cx < width and 0.0 < cy < height):
                 problem = f"({cx:.6g}, {cy:.6g}) px lies outside the images of {width}x{height} px"
@@ -70,7 +69,16 @@ class Kitti(ImageFormat):
             raise InputError(f"{path}: the left and right images have {sizes}, expected one size.")
         baseline_m = used.baseline_m if stereo else None
         if stereo and baseline_m is None:
-            baseline_m = projection.baseline(Projection.read(calib, self.kind, right))
+            where, theirs, first_from_right = _projection(calib, self.kind, right)
+            baseline_m = float((first_from_right - first_from_camera)[4])
+            if baseline_m == 0.0:
+                problem = (
+                    "it is at the place of the left camera, a baseline of zero; give the projections of two cameras"
+                )
+                raise InputError(f"{where}: {problem}.")
+            if np.abs(intrinsics - theirs).max() > ALIGNED_PX or baseline_m < 0.0:
+                problem = "expected the left camera's projection shifted to the right, as of a rectified pair"
+                raise InputError(f"{where}: {problem}.")
         # A sentence about each folder that does not hold an image for every time.
         held = [sum(file.exists() for file in of_camera) for of_camera in files]
         notes = tuple(
@@ -78,49 +86,32 @@ class Kitti(ImageFormat):
             for folder, number in zip(folders, held, strict=False)
             if stereo and number < count
         )
-        truth = _read_truth(path, projection.first_from_camera, rows.stamps_ns)
+        truth = _read_truth(path, first_from_camera, rows.stamps_ns)
         source = FileImages(rows.stamps_ns, shape, *files)
         return ImageSequence(path.resolve().name, used.camera, rows.stamps_ns, truth, baseline_m, source, notes)
 
 
-@dataclass(frozen=True)
-class Projection:
-    """A camera in `calib.txt`, whose line `where` names."""
+def _projection(path: Path, hint: str, camera: int) -> tuple[str, Array, Array]:
+    """A camera of `calib.txt` by its number; other lines are passed over. `hint` is what is expected to lie there.
 
-    where: str
-    intrinsics: Array  #: (4,) fx, fy, cx, cy [px].
-    first_from_camera: Array  #: (7,) pose in the frame of camera 0, to which poses refer.
-
-    @classmethod
-    def read(cls, path: Path, hint: str, camera: int) -> "Projection":
-        """The camera of a number; other lines are passed over. `hint` is what is expected to lie there, for messages."""
-        for number, line in enumerate(read_text(path, hint).splitlines(), 1):
-            name, _, rest = line.partition(":")
-            if name != f"P{camera}":
-                continue
-            fields = rest.split()
-            if len(fields) != 12:
-                raise line_error(path, number, f"expected {name}: and 12 numbers, found {len(fields)}")
-            matrix = np.reshape([parse_number(path, number, name, field) for field in fields], (3, 4))
-            fx, fy, cx, cy = intrinsics = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-            pinhole = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-            if not (fx > 0.0 and fy > 0.0 and np.array_equal(matrix[:, :3], pinhole)):
-                problem = f"expected {name} to be fx 0 cx . 0 fy cy . 0 0 1 . with positive fx and fy"
-                raise line_error(path, number, problem)
-            shift = -np.linalg.solve(pinhole, matrix[:, 3])
-            return cls(f"{path}, line {number}", intrinsics, np.concatenate([SE3.identity()[:4], shift]))
-        raise InputError(f"{path}: expected a line `P{camera}:` and 12 numbers, found none.")
-
-    def baseline(self, right: "Projection") -> float:
-        """Distance [m] of the right camera of a pair."""
-        along = float((right.first_from_camera - self.first_from_camera)[4])
-        if along == 0.0:
-            problem = "it is at the place of the left camera, a baseline of zero; give the projections of two cameras"
-            raise InputError(f"{right.where}: {problem}.")
-        if np.abs(self.intrinsics - right.intrinsics).max() > ALIGNED_PX or along <= 0.0:
-            problem = "expected the left camera's projection shifted to the right, as of a rectified pair"
-            raise InputError(f"{right.where}: {problem}.")
-        return along
+    Where its line is, in words; fx, fy, cx, cy (4,) [px]; its pose (7,) in the frame of camera 0, to which poses refer.
+    """
+    for number, line in enumerate(read_text(path, hint).splitlines(), 1):
+        name, _, rest = line.partition(":")
+        if name != f"P{camera}":
+            continue
+        fields = rest.split()
+        if len(fields) != 12:
+            raise line_error(path, number, f"expected {name}: and 12 numbers, found {len(fields)}")
+        matrix = np.reshape([parse_number(path, number, name, field) for field in fields], (3, 4))
+        fx, fy, cx, cy = intrinsics = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        pinhole = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        if not (fx > 0.0 and fy > 0.0 and np.array_equal(matrix[:, :3], pinhole)):
+            problem = f"expected {name} to be fx 0 cx . 0 fy cy . 0 0 1 . with positive fx and fy"
+            raise line_error(path, number, problem)
+        shift = -np.linalg.solve(pinhole, matrix[:, 3])
+        return f"{path}, line {number}", intrinsics, np.concatenate([SE3.identity()[:4], shift])
+    raise InputError(f"{path}: expected a line `P{camera}:` and 12 numbers, found none.")
 
 
 def _files(folder: Path, count: int) -> list[Path]:

@@ -7,7 +7,7 @@ in the middle, and what then lies outside is left out. A lens of 140° on images
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Self, final
+from typing import Any, final
 
 import numpy as np
 
@@ -24,75 +24,74 @@ ALIKE_PX = 1e-2  #: How far intrinsics of a rectified pair may differ: rounding,
 ROTATED_RAD, ASIDE = 1e-4, 1e-2
 
 
-@final
-@dataclass(frozen=True)
-class Rectification:
-    """How images are made into those of a rectified pair."""
+#: For each camera, columns and rows (H, W) float32 of the given image that the rectified one shows.
+Maps = list[tuple[np.ndarray, np.ndarray]]
 
-    rig: RectifiedStereo  #: the rectified pair.
-    left_from_rectified: Array  #: (7,) a turn.
-    #: for each camera, columns and rows (H, W) float32 of the given image that the rectified one shows.
-    maps: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-    @classmethod
-    def between(cls, left: Pinhole, right: Pinhole, left_from_right: Array, where: str) -> Self:
-        """Rectification of two cameras of one image size, the second at `left_from_right` (7,) in the frame of the first."""
-        import cv2
+def rectification(
+    left: Pinhole, right: Pinhole, left_from_right: Array, where: str
+) -> tuple[RectifiedStereo, Array, Maps]:
+    """How images of two cameras of one size, the second at `left_from_right` (7,), are made into those of a rectified pair.
 
-        shift = SE3.translation(left_from_right)
-        if shift[0] < BESIDE * np.linalg.norm(shift):
-            x, y, z = (f"{component:.4g}" for component in shift)
-            raise InputError(
-                f"{where}: the right camera is at ({x}, {y}, {z}) m from the left one, expected it to the right, "
-                "along the rows; exchange the two, or correct T_BS."
-            )
-        right_from_left, size = SE3.inverse(left_from_right), (left.width, left.height)
-        motion = SE3.rotation(right_from_left), SE3.translation(right_from_left)[:, None]
-        if "equidistant" in (left.distortion_model, right.distortion_model):
-            # Turned as OpenCV does, which depends on the two poses alone, and drawn by our own lenses.
-            fx, fy, cx, cy = np.mean([left.params[:4], right.params[:4]], axis=0).tolist()
-            camera = Pinhole(*size, 0.5 * (fx + fy), 0.5 * (fx + fy), cx, cy)
-            same = (*_opencv(camera), *_opencv(camera))
-            turns = cv2.stereoRectify(*same, size, *motion, flags=cv2.CALIB_ZERO_DISPARITY)[:2]
-            rows, columns = np.mgrid[: left.height, : left.width].astype(float)
-            uv = camera.unproject(np.stack([columns, rows], axis=-1))
-            rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
-            maps = [_drawn(given, rays @ turn) for given, turn in zip((left, right), turns, strict=True)]
-            rig = RectifiedStereo(camera, float(np.linalg.norm(shift)))
-        else:
-            both = (*_opencv(left), *_opencv(right))
-            found = cv2.stereoRectify(*both, size, *motion, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
-            turns, projections = found[:2], found[2:4]
-            fx, fy, cx, cy = projections[0][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-            maps = [
-                cv2.initUndistortRectifyMap(*_opencv(given), turn, target, size, cv2.CV_32FC1)
-                for given, turn, target in zip((left, right), turns, projections, strict=True)
-            ]
-            rig = RectifiedStereo(Pinhole(*size, fx, fy, cx, cy), -float(projections[1][0, 3]) / fx)
-        back = SE3.from_matrix(np.column_stack([turns[0].T, np.zeros(3)]))
-        return cls(rig, back, (maps[0], maps[1]))
+    The pair, left_from_rectified (7,), which is a turn, and the maps. Raises InputError: as `rectified`.
+    """
+    import cv2
 
-    def frame(self, frame: ImageFrame) -> ImageFrame:
-        """The frame with its images rectified."""
-        import cv2
-
-        left, right = (
-            None if image is None else np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))
-            for image, maps in zip((frame.image, frame.right), self.maps, strict=True)
+    shift = SE3.translation(left_from_right)
+    if shift[0] < BESIDE * np.linalg.norm(shift):
+        x, y, z = (f"{component:.4g}" for component in shift)
+        raise InputError(
+            f"{where}: the right camera is at ({x}, {y}, {z}) m from the left one, expected it to the right, "
+            "along the rows; exchange the two, or correct T_BS."
         )
-        return replace(frame, image=left, right=right)
+    right_from_left, size = SE3.inverse(left_from_right), (left.width, left.height)
+    motion = SE3.rotation(right_from_left), SE3.translation(right_from_left)[:, None]
+    maps: Maps
+    if "equidistant" in (left.distortion_model, right.distortion_model):
+        # Turned as OpenCV does, which depends on the two poses alone, and drawn by our own lenses: beyond the image where
+        # they see nothing.
+        fx, fy, cx, cy = np.mean([left.params[:4], right.params[:4]], axis=0).tolist()
+        camera = Pinhole(*size, 0.5 * (fx + fy), 0.5 * (fx + fy), cx, cy)
+        same = (*_opencv(camera), *_opencv(camera))
+        turns = cv2.stereoRectify(*same, size, *motion, flags=cv2.CALIB_ZERO_DISPARITY)[:2]
+        rows, columns = np.mgrid[: left.height, : left.width].astype(float)
+        uv = camera.unproject(np.stack([columns, rows], axis=-1))
+        rays, maps = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1), []
+        for given, turn in zip((left, right), turns, strict=True):
+            px = np.where(given.visible(rays @ turn)[..., None], given.project(rays @ turn), OUTSIDE)
+            column, row = cv2.split(px.astype(np.float32))
+            maps.append((column, row))
+        rig = RectifiedStereo(camera, float(np.linalg.norm(shift)))
+    else:
+        both = (*_opencv(left), *_opencv(right))
+        found = cv2.stereoRectify(*both, size, *motion, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
+        turns, projections = found[:2], found[2:4]
+        fx, fy, cx, cy = projections[0][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        maps = [
+            cv2.initUndistortRectifyMap(*_opencv(given), turn, target, size, cv2.CV_32FC1)
+            for given, turn, target in zip((left, right), turns, projections, strict=True)
+        ]
+        rig = RectifiedStereo(Pinhole(*size, fx, fy, cx, cy), -float(projections[1][0, 3]) / fx)
+    return rig, SE3.from_matrix(np.column_stack([turns[0].T, np.zeros(3)])), maps
 
 
 @final
 @dataclass(frozen=True)
 class RectifiedImages(Source):
-    """Images of another source, rectified."""
+    """Pairs of another source, rectified."""
 
     source: Source
-    rectification: Rectification
+    maps: Maps
 
     def frames(self, start: int) -> Iterator[ImageFrame]:
-        return map(self.rectification.frame, self.source.frames(start))
+        import cv2
+
+        for frame in self.source.frames(start):
+            left, right = (
+                None if image is None else np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))
+                for image, maps in zip((frame.image, frame.right), self.maps, strict=True)
+            )
+            yield replace(frame, image=left, right=right)
 
 
 def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, where: str, note: str) -> ImageSequence:
@@ -116,30 +115,15 @@ def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, w
     aligned = np.linalg.norm(SE3.log(left_from_right)[:3]) <= ROTATED_RAD and np.linalg.norm(across) <= ASIDE * along
     if equal and aligned and along > 0.0 and np.abs(left.params - right.params).max() <= ALIKE_PX:
         return replace(sequence, baseline_m=float(along))
-    done = Rectification.between(sequence.camera, right, left_from_right, where)
-    truth = sequence.truth
-    if truth is not None:
-        turned = SE3.compose(truth.poses, done.left_from_rectified)
-        truth = replace(truth, poses=turned)
-    return replace(
-        sequence,
-        camera=done.rig.camera,
-        truth=truth,
-        baseline_m=done.rig.baseline_m,
-        source=RectifiedImages(sequence.source, done),
-        notes=(*sequence.notes, note),
-    )
+    rig, left_from_rectified, maps = rectification(left, right, left_from_right, where)
+    truth = sequence.truth and replace(sequence.truth, poses=SE3.compose(sequence.truth.poses, left_from_rectified))
+    source, notes = RectifiedImages(sequence.source, maps), (*sequence.notes, note)
+    return replace(sequence, camera=rig.camera, truth=truth, baseline_m=rig.baseline_m, source=source, notes=notes)
 
 
 def _opencv(camera: Pinhole) -> tuple[Any, Any]:
     fx, fy, cx, cy = camera.params[:4]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(camera.distortion)
-
-
-def _drawn(camera: Pinhole, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows where a camera sees points (H, W, 3); beyond the image where it does not."""
-    px = np.where(camera.visible(seen)[..., None], camera.project(seen), OUTSIDE).astype(np.float32)
-    return np.ascontiguousarray(px[..., 0]), np.ascontiguousarray(px[..., 1])
 
 
 def pair_stamps(

@@ -10,7 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, open_stereo
-from rbpf.sensors.readers.images.rectification import OUTSIDE, Rectification
+from rbpf.sensors.readers.images.rectification import OUTSIDE, rectification
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,
@@ -182,16 +182,16 @@ WIDE_RIGHT = Pinhole(160, 120, 65.0, 65.5, 78.0, 61.0, (0.0, 0.0, 0.0, 0.0), "eq
     ("left", "right"), [(LEFT, RIGHT), (WIDE_LEFT, WIDE_RIGHT), (LEFT, WIDE_RIGHT)], ids=["narrow", "wide", "mixed"]
 )
 def test_rectified_cameras_see_a_point_on_one_row(left, right):
-    done = Rectification.between(left, right, APART, "here")
-    assert done.rig.baseline_m == pytest.approx(np.linalg.norm(SE3.translation(APART)), rel=1e-9)
+    rig, left_from_rectified, both = rectification(left, right, APART, "here")
+    assert rig.baseline_m == pytest.approx(np.linalg.norm(SE3.translation(APART)), rel=1e-9)
     points = np.random.default_rng(0).uniform([-0.4, -0.3, 1.5], [0.4, 0.3, 4.0], (200, 3))
-    rectified = done.rig.project(SE3.inverse_transform(done.left_from_rectified, points))
-    inside = done.rig.inside(rectified, 2.0)
+    rectified = rig.project(SE3.inverse_transform(left_from_rectified, points))
+    inside = rig.inside(rectified, 2.0)
     inside &= left.visible(points) & right.visible(SE3.inverse_transform(APART, points))
     assert inside.sum() > 100
     for camera, maps, where, column in (
-        (left, done.maps[0], points, 0),
-        (right, done.maps[1], SE3.inverse_transform(APART, points), 2),
+        (left, both[0], points, 0),
+        (right, both[1], SE3.inverse_transform(APART, points), 2),
     ):
         # The map at the rectified place names the place in the image as it was taken.
         place = rectified[inside][:, [column, 1]].astype(np.float32)
@@ -201,8 +201,7 @@ def test_rectified_cameras_see_a_point_on_one_row(left, right):
 
 def test_what_a_wide_pair_does_not_see_is_black():
     turned = SE3.from_ypr(SE3.translation(APART), 0.0, 0.8, 0.0)
-    done = Rectification.between(WIDE_LEFT, WIDE_RIGHT, turned, "here")
-    columns, rows = done.maps[1]
+    columns, rows = rectification(WIDE_LEFT, WIDE_RIGHT, turned, "here")[2][1]
     np.testing.assert_array_equal(columns == OUTSIDE, rows == OUTSIDE)
     assert 0.02 < (columns == OUTSIDE).mean() < 0.5
     white = np.full((120, 160), 255, np.uint8)
