@@ -74,8 +74,16 @@ class LandmarkManager:
         return self.observations >= self.config.observations
 
     def observe(self, names: np.ndarray) -> np.ndarray:
-        """Begins a frame in which landmarks (k,) were seen again; returns names (j,) of those dropped. Errors as `remove`."""
-        rows = self._rows(names)
+        """Begins a frame in which landmarks (k,) were seen again; returns names (j,) of those dropped.
+
+        Raises InputError: one is not held.
+        """
+        names = np.asarray(names, dtype=np.int64)
+        rows = np.searchsorted(self.names, names)
+        known = rows < self.names.size
+        known[known] = self.names[rows[known]] == names[known]
+        if not known.all():
+            raise InputError(f"there is no landmark named {names[~known][0]}")
         self.frame += 1
         self._table[rows, 1] += 1
         self._table[rows, 2] = self.frame
@@ -128,10 +136,6 @@ class LandmarkManager:
         self._table = np.concatenate([self._table, new])
         return names
 
-    def remove(self, names: np.ndarray) -> None:
-        """Drops descriptors (k,), landmarks or not; an InputError where one is not held."""
-        self._table = np.delete(self._table, self._rows(names), axis=0)
-
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         return {"key_manager/table": self._table.copy(), "key_manager/counters": np.array([self.frame, self.next_name])}
@@ -146,12 +150,3 @@ class LandmarkManager:
     def _cell(self, px: np.ndarray) -> np.ndarray:
         column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T
         return column.astype(np.int64) + self.config.cells * line.astype(np.int64)
-
-    def _rows(self, names: np.ndarray) -> np.ndarray:
-        names = np.asarray(names, dtype=np.int64)
-        rows = np.searchsorted(self.names, names)
-        known = rows < self.names.size
-        known[known] = self.names[rows[known]] == names[known]
-        if not known.all():
-            raise InputError(f"there is no landmark named {names[~known][0]}")
-        return rows

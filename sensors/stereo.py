@@ -76,7 +76,7 @@ class StereoFeatures:
     ) -> "StereoFeatures":
         """Features whose points and their covariances follow from the pixels."""
         points = rig.triangulate(z)
-        jac = triangulate_jacobian(rig, z)
+        jac = np.linalg.inv(rig.jacobian(points))  # Mathematics (stereo-slope)
         cov_points = gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2))
         return cls(z, cov, points, cov_points, scale, orientation, descriptors)
 
@@ -86,22 +86,6 @@ class StereoFeatures:
     def take(self, rows: np.ndarray) -> "StereoFeatures":
         """Some of them, by number or by mask."""
         return StereoFeatures(*(getattr(self, item.name)[rows] for item in fields(self)))
-
-
-def triangulate_jacobian(rig: RectifiedStereo, z: np.ndarray) -> np.ndarray:
-    """∂P/∂(u_left, v, u_right) (…, 3, 3) of `RectifiedStereo.triangulate` at pixels z (…, 3), Mathematics (stereo-slope).
-
-    With disparity d = u_left − u_right, P = (fx b / d) (u, v, 1) in normalised coordinates: every pixel of d moves P
-    along its own ray by −P/d, and u_left and v turn the ray besides.
-    """
-    points = rig.triangulate(z)
-    disparity = (z[..., 0] - z[..., 2])[..., None]
-    slope = np.zeros((*points.shape, 3))
-    slope[..., 0] = -points / disparity
-    slope[..., 2] = points / disparity
-    slope[..., 0, 0] += rig.baseline_m / disparity[..., 0]
-    slope[..., 1, 1] = rig.camera.fx / rig.camera.fy * rig.baseline_m / disparity[..., 0]
-    return slope
 
 
 SWAPPED, FEWER = 20, 4  #: So many matches the wrong way round, and so many times fewer the right way, are no accident.

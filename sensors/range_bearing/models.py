@@ -31,7 +31,8 @@ class RigidPointModel(ObservationModel):
         self.robot_from_sensor = np.array(mounting, dtype=float)
         self.robot_from_sensor.flags.writeable = False
         rotation = space.rotation(self.robot_from_sensor)
-        self._mounting = np.concatenate([rotation.ravel(), space.translation(self.robot_from_sensor)])
+        #: Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation.
+        self.mounting = np.concatenate([rotation.ravel(), space.translation(self.robot_from_sensor)])
 
     @abstractmethod
     def measure(self, point: Array) -> Array:
@@ -68,10 +69,6 @@ class RigidPointModel(ObservationModel):
     def invert(self, state: Array, z: Array) -> Array:
         in_robot = self.space.transform(self.robot_from_sensor, self.locate(z))
         return self.space.transform(state, in_robot)
-
-    def mounting(self) -> Array:
-        """Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation."""
-        return self._mounting
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -145,8 +142,8 @@ class RangeBearing(RigidPointModel):
         from rbpf.sensors.range_bearing import kernels as compiled
 
         if self.dim == 2:
-            return FusedKernel(compiled.range_bearing_planar, self.mounting())
-        return FusedKernel(compiled.range_bearing_spatial, np.append(self.mounting(), self.pitch_sign))
+            return FusedKernel(compiled.range_bearing_planar, self.mounting)
+        return FusedKernel(compiled.range_bearing_spatial, np.append(self.mounting, self.pitch_sign))
 
 
 @final
@@ -176,4 +173,4 @@ class RelativePosition(RigidPointModel):
         from rbpf.sensors.range_bearing import kernels as compiled
 
         function = compiled.position_planar if self.dim == 2 else compiled.position_spatial
-        return FusedKernel(function, self.mounting())
+        return FusedKernel(function, self.mounting)

@@ -315,7 +315,7 @@ class Kerneled(Polar):
 
     def __init__(self, function, params=None) -> None:
         self.function = function
-        self.params = RangeBearing(SE2).mounting() if params is None else params
+        self.params = RangeBearing(SE2).mounting if params is None else params
 
     def jacobians(self, state, landmark=None, const=None, substate=None):
         return RangeBearing(SE2).jacobians(state, landmark)
@@ -342,7 +342,7 @@ def plain(*args):
 
 def kernels() -> dict[str, Kerneled]:
     sound = RangeBearing(SE2).kernel().function
-    turned = RangeBearing(SE2, np.array([0.5, 0.0, 0.0])).mounting()
+    turned = RangeBearing(SE2, np.array([0.5, 0.0, 0.0])).mounting
     outside = rf"Kerneled.kernel writes outside jac_landmark, which has shape \(2, 2, {BLOCK}\)"
     return {
         "Kerneled.kernel gives no fused kernel: decorate it with @observation_kernel": Kerneled(plain),
