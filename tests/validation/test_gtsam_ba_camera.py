@@ -10,8 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import KnownPoints
 from rbpf.sensors.readers.measurements import InitialEstimate
-from rbpf.validation.gtsam.camera import begin, solve_features
-from rbpf.validation.gtsam.camera_graph import CameraProblem, adjust
+from rbpf.validation.gtsam.camera import CameraProblem, adjust, begin, solve_features
 from rbpf.validation.gtsam.observations import known_by_name, observation_table
 from rbpf.validation.gtsam.solvers import marginals_by_schur
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene, solve_by_scipy

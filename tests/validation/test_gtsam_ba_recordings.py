@@ -15,8 +15,7 @@ from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measuremen
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
 from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
-from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.camera import CameraProblem, CameraState, solve_features
 from rbpf.validation.gtsam.observations import observation_table
 from rbpf.validation.gtsam.path_sampling import draw_posterior
 from rbpf.validation.gtsam.robot import Problem, solve

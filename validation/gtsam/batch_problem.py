@@ -21,8 +21,7 @@ from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam import robot
-from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.gtsam.camera_graph import FINE
+from rbpf.validation.gtsam.camera import FINE, solve_features
 from rbpf.validation.gtsam.observations import in_one_piece, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis

@@ -2,10 +2,28 @@
 
 The same measurements and the same noise as a filter had, without its samples and without its order in time.
 B. Triggs et al., "Bundle adjustment: a modern synthesis" (2000);
-F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
+F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017). The factors:
+
+    observations:  project(T⁻¹ l) − z ~ N(0, R), Huber's loss on request
+    known points:  l ~ N(m, P), exact ones a hard constraint
+    undetermined:  l ~ N(start, (d/4)² I) with d its distance, far wider than the pixels are across it
+    gauge:         without known points the first pose is held where it started; for one camera, a distance too
+
+The distance is that from the first camera to the one farthest from it at the start. The gauge only says which of many
+equal solutions is meant: it costs nothing at the optimum.
+
+GTSAM's own projection factors are taken where they are exactly our camera: Cal3DS2 has no k₃. Factors written in
+Python are evaluated all at once and handed out one by one, which makes them nearly as fast as GTSAM's.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, final
+
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
@@ -13,13 +31,267 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam import observations, solvers
-from rbpf.validation.gtsam.camera_graph import FINE, CameraProblem, CameraState, adjust, covariances
 
 LEAST = 3  #: Landmarks that fix a pose, and points that fix a frame.
 LINE = 1e-3  #: Known points whose spread across a line is below this fraction of that along it lie on it.
 POINTS = 4  #: That a frame has to see to be located.
 #: Frames after which a path that is found frame by frame is first adjusted, and its growth until the next time, a factor.
 FIRST, LONGER = 8, 1.2
+SCALE, SOFT_SCALE = 1e-6, 1e-3
+"""Standard deviation of the distance that holds the scale, as a fraction of it, at the end and on the way there.
+
+Nothing else speaks of the scale, but a hard one could only be followed along a curve.
+"""
+FINE = 1e-9  #: A gain of this fraction of the error is none; landmarks without much parallax would creep on for ever.
+WEAK = 0.25  #: Standard deviation of an undetermined landmark's prior, as a fraction of its distance.
+_ROUNDS = 10
+_FEW = 8
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """A point in the space of all variables: world_from_camera (T, 7), and the landmarks of the table (L, 3)."""
+
+    path: Array
+    points: Array
+
+
+@final
+class CameraProblem:
+    """Variables and factors of a recording of `frames` images; known points have a position and a covariance."""
+
+    def __init__(
+        self,
+        name: str,
+        frames: int,
+        table: observations.ObservationTable,
+        known: dict[int, tuple[Array, Array]],
+        robust: float | None = None,
+    ) -> None:
+        self.name, self.frames, self.table, self.known, self.robust = name, frames, table, known, robust
+        self.free = np.array([name not in known for name in table.names.tolist()], dtype=bool)
+        self.pose_keys = [int(gtsam.symbol("x", frame)) for frame in range(frames)]
+        self.point_keys = [int(gtsam.symbol("l", index)) for index in range(len(table.names))]
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the scale has to be held."""
+        return not self.known and not isinstance(self.table.camera, RectifiedStereo)
+
+    @property
+    def held_keys(self) -> list[int]:
+        """What hard constraints hold: known points without errors; without any known points, the first pose."""
+        if not self.known:
+            return [self.pose_keys[0]]
+        exact = {name for name, (_, cov) in self.known.items() if not cov.any()}
+        pairs = zip(self.table.names.tolist(), self.point_keys, strict=True)
+        return [key for name, key in pairs if name in exact]
+
+    def graph(
+        self,
+        start: CameraState,
+        loose: NDArray[np.bool_],
+        held: Array,
+        scale: float = SOFT_SCALE,
+        factors: list[Any] | None = None,
+    ) -> Any:
+        """All factors, or others than those of the observations.
+
+        Weak priors hold the `loose` landmarks (L,) where they are in `start`; the gauge holds at the path `held` (T, 7), and
+        the scale with a standard deviation as `SCALE` has it.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self.observation_factors() if factors is None else factors:
+            graph.push_back(factor)
+        names = self.table.names.tolist()
+        for name, key in zip(names, self.point_keys, strict=True):
+            if name in self.known:
+                position, cov = self.known[name]
+                model = solvers.noise(cov) if cov.any() else gtsam.noiseModel.Constrained.All(3)
+                graph.push_back(gtsam.PriorFactorPoint3(key, position, model))
+        distance = np.linalg.norm(start.points - observations.first_centres(self.table, start.path), axis=1)
+        for index in np.flatnonzero(loose).tolist():
+            model = gtsam.noiseModel.Isotropic.Sigma(3, WEAK * distance[index])
+            graph.push_back(gtsam.PriorFactorPoint3(self.point_keys[index], start.points[index], model))
+        if not self.known:
+            hard = gtsam.noiseModel.Constrained.All(6)
+            graph.push_back(gtsam.PriorFactorPose3(self.pose_keys[0], solvers.SPATIAL.pose(held[0]), hard))
+        if self.scaled:
+            distances = np.linalg.norm(SE3.translation(held) - SE3.translation(held[0]), axis=1)
+            far = int(np.argmax(distances))
+            if distances[far] == 0:
+                raise InputError(
+                    f"All initial poses of {self.name} are at one place: without known points a path has to tell the scale."
+                )
+            model = gtsam.noiseModel.Isotropic.Sigma(1, scale * distances[far])
+            keys = self.pose_keys[0], self.pose_keys[far]
+            graph.push_back(gtsam.RangeFactorPose3(*keys, distances[far], model))
+        return graph
+
+    def values(self, state: CameraState) -> Any:
+        """GTSAM's values of a state."""
+        values = gtsam.Values()
+        for key, pose in zip(self.pose_keys, state.path, strict=True):
+            values.insert(key, solvers.SPATIAL.pose(pose))
+        for key, point in zip(self.point_keys, state.points, strict=True):
+            values.insert(key, np.asarray(point))
+        return values
+
+    def state(self, values: Any) -> CameraState:
+        """The inverse of `values`; in the order of the keys, as GTSAM extracts all of a kind."""
+        rows = gtsam.utilities.extractPose3(values)
+        matrices = np.concatenate([rows[:, :9].reshape(-1, 3, 3), rows[:, 9:, None]], axis=-1)
+        points = np.asarray(gtsam.utilities.extractVectors(values, "l"))
+        return CameraState(SE3.normalise(SE3.from_matrix(matrices)), points.reshape(-1, 3))
+
+    def explaining(self) -> AbstractContextManager[None]:
+        """GTSAM's complaints in words."""
+        advice = "check the measurements there, or add known points"
+        return solvers.explaining(self.name, "frame", self.table.names, advice)
+
+    def observation_factors(self) -> list[Any]:
+        """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
+        camera, z = self.table.camera, self.table.z
+        if isinstance(camera, RectifiedStereo):
+            left = camera.camera
+            pair = gtsam.Cal3_S2Stereo(left.fx, left.fy, 0.0, left.cx, left.cy, camera.baseline_m)
+            return self.factors_by_row(
+                lambda row, model, pose, point: gtsam.GenericStereoFactor3D(
+                    gtsam.StereoPoint2(z[row, 0], z[row, 2], z[row, 1]), model, pose, point, pair
+                ),
+                order=[0, 2, 1],
+            )
+        intrinsics = camera.fx, camera.fy, 0.0, camera.cx, camera.cy
+        kind: Any
+        lens: Any
+        if camera.distortion_model == "equidistant":
+            kind = gtsam.GenericProjectionFactorCal3Fisheye
+            lens = gtsam.Cal3Fisheye(*intrinsics, *camera.distortion)
+        elif camera.lens.is_identity:
+            kind, lens = gtsam.GenericProjectionFactorCal3_S2, gtsam.Cal3_S2(*intrinsics)
+        elif camera.distortion[4] == 0.0:
+            kind = gtsam.GenericProjectionFactorCal3DS2
+            lens = gtsam.Cal3DS2(*intrinsics, *camera.distortion[:4])
+        else:
+
+            def evaluate(values: Any) -> observations.Residuals:
+                state = self.state(values)
+                return observations.reprojection(self.table, state.path, state.points)
+
+            factor = together(evaluate)
+            return self.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point], model))
+        return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
+
+    def factors_by_row(self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None) -> list[Any]:
+        """A factor of each row of the table, made of row, noise model with its loss, key of the pose and key of the landmark.
+
+        A factor's residual is ours[order]; by default ours.
+        """
+        models, out = dict[bytes, Any](), []
+        for row, (step, index) in enumerate(zip(self.table.steps.tolist(), self.table.index.tolist(), strict=True)):
+            cov = self.table.cov_z[row]
+            code = cov.tobytes()
+            if code not in models:
+                ordered = cov if order is None else cov[np.ix_(order, order)]
+                models[code] = solvers.huber(solvers.noise(ordered), self.robust)
+            out.append(make(row, models[code], self.pose_keys[step], self.point_keys[index]))
+        return out
+
+
+def together(evaluate: Callable[[Any], observations.Residuals]) -> Callable[[int, list[int], Any], Any]:
+    """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
+
+    GTSAM hands every factor the same object as long as Python holds it, as the loops of `solvers` do; an
+    optimiser that changes its values in place would be shown old residuals.
+    """
+    held: Any = None
+    found: observations.Residuals = np.empty(0), []
+
+    def factor(row: int, keys: list[int], model: Any) -> Any:
+        def error(factor: Any, values: Any, jacobians: Any) -> Array:
+            nonlocal held, found
+            if values is not held:
+                held, found = values, evaluate(values)
+            residuals, slopes = found
+            if jacobians is not None:
+                for place, slope in enumerate(slopes):
+                    jacobians[place] = slope[row]
+            return residuals[row]
+
+        return gtsam.CustomFactor(model, keys, error)
+
+    return factor
+
+
+class Adjusted(NamedTuple):
+    """An optimum, with the factors there."""
+
+    problem: CameraProblem  #: of which it is one, without the landmarks that had to be left out.
+    values: Any  #: GTSAM's.
+    graph: Any  #: likewise.
+    loose: NDArray[np.bool_]  #: (L,) landmarks with a weak prior.
+    iterations: int  #: in all.
+    converged: bool  #: whether it is one.
+
+    @property
+    def state(self) -> CameraState:
+        """The optimum in our storage."""
+        return self.problem.state(self.values)
+
+
+def adjust(
+    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: solvers.OnIteration | None = None
+) -> Adjusted:
+    """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
+
+    Those whose distance is open get a weak prior. One that an outlier has drawn into its camera is left out: there
+    it would explain any pixel, and hold up all others. An InputError names a variable that is not determined.
+    """
+
+    def run(graph: Any, state: CameraState, tolerance: float) -> tuple[Any, int, bool]:
+        most = _FEW if tolerance == solvers.ROUGH else solvers.ITERATIONS
+        with problem.explaining():
+            return solvers.levenberg_marquardt(graph, problem.values(state), tolerance, most, on_iteration)
+
+    state, weak, total, loose = start, start, 0, np.zeros(len(start.points), dtype=bool)
+    for round_ in range(_ROUNDS):
+        kept = ~(problem.free & observations.collapsed(problem.table, state.path, state.points))
+        if not kept.all():
+            table, loose = problem.table.rows(kept[problem.table.index]), loose[kept]
+            problem = CameraProblem(problem.name, problem.frames, table, problem.known, problem.robust)
+            state, weak = (replace(one, points=one.points[kept]) for one in (state, weak))
+        now = problem.free & observations.is_open(problem.table, state.path, state.points)
+        # The first judgement may be the start's fault; later ones only add, so that it comes to an end.
+        now = now if round_ < 2 else now | loose
+        settled = round_ > 0 and kept.all() and bool((now == loose).all())
+        if not settled:
+            weak = replace(state, points=observations.place(problem.table, state.path, state.points, now))
+            state, loose = weak, now
+        graph = problem.graph(weak, loose, start.path)
+        values, count, converged = run(graph, state, tolerance if settled else solvers.ROUGH)
+        state, total = problem.state(values), total + count
+        if settled and converged:
+            break
+    done = bool(settled and converged)
+    if problem.scaled:  # The same with the scale held as tightly as the covariances need it.
+        graph = problem.graph(weak, loose, start.path, SCALE)
+        values, count, converged = run(graph, state, tolerance)
+        total, done = total + count, done and converged
+    return Adjusted(problem, values, graph, loose, total, done)
+
+
+def covariances(found: Adjusted) -> tuple[Array, dict[int, Array]]:
+    """Marginal covariances of all poses (T, 6, 6) in the right chart, and of all landmarks, each (3, 3)."""
+    problem = found.problem
+    poses, points, names = problem.pose_keys, problem.point_keys, problem.table.names.tolist()
+    if not problem.scaled and len(poses) <= solvers.MOST_POSES:
+        keys = poses, points, problem.held_keys
+        of_poses, of_points = solvers.marginals_by_schur(found.graph, found.values, *keys, problem.name)
+        return of_poses, dict(zip(names, of_points, strict=True))
+    with problem.explaining():
+        blocks = solvers.marginals(found.graph, found.values, [*poses, *points])
+    return np.array(blocks[: len(poses)]), dict(zip(names, blocks[len(poses) :], strict=True))
 
 
 def solve_features(
@@ -85,7 +357,6 @@ def solve_features(
         cov_poses=cov_poses,
         cov_landmarks=cov_landmarks,
         error=found.graph.error(found.values),
-        iterations=found.iterations,
         undetermined=sorted({*full.names.tolist()} - {*names[~found.loose].tolist()}),
     )
 

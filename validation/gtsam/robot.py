@@ -59,9 +59,8 @@ def solve(
         else:
             values = problem.values(initial or initial_estimate(m))
         # Until the error stands; hard constraints of the odometry are softened first, and then Gauss-Newton's.
-        softened = 0
         if problem.null.any():
-            near, softened, _ = solvers.levenberg_marquardt(problem.graph(soft=True), values, solvers.ROUGH)
+            near, _, _ = solvers.levenberg_marquardt(problem.graph(soft=True), values, solvers.ROUGH)
             values, count, converged = solvers.gauss_newton(graph, near)
         else:
             values, count, converged = solvers.levenberg_marquardt(graph, values, solvers.EXACT)
@@ -75,9 +74,7 @@ def solve(
             found = solvers.marginals(graph, values, problem.pose_keys + problem.landmark_keys)
             cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(path)]])
             cov_landmarks = dict(zip(problem.names.tolist(), found[len(path) :], strict=True))
-        return solvers.BatchSolution(
-            path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count
-        )
+        return solvers.BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values))
 
 
 def solve_online(m: Measurements) -> Array:

@@ -47,7 +47,6 @@ class BatchSolution:
     #: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right about
     #: half the number of measured scalars less half that of the landmarks' coordinates.
     error: float
-    iterations: int  #: of the optimiser.
     #: of a camera's, ascending: names of the landmarks whose place the measurements do not tell: those seen in one frame by
     #: a single camera, and those that an outlier has drawn into its camera, which are both left out, and those whose
     #: distance is open for want of parallax, which have a weak prior.
