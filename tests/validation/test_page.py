@@ -16,8 +16,7 @@ from rbpf.cli import main
 from rbpf.runs.plots import World
 from rbpf.runs.provenance import command_of
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.report.page import digits, write_report
-from rbpf.validation.report.scene import program, scene
+from rbpf.validation.report.page import digits, program, scene, write_report
 from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 

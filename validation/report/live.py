@@ -68,12 +68,29 @@ class RunView:
     def show(self, run: Run, t: int, tracked: Tracked, image: np.ndarray | None) -> None:
         """Frame t of a run, what the system said of it, and its image, if there is one."""
         rr, stream, system = self.rr, self.stream, run.system
+        camera = _lens(system)
         if not self._next:
-            self._begin(run)
-            self._start_ns = tracked.stamp_ns
-        pose, cov, values = _pose_in_space(tracked), tracked.cov, tracked.values
+            self._next, self._start_ns = 1, tracked.stamp_ns
+            stream.send_blueprint(blueprint(run))
+            if camera is not None:
+                # Rerun's pixels start at a corner, not at a centre.
+                lens = rr.Pinhole(
+                    focal_length=[camera.fx, camera.fy],
+                    principal_point=[camera.cx + 0.5, camera.cy + 0.5],
+                    resolution=[camera.width, camera.height],
+                    camera_xyz=rr.ViewCoordinates.RDF,
+                    image_plane_distance=AXIS_M,
+                )
+                stream.log("world/camera", lens, static=True)
+            known = getattr(system, "known_points", None)
+            if known is not None:
+                stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
+            for name, colour in DRAWN.get(system.name, (None, {}))[1].items():
+                stream.log(f"plots/tracking/{name}", rr.SeriesLines(colors=[colour], names=[name]), static=True)
+        pose = in_space(np.zeros(1, dtype=np.int64), tracked.pose[None]).world_from_body[0]
+        cov, values = tracked.cov, tracked.values
         log_time(stream, t, tracked.stamp_ns - self._start_ns)
-        body = "camera" if _lens(system) is not None else "body"
+        body = "camera" if camera is not None else "body"
         log_pose(rr, stream, body, pose)
         if body == "body":
             stream.log("world/body", rr.TransformAxes3D(1.0))
@@ -121,27 +138,6 @@ class RunView:
             line = self.rr.LineStrips3D([moved.transform(true.positions)], colors=[TRUE])
             self.stream.log("world/truth", line, static=True)
 
-    def _begin(self, run: Run) -> None:
-        rr, stream = self.rr, self.stream
-        stream.send_blueprint(blueprint(run))
-        camera = _lens(run.system)
-        if camera is not None:
-            # Rerun's pixels start at a corner, not at a centre.
-            lens = rr.Pinhole(
-                focal_length=[camera.fx, camera.fy],
-                principal_point=[camera.cx + 0.5, camera.cy + 0.5],
-                resolution=[camera.width, camera.height],
-                camera_xyz=rr.ViewCoordinates.RDF,
-                image_plane_distance=AXIS_M,
-            )
-            stream.log("world/camera", lens, static=True)
-        known = getattr(run.system, "known_points", None)
-        if known is not None:
-            stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
-        for name, colour in DRAWN.get(run.system.name, (None, {}))[1].items():
-            stream.log(f"plots/tracking/{name}", rr.SeriesLines(colors=[colour], names=[name]), static=True)
-        self._next = 1
-
 
 def blueprint(run: Run) -> Any:
     """What the viewer shows where: the world, beside it the image if there is one, and the figures.
@@ -175,12 +171,6 @@ def _places(run: Run) -> np.ndarray:
     picture = run.system.picture()
     walls = picture.corner + picture.cell_m * (np.argwhere(picture.log_odds > 0.0)[:, ::-1] + 0.5)
     return np.pad(walls, ((0, 0), (0, 1)))
-
-
-def _pose_in_space(tracked: Tracked) -> np.ndarray:
-    """(7,) of a pose in the plane or in space."""
-    pose: np.ndarray = in_space(np.zeros(1, dtype=np.int64), tracked.pose[None]).world_from_body[0]
-    return pose
 
 
 def _lens(system: Any) -> Any:

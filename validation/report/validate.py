@@ -50,8 +50,7 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
 
 def _camera_colmap(record: RunFolder) -> Comparison:
     """A run over images beside COLMAP's reconstruction of every n-th."""
-    from rbpf.validation.colmap.compare import compare_folder_with_colmap
-    from rbpf.validation.colmap.reconstruct import ReconstructionOptions
+    from rbpf.validation.colmap.compare import ReconstructionOptions, compare_folder_with_colmap
     from rbpf.validation.report.comparison_pictures import plot_against_colmap
 
     every = max(ReconstructionOptions().every, -(-len(record.path.world_from_body) // KEY_FRAMES))
