@@ -11,8 +11,7 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import MonoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.colmap.compare import compare_with_colmap
-from rbpf.validation.colmap.reconstruct import ReconstructionOptions
+from rbpf.validation.colmap.compare import ReconstructionOptions, compare_with_colmap
 from rbpf.validation.exports import export_colmap, export_ply
 from rbpf.validation.report.comparison_pictures import plot_against_colmap
 from rbpf.validation.simulation.desk_and_room import TexturedDesk

@@ -16,7 +16,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import read_tum
-from rbpf.validation.colmap.reconstruct import ReconstructionOptions
+from rbpf.validation.colmap.compare import ReconstructionOptions
 from tests.cli.mono_sequences import sentence
 from tests.cli.run_outputs import BATCH, FILES, OF_CAMERAS, REQUIRED, names, outputs, untimed_summary
 from tests.cli.stereo_sequences import FRAMES, run
@@ -140,7 +140,7 @@ def test_a_run_is_compared_with_a_reconstruction(finished, tmp_path, monkeypatch
     """The baseline tells the scale; so few pairs must all be key frames, and begin with a smaller angle."""
     importlib.import_module("rbpf.validation.colmap.compare")  # names the class as the type of an argument
     near = ReconstructionOptions(every=1, features=800, least_angle_deg=4.0)
-    monkeypatch.setattr("rbpf.validation.colmap.reconstruct.ReconstructionOptions", lambda **_: near)
+    monkeypatch.setattr("rbpf.validation.colmap.compare.ReconstructionOptions", lambda **_: near)
     folder = shutil.copytree(finished, tmp_path / "run")
     assert main(["validate", str(folder), "--against", "colmap"]) == 0
     assert "(rms) from COLMAP's reconstruction" in " ".join(capsys.readouterr().err.split())

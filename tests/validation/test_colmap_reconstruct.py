@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 
 from rbpf.errors import InputError
@@ -14,14 +15,16 @@ from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import open_images
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.compare import (
+    Reconstruction,
+    ReconstructionOptions,
     cloud_distance,
     compare_folder_with_colmap,
     compare_with_colmap,
     compare_with_path,
     compare_with_truth,
+    reconstruct,
 )
 from rbpf.validation.colmap.model import HALF_PX, to_colmap_camera
-from rbpf.validation.colmap.reconstruct import Reconstruction, ReconstructionOptions, reconstruct
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems import plane_sequences
@@ -51,8 +54,8 @@ def made(points=None, metric=False, scale=1.0):
     poses[:, 4:] *= scale
     cloud = rng.uniform(-1, 1, (200, 3)) * scale if points is None else points
     count = np.arange(8)
-    zeros = np.zeros(len(cloud))
-    return Reconstruction("by hand", count, count, 1_000 * count, poses, cloud, zeros, zeros.astype(int), metric, None)
+    model = pycolmap.Reconstruction()
+    return Reconstruction("by hand", count, count, 1_000 * count, poses, cloud, metric, model)
 
 
 @pytest.mark.slow
