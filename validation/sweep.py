@@ -50,20 +50,12 @@ Row = dict[str, Any]
 Named = tuple[tuple[str, str], ...]
 
 
-@dataclass(frozen=True)
-class SweepSystem:
-    """A system that a sweep can run."""
-
-    recording: Callable[..., recordings.Recording]  #: opens a sequence, from the paths of its fields.
-    fields: tuple[str, ...] = ("recording",)  #: of a sequence, each a path; the first is the recording itself.
-
-
-#: By their names.
-SYSTEMS = {
-    "range-bearing": SweepSystem(recordings.RobotRecording),
-    "laser": SweepSystem(recordings.LaserRecording),
-    "mono": SweepSystem(recordings.MonoRecording, ("recording", "known_points", "calibration")),
-    "stereo": SweepSystem(recordings.StereoRecording, ("recording", "calibration")),
+#: By their names what opens a sequence, and its fields, each a path that this takes; the first is the recording itself.
+SYSTEMS: dict[str, tuple[Callable[..., recordings.Recording], tuple[str, ...]]] = {
+    "range-bearing": (recordings.RobotRecording, ("recording",)),
+    "laser": (recordings.LaserRecording, ("recording",)),
+    "mono": (recordings.MonoRecording, ("recording", "known_points", "calibration")),
+    "stereo": (recordings.StereoRecording, ("recording", "calibration")),
 }
 
 
@@ -134,7 +126,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     """All runs of a sweep; paths are taken from a folder. Errors as `read_plan`."""
     if file.system not in SYSTEMS:
         raise InputError(f"a sweep runs one of the systems {', '.join(SYSTEMS)}, not {file.system!r}")
-    sequences = [_sequence(given, SYSTEMS[file.system].fields, folder, where) for given in file.sequences]
+    sequences = [_sequence(given, SYSTEMS[file.system][1], folder, where) for given in file.sequences]
     seeds: Sequence[int] = range(file.seeds) if isinstance(file.seeds, int) else file.seeds  # a range takes no room
     for what, values in (("sequences", sequences), ("seeds", seeds), ("options", list(file.options))):
         if not values:
@@ -198,8 +190,14 @@ def sweep(
                 told(sum(job.key in done for job in jobs), len(jobs))
     finally:
         rows = [job.facts() | done[job.key]["figures"] for job in jobs if job.key in done]
-        # One line per row; a figure that a run does not have is left empty.
-        flat = [_flat(row) for row in rows]
+        # One line per row, figures within figures as NAME.INNER; one that a run does not have is left empty.
+        flat: list[Row] = [{} for _ in rows]
+        for out_row, row in zip(flat, rows, strict=True):
+            for name, value in row.items():
+                if isinstance(value, dict):
+                    out_row |= {f"{name}.{inner}": item for inner, item in value.items()}
+                else:
+                    out_row[name] = json.dumps(value) if isinstance(value, list) else value
         names = list(dict.fromkeys(name for row in flat for name in row))
         write_csv(out / TABLE, names, [[row.get(name, "") for name in names] for row in flat])
     return rows
@@ -231,11 +229,11 @@ def run_job(job: Job) -> Row:
     """One run, with one thread: the processes keep the machine busy."""
     import numba
 
-    system, paths = SYSTEMS[job.system], {name: Path(path) for name, path in job.sequence}
+    (recording, names), paths = SYSTEMS[job.system], {name: Path(path) for name, path in job.sequence}
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        figures = _figures(recordings.filter_recording(system.recording(*map(paths.get, system.fields)), job.config()))
+        figures = _figures(recordings.filter_recording(recording(*map(paths.get, names)), job.config()))
     except InputError as error:
         figures = {"failure": str(error)}
     finally:
@@ -281,13 +279,3 @@ def _results(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterat
         parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
         with closing(parallel(delayed(run_job)(job) for job in jobs)) as rows:
             yield from rows
-
-
-def _flat(row: Row) -> Row:
-    out: Row = {}
-    for name, value in row.items():
-        if isinstance(value, dict):
-            out.update({f"{name}.{inner}": item for inner, item in value.items()})
-        else:
-            out[name] = json.dumps(value) if isinstance(value, list) else value
-    return out

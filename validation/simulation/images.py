@@ -23,7 +23,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_ranges
-from rbpf.runs.files import OnDone, write_csv, write_text
+from rbpf.runs.files import OnDone, prepare_folder, write_csv, write_text
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import camera_text
 from rbpf.validation.simulation.paths import Wave
@@ -216,10 +216,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         raise InputError(f"{folder} exists already: delete it or choose another folder for the images")
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
-    try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {partial} for the images: {error.strerror}") from error
+    prepare_folder(partial)
     try:
         yield partial
         partial.replace(folder)
