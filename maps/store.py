@@ -13,7 +13,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import integers, numbers, read, read_one
-from rbpf.core.genealogy import DUE, Lineage, Schedule
+from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.ranges import require_memory
@@ -24,7 +24,6 @@ _TABLES = {
     "ids": integers("landmarks", least=0, below="ids"),
     "fields": integers("landmarks", least=1),
     "generation": integers("landmarks", least=0, below="generations"),
-    "due": DUE,
 }
 _HOT = {"data": numbers("fields", "n", values="log")}
 _COLD = {"kept": integers("kept", least=0, below="n", ascending=True), "data": numbers("fields", "kept", values="log")}
@@ -267,7 +266,6 @@ class SharedStore:
         self.columns = Columns()
         self._cold: dict[int, Cold] = {}
         self._members: dict[int, set[int]] = {}
-        self._schedule = Schedule()
         self._survivors: dict[int, int] = {}
 
     @property
@@ -375,13 +373,12 @@ class SharedStore:
 
     def compact(self) -> None:
         """After a resampling: shrinks the columns whose writers have lost half their lineages; amortised O(1)."""
-        now = self.lineage.generation
-        for generation in self._schedule.pop(now):
-            members = self._members.get(generation)
-            if not members:
+        for generation in self.lineage.due():
+            members, before = self._members.get(generation), self._survivors.get(generation, self.n)
+            if not members or before == 1:
                 continue
             alive = self.lineage.survivors(generation)
-            if alive.size <= COLD_FRACTION * self._survivors.get(generation, self.n):
+            if alive.size <= COLD_FRACTION * before:
                 self._survivors[generation] = alive.size
                 for column in members:
                     row, cold = self.columns.row(column), self._cold.get(column)
@@ -393,8 +390,6 @@ class SharedStore:
                         self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))
                         pool.give(self.columns.slab[row : row + 1])
                         self.columns.slab[row] = -1
-            if alive.size > 1:
-                self._schedule.add(generation, now)
 
     @property
     def stored_bytes(self) -> int:
@@ -414,7 +409,6 @@ class SharedStore:
             "store/ids": ids,
             "store/fields": self.columns.fields[: ids.size].copy(),
             "store/generation": self.columns.generation[: ids.size].copy(),
-            "store/due": self._schedule.array(),
         }
         for row, column in enumerate(ids.tolist()):
             cold = self._cold.get(column)
@@ -449,7 +443,6 @@ class SharedStore:
             if np.setdiff1d(alive, cold.kept).size:
                 raise InputError(f"the array {name}kept lacks particles that have descendants")
             self._cold[column] = cold
-        self._schedule = Schedule.of(found["due"])
 
     def _pool(self, row: int) -> Pool:
         fields = int(self.columns.fields[row])
@@ -485,7 +478,6 @@ class SharedStore:
         if members is None:
             members = self._members[generation] = set()
             self.lineage.retain(generation)
-            self._schedule.add(generation, generation)
         members.update(columns)
 
     def _leave(self, generation: int, columns: list[int]) -> None:

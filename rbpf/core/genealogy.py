@@ -5,7 +5,8 @@ row of the particle that wrote it, and read back through `Lineage.rows`. Resampl
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import accumulate, repeat, takewhile
 
 import numpy as np
 
@@ -16,10 +17,9 @@ from rbpf.kernels import forest
 from rbpf.kernels.forest import CHILDREN, GENERATION, ROW
 from rbpf.ranges import require_memory
 
-#: Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time.
-_FIRST_CHECK = 4
+#: Ages in generations at which what is stored is looked through for dead rows: each a quarter above the one before.
+_AGES = tuple(takewhile(lambda age: age < 2**62, accumulate(repeat(4), lambda age, least: age + max(least, age // 4))))
 _MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
-DUE = integers("due", 2, least=0)  #: Of a `Schedule`.
 
 _COLUMNS = "parent", "children", "generation", "row"
 _NO_NODE = np.array([-1, 0, -1, 0])
@@ -105,6 +105,10 @@ class Lineage:
         # A node that died is free, or serves a later generation.
         nodes = self._members[generation] = nodes[self._nodes[nodes, GENERATION] == generation]
         return np.asarray(self._nodes[nodes, ROW])
+
+    def due(self) -> list[int]:
+        """Past generations whose rows are worth compacting now: at ages growing by a quarter, as lineages coalesce."""
+        return [self.generation - age for age in takewhile(self.generation.__ge__, _AGES)][::-1]
 
     def distinct(self, generation: int) -> int:
         """Number of particles of a retained generation that still have descendants."""
@@ -198,31 +202,6 @@ class Lineage:
 
 
 @dataclass
-class Schedule:
-    """When each generation's rows are next worth compacting: at ages growing by a quarter, as lineages coalesce."""
-
-    due: dict[int, set[int]] = field(default_factory=dict)
-
-    def add(self, generation: int, now: int) -> None:
-        """Looks again when the generation is older by a quarter."""
-        self.due.setdefault(now + max(_FIRST_CHECK, (now - generation) // 4), set()).add(generation)
-
-    def pop(self, now: int) -> list[int]:
-        return sorted(self.due.pop(now, ()))
-
-    def array(self) -> np.ndarray:
-        pairs = [(when, g) for when in sorted(self.due) for g in sorted(self.due[when])]
-        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
-
-    @classmethod
-    def of(cls, pairs: np.ndarray) -> "Schedule":
-        schedule = cls()
-        for when, generation in pairs:
-            schedule.due.setdefault(int(when), set()).add(int(generation))
-        return schedule
-
-
-@dataclass
 class PathBlock:
     """Poses of one generation: `states` (T, n, E) at the rows `kept` (n,); log-weights where clouds are kept."""
 
@@ -247,7 +226,6 @@ class History:
         self.lag = lag
         self.clouds = clouds
         self._blocks: dict[int, PathBlock] = {}
-        self._schedule = Schedule()
         self._steps = 0
 
     def record(self, stamp_ns: int, state: np.ndarray, log_weights: np.ndarray) -> None:
@@ -262,20 +240,16 @@ class History:
         if block is None:
             block = self._blocks[now] = PathBlock(now, np.arange(state.shape[0]), [], [], [])
             self.lineage.retain(now)
-            if not self.clouds:
-                self._schedule.add(now, now)
             # Blocks whose lineages have coalesced shrink to the rows that still have descendants.
-            for generation in self._schedule.pop(now):
+            for generation in [] if self.clouds else self.lineage.due():
                 past = self._blocks.get(generation)
-                if past is None:
+                if past is None or past.kept.size == 1:
                     continue
                 alive = self.lineage.survivors(generation)
                 if 2 * alive.size <= past.kept.size:
                     rows = np.searchsorted(past.kept, alive)
                     past.states = [states[rows] for states in past.states]
                     past.kept = alive
-                if alive.size > 1:
-                    self._schedule.add(generation, now)
         block.stamps_ns.append(stamp_ns)
         block.states.append(state.copy())
         if self.clouds:
@@ -324,13 +298,11 @@ class History:
             out[f"history/{number}/stamps_ns"] = np.array(block.stamps_ns, dtype=np.int64)
             out[f"history/{number}/states"] = np.array(block.states)
             out[f"history/{number}/log_weights"] = np.array(block.log_weights)
-        out["history/due"] = self._schedule.array()
         return out
 
     def restore(self, arrays: dict[str, np.ndarray], size: int | None = None) -> None:
         """The inverse of `arrays`, of states of so many numbers; errors as `rbpf.core.checkpoint.read`."""
         self._blocks = {}
-        self._schedule = Schedule.of(read_one(arrays, "history/due", DUE))
         generations = read_one(arrays, "history/generations", integers("blocks", ascending=True)).tolist()
         shape = ("steps", "n") if self.clouds else (0,)
         block = {**_BLOCK, "log_weights": numbers(*shape, values="log")}

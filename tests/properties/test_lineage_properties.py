@@ -153,11 +153,9 @@ def test_a_fixed_lag_takes_constant_memory(rate):
             lineage.advance(np.sort(rng.integers(0, n, n)))
         history.record(t, np.zeros((n, 3)), np.zeros(n))
         if t % 20 == 0:
-            arrays = lineage.arrays() | history.arrays()
-            sizes.append((history.stored_states, len(history.blocks), len(arrays["history/due"]), lineage.nodes))
-    states, blocks, due, nodes = np.max(sizes, axis=0)
+            sizes.append((history.stored_states, len(history.blocks), lineage.nodes))
+    states, blocks, nodes = np.max(sizes, axis=0)
     assert states <= lag * n
     assert blocks <= lag + 1
-    assert due <= 2 * lag + 4
     assert nodes <= 16 * n
     assert lineage.arrays()["lineage/parent"].size <= 16 * n
