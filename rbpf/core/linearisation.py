@@ -3,6 +3,8 @@
 Shapes: N particles, K observations, p rows, d increment, D landmark. `mask` (N, K): who took an observation; None is all.
 """
 
+from typing import Any
+
 import numpy as np
 
 from rbpf import gaussian
@@ -18,82 +20,61 @@ _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 
 
 def numeric_jacobians(
-    model: ObservationModel,
-    space: LieGroup,
-    state: np.ndarray,
-    landmark: np.ndarray | None = None,
-    const: np.ndarray | None = None,
-    substate: np.ndarray | None = None,
-    by: frozenset[Part] = EVERYTHING,
+    model: ObservationModel, space: LieGroup, *read: Any, by: frozenset[Part] = EVERYTHING
 ) -> Jacobians:
     """Central differences of −ν for z = h, in the right chart at the state; `model.residual` wraps.
 
-    Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
+    What is `read` are the arguments of `model.predict`, or the first of them. Differences by a part that `by` does not name
+    are left out: each costs two predictions per coordinate.
     """
-    plus_minus = np.array([STEP, -STEP])
+    read = (*read, None, None, None)[:4]
+    steps = np.array([STEP, -STEP])
     constrains = type(model).innovation is not ObservationModel.innovation
-    z = model.predict(state, landmark, const, substate) if constrains else None
-
-    def differences(state: Array, landmark: Array | None, const: Array | None, substate: Array | None) -> np.ndarray:
+    z = model.predict(*read) if constrains else None
+    blocks = list[np.ndarray | None]()
+    for part, number in (Part.STATE, 0), (Part.LANDMARK, 1), (Part.SUBSTATE, 3):
+        if (at := read[number]) is None or part not in model.reads & by:
+            blocks.append(None)
+            continue
+        dim = space.dim if part == Part.STATE else at.shape[-1]
+        offsets = (steps[:, None, None] * np.eye(dim)).reshape(2, dim, *(1,) * (at.ndim - 1), dim)
+        moved = space.retract(at, offsets) if part == Part.STATE else at + offsets
+        arguments = (*read[:number], moved, *read[number + 1 :])
         if z is not None:
-            nu = model.innovation(z, state, landmark, const, substate)
+            nu = model.innovation(z, *arguments)
             difference = nu[1] - nu[0]
         else:  # half as many residuals
-            difference = model.residual(*model.predict(state, landmark, const, substate))
-        return np.moveaxis(difference, 0, -1) / (2 * STEP)
-
-    def perturbed(x: np.ndarray) -> np.ndarray:
-        steps = plus_minus[:, None, None] * np.eye(x.shape[-1])
-        return x + steps.reshape(2, x.shape[-1], *(1,) * (x.ndim - 1), x.shape[-1])
-
-    state_part = landmark_part = substate_part = None
-    wanted = model.reads & by
-    if Part.STATE in wanted:
-        steps = plus_minus[:, None, None] * np.eye(space.dim)
-        moved = space.retract(state, steps.reshape(2, space.dim, *(1,) * (state.ndim - 1), space.dim))
-        state_part = differences(moved, landmark, const, substate)
-    if landmark is not None and Part.LANDMARK in wanted:
-        landmark_part = differences(state, perturbed(landmark), const, substate)
-    if substate is not None and Part.SUBSTATE in wanted:
-        substate_part = differences(state, landmark, const, perturbed(substate))
-    return Jacobians(state_part, landmark_part, substate_part)
+            difference = model.residual(*model.predict(*arguments))
+        blocks.append(np.moveaxis(difference, 0, -1) / (2 * STEP))
+    return Jacobians(*blocks)
 
 
 def linearise(
-    model: ObservationModel,
-    space: LieGroup,
-    z: np.ndarray,
-    state: np.ndarray,
-    landmark: np.ndarray | None = None,
-    const: np.ndarray | None = None,
-    substate: np.ndarray | None = None,
-    by: frozenset[Part] = EVERYTHING,
+    model: ObservationModel, space: LieGroup, z: np.ndarray, *read: Any, by: frozenset[Part] = EVERYTHING
 ) -> tuple[np.ndarray, Jacobians]:
-    """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), substates (N, 1, m).
+    """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), constants (N, K, A), substates (N, 1, m).
 
-    Numeric Jacobians by a part that `by` does not name are left out. Raises InputError: a result has the wrong shape.
+    These are what is `read`, as `numeric_jacobians` takes it. Raises InputError: a result has the wrong shape.
     """
-    nu = model.innovation(z, state, landmark, const, substate)
-    parts = (state, landmark, substate)
+    state, landmark, _, substate = read = (*read, None, None, None)[:4]
+    nu, name, parts = model.innovation(z, *read), type(model).__name__, (state, landmark, substate)
     if nu.dtype != np.float64:
-        nu = numbers(nu, f"{type(model).__name__}.predict or its residual")
+        nu = numbers(nu, f"{name}.predict or its residual")
     expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
     if nu.shape != np.broadcast_shapes(expected, z.shape):
-        raise InputError(f"{type(model).__name__}.predict returned shape {nu.shape}, expected {expected}")
-    jacobians = model.jacobians(state, landmark, const, substate)
-    if jacobians is None:
-        jacobians = numeric_jacobians(model, space, state, landmark, const, substate, by)
+        raise InputError(f"{name}.predict returned shape {nu.shape}, expected {expected}")
+    jacobians = model.jacobians(*read) or numeric_jacobians(model, space, *read, by=by)
     sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
     blocks: list[np.ndarray | None] = []
     for block, size in zip(jacobians, sizes, strict=True):
         # A constant block may come without its leading axes.
         try:
             if block is not None and block.dtype != np.float64:
-                block = numbers(block, f"{type(model).__name__}.jacobians")
+                block = numbers(block, f"{name}.jacobians")
             blocks.append(None if block is None else np.broadcast_to(block, (*expected, size)))
         except ValueError as error:
             shape = None if block is None else block.shape
-            found = f"{type(model).__name__}.jacobians returned a block of shape {shape}"
+            found = f"{name}.jacobians returned a block of shape {shape}"
             raise InputError(f"{found}, expected {(*expected, size)}") from error
     return nu, Jacobians(*blocks)
 

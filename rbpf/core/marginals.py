@@ -223,9 +223,7 @@ class KalmanSubstate(Conditional):
                     f"{type(group.model).__name__} reads the substate: its likelihood must be Gaussian, "
                     f"not {type(group.likelihood).__name__}"
                 )
-            nu, jacobians = linearise(
-                group.model, self.space, group.z, state[:, None, :], substate=substate[:, None, :]
-            )
+            nu, jacobians = linearise(group.model, self.space, group.z, state[:, None], None, None, substate[:, None])
             assert jacobians.substate is not None
             by_state = np.zeros((1, 1, 1, 1)) if jacobians.state is None else jacobians.state
             blocks = ((by_state, self.space.dim), (jacobians.substate, m))

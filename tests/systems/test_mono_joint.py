@@ -264,7 +264,7 @@ def test_slopes_by_the_calibration(camera):
     about, tuned = np.zeros(10), np.concatenate([rng.normal(size=6), [0.02, 0.01, 0.01, -0.02]])
     model = CameraPoint(camera, about=about)
     slope = model.jacobians(state, point, None, about).substate
-    numeric = numeric_jacobians(model, SE3, state, point, None, np.tile(about, (6, 1)), frozenset({Part.SUBSTATE}))
+    numeric = numeric_jacobians(model, SE3, state, point, None, np.tile(about, (6, 1)), by=frozenset({Part.SUBSTATE}))
     np.testing.assert_allclose(slope, numeric.substate, atol=1e-4)
     seen = CameraPoint(camera.tuned(tuned[6:])).predict(state, point)
     predicted = model.predict(state, point, None, tuned)
