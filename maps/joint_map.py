@@ -41,7 +41,7 @@ from rbpf.core.models import (
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import expect_group
-from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
+from rbpf.lie import Array, Euclidean, LieGroup, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.present import Present
 from rbpf.maps.joint.rows import (
@@ -59,7 +59,7 @@ from rbpf.maps.joint.rows import (
 from rbpf.maps.joint.solution import Given, SubMap
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
-from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations, projected
+from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
@@ -591,17 +591,7 @@ class JointMap(Map):
     ) -> tuple[np.ndarray, Jacobians, Records]:
         return innovations(model, self.space, z, state, self.read(ids, slice(particle, particle + 1)), self.compiled)
 
-    def predictions(
-        self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
-    ) -> tuple[np.ndarray, np.ndarray]:
-        predicted, inside = self._expected(model, ids, belief)
-        return model.residual(z[:, None, :], predicted[:, None]), inside[:, None] + cov[:, None]
-
-    def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        return projected(model, *self._expected(model, ids, belief), belief)
-
-    def _expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        """As `expected`."""
+    def expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         kind, prior = self.held.of_one_kind(np.asarray(ids)), belief.prior
         kernel = self.held.kernel(model, kind) if self.compiled else None
         if kernel is None:
@@ -613,9 +603,7 @@ class JointMap(Map):
         expect_group(kernel.function.address, kernel.params, state, mean, *held, cov, root, predicted, within)
         return predicted, within
 
-    def project_jointly(
-        self, model: ObservationModel, ids: np.ndarray, belief: Belief
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def project_jointly(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[Array, Array]:
         """`project`, with what the landmarks have in common: mean (K, p) and covariance (K p, K p)."""
         mode = slice(belief.mode, belief.mode + 1)
         records = self.read(ids, mode)

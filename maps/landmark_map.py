@@ -157,11 +157,8 @@ class LandmarkMap(Map):
             model, self.space, z, state, self.read(ids, slice(particle, particle + 1)), self.compiled
         )
 
-    def predictions(
-        self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
-    ) -> tuple[np.ndarray, np.ndarray]:
-        predicted, within = rows.expected(model, self.read(ids), belief)
-        return model.residual(z[:, None, :], predicted[:, None]), within[:, None] + cov[:, None]
+    def expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+        return rows.expected(model, self.read(ids), belief)
 
     def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
         """Whether `project` runs compiled for landmarks (K,) of one parametrisation."""
@@ -186,7 +183,7 @@ class LandmarkMap(Map):
             fused = kernel.function.address, kernel.params, state
             project(fused, access, anchor, weights, spread, sizes, mean, cov)
             return anchor + mean, cov
-        return rows.projected(model, *rows.expected(model, self.read(ids), belief), belief)
+        return super().project(model, ids, belief)
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         if not self.evidence:

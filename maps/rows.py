@@ -384,7 +384,7 @@ def _likelihood(group: Observations) -> Likelihood:
 
 
 def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-    """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
+    """As `Map.expected`, of their records."""
     prior, state = belief.prior, belief.state[:, None, :]
     predicted = model.predict(state, records.mean, records.const)
     _, (by_state, by_landmark, _) = linearise(model, prior.space, predicted, state, records.mean, records.const)
@@ -392,16 +392,6 @@ def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple
     moved = by_state @ prior.spread(prior.mean)[:, None]
     within = by_landmark @ records.cov @ np.swapaxes(by_landmark, -1, -2)
     return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
-
-
-def projected(
-    model: ObservationModel, predicted: np.ndarray, within: np.ndarray, belief: Belief
-) -> tuple[np.ndarray, np.ndarray]:
-    """The moments (K, p), (K, p, p) of all particles' expectations together, see `expected` and `Belief.project`."""
-    # Relative to the particle of highest weight, so that angles need not be wrapped.
-    mode = predicted[belief.mode]
-    mean, cov = gaussian.mixture_moments(belief.weights, model.residual(predicted, mode), within)
-    return mode + mean, cov
 
 
 def checked_new_ids(

@@ -16,6 +16,7 @@ from rbpf.core.particles import Information, weighted_mean
 from rbpf.errors import InputError
 from rbpf.kernels.dense import add_gram, add_inner, congruent, gather, mirror, product
 from rbpf.kernels.landmarks import linearise_group
+from rbpf.lie import Array
 from rbpf.maps.joint.columns import JointColumns, Kind
 from rbpf.maps.rows import GAUSSIAN
 
@@ -168,9 +169,7 @@ class Reading:
             for one, two in zip(groups, self._groups, strict=True)
         )
 
-    def rows(
-        self, groups: Sequence[Observations], state: np.ndarray, mean: np.ndarray, origin: np.ndarray | None
-    ) -> Rows:
+    def rows(self, groups: Sequence[Observations], state: np.ndarray, mean: np.ndarray, origin: Array | None) -> Rows:
         """Linearises all groups, at states (N, E) and the particles' own means (N, n).
 
         Jacobians by what is held are averaged over the particles. `origin` is None where nothing may be observed in the

@@ -20,7 +20,7 @@ from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
-from rbpf.lie import Euclidean, SE2Group, SE3Group
+from rbpf.lie import Array, Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.solution import CLOSE_ENOUGH, EXACT, ITERATIONS, Given, Solution, SubMap, fused, inverse_of, solve
 
@@ -118,9 +118,7 @@ class SubMaps:
             self.frame = self.end(present)
             self.beside = self._about(present) if self.unnamed else None
 
-    def widened(
-        self, held: JointColumns, mean: np.ndarray, cov: np.ndarray
-    ) -> tuple[JointColumns, np.ndarray, np.ndarray]:
+    def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
         """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
         if (found := self.beside) is None:
             return held, mean, cov
@@ -374,9 +372,7 @@ class SubMaps:
             rotation = space.rotation(end)
             by_turned = rotation @ space.transform_jacobian(seen) @ space.right_jacobian(x[turned])
 
-            def moved_by(
-                columns: np.ndarray, rotation: np.ndarray = rotation, by: np.ndarray = by_turned
-            ) -> np.ndarray:
+            def moved_by(columns: np.ndarray, rotation: Array = rotation, by: Array = by_turned) -> Array:
                 off = columns[of_mine] - rotation @ columns[of_its] - by @ columns[turned]
                 return off.reshape(-1, columns.shape[1])
 

@@ -30,9 +30,15 @@ STEP = float(np.finfo(float).eps) ** (1 / 3)
 Control = TypeVar("Control", contravariant=True)  #: What a motion model moves by, as odometry.
 Frame = TypeVar("Frame", contravariant=True)  #: What a sensor takes, as an image.
 RigidSpace = SE2Group | SE3Group | Euclidean  #: Poses that points are seen from; of Euclidean(n), places.
+#: What all particles have: states, weights or densities, increments, substates.
+AllStates = Float[np.ndarray, "N E"]
+OfAll = Float[np.ndarray, " N"]
+Increments = Float[np.ndarray, "N d"]
+AllSubstates = Float[np.ndarray, "N m"]
 #: What is observed, with leading axes that broadcast: states, landmarks, their constants and substates.
 States = Float[np.ndarray, "*#batch E"]
-Means = Float[np.ndarray, "*#batch D"] | None
+Estimates = Float[np.ndarray, "*#batch D"]
+Means = Estimates | None
 Constants = Float[np.ndarray, "*#batch A"] | None
 Substates = Float[np.ndarray, "*#batch m"] | None
 Measured = Float[np.ndarray, "*#batch p"]
@@ -42,6 +48,8 @@ Covariances = Float[np.ndarray, "*#batch p p"]
 Ids = Int[np.ndarray, " K"]
 Z = Float[np.ndarray, "K p"]
 CovZ = Float[np.ndarray, "K p p"]
+Expected = tuple[Float[np.ndarray, "N K p"], Float[np.ndarray, "N K p p"]]  #: Of K landmarks in all particles.
+Some = Int[np.ndarray, " n"] | slice  #: Of the particles.
 Moments = tuple[Float[np.ndarray, "*K D"], Float[np.ndarray, "*K d d"]]
 
 NULL = -1  #: An observation that a particle takes as clutter.
@@ -71,7 +79,7 @@ class Transition:
     Mathematics (substate). Arrays may have a first axis of length 1 where they do not differ between particles.
     """
 
-    mean: Float[np.ndarray, "N E"]  #: (N, E) chart's origin, x_t = mean · Exp(ε).
+    mean: AllStates  #: (N, E) chart's origin, x_t = mean · Exp(ε).
     #: (N or 1, joint = d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
     noise_factor: Float[np.ndarray, "#N joint r"]
     coupling: Float[np.ndarray, "#N d m"] | None = None  #: B, (N or 1, d, m); None where there is no substate.
@@ -151,8 +159,8 @@ class NewLandmarks:
 class LogDensities(NamedTuple):
     """log p(z | x) (N,) of all observations, and of those that could enter only after sampling."""
 
-    all: Float[np.ndarray, " N"]
-    after_sampling: Float[np.ndarray, " N"]
+    all: OfAll
+    after_sampling: OfAll
 
 
 class MotionModel(ABC, Generic[Control]):
@@ -164,27 +172,23 @@ class MotionModel(ABC, Generic[Control]):
 
     space: LieGroup
 
-    def sample(
-        self, state: Float[np.ndarray, "N E"], control: Control, dt: float, rng: np.random.Generator
-    ) -> Float[np.ndarray, "N E"]:
+    def sample(self, state: AllStates, control: Control, dt: float, rng: np.random.Generator) -> AllStates:
         """States (N, E) drawn from any distribution given those before (N, E); by default they stay as they are."""
         return state
 
-    def transition(self, state: Float[np.ndarray, "N E"], control: Control, dt: float) -> Transition:
+    def transition(self, state: AllStates, control: Control, dt: float) -> Transition:
         """Gaussian of the next state, given states (N, E), a control and a time step in seconds; they come from `sample`.
 
         Its noise may depend on the state. By default nothing moves any more.
         """
         return Transition(state, np.zeros((1, self.space.dim, 0)))
 
-    def transition_given(
-        self, state: Float[np.ndarray, "N E"], substate: Float[np.ndarray, "N m"], control: Control, dt: float
-    ) -> Transition:
+    def transition_given(self, state: AllStates, substate: AllSubstates, control: Control, dt: float) -> Transition:
         """`transition`, linearised about the substate's mean (N, m): to be overridden where it is not linear in it."""
         return self.transition(state, control, dt)
 
     def log_density(
-        self, before: Float[np.ndarray, "N E"], after: Float[np.ndarray, "J E"], control: Control, dt: float
+        self, before: AllStates, after: Float[np.ndarray, "J E"], control: Control, dt: float
     ) -> Float[np.ndarray, "J N"] | None:
         """Log p(after | before) (J, N) for states (N, E) and (J, E), which backward simulation needs where `sample` draws."""
         return None
@@ -228,9 +232,7 @@ class ObservationModel(ABC):
         """ν (…, p): residual(z, predict(…)); override, with `jacobians`, for a constraint g(z, x, l) = 0 on z."""
         return self.residual(z, self.predict(state, landmark, const, substate))
 
-    def visible(
-        self, state: States, landmark: Float[np.ndarray, "*#batch D"], const: Constants = None
-    ) -> Bool[np.ndarray, "*batch"]:
+    def visible(self, state: States, landmark: Estimates, const: Constants = None) -> Bool[np.ndarray, "*batch"]:
         """Whether the sensor could see the landmark (…), bool; by default always."""
         return np.ones(np.broadcast_shapes(state.shape[:-1], landmark.shape[:-1]), dtype=bool)
 
@@ -238,7 +240,7 @@ class ObservationModel(ABC):
         """The landmark (…, D) that would be measured as z (…, p) from the state, for `initialise`."""
         raise InputError(f"{type(self).__name__} cannot start landmarks: override invert or initialise")
 
-    def initialise(self, state: Float[np.ndarray, "N E"], z: Z, cov: CovZ) -> Records:
+    def initialise(self, state: AllStates, z: Z, cov: CovZ) -> Records:
         """First estimate of landmarks from (N, E), (K, p), (K, p, p).
 
         By default `invert`, with the covariance J R Jᵀ of its numeric derivative by the measurement.
@@ -253,7 +255,7 @@ class ObservationModel(ABC):
         return Records(mean, gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2)))
 
     def by_substate(
-        self, state: States, landmark: Float[np.ndarray, "*#batch D"], const: Constants = None
+        self, state: States, landmark: Estimates, const: Constants = None
     ) -> Float[np.ndarray, "*batch p m"]:
         """∂z/∂substate (…, p, m) of a model with `about`, Mathematics (sensor-constants); to be overridden with it."""
         raise InputError(f"{type(self).__name__} has an `about`: override by_substate")
@@ -299,20 +301,18 @@ class Landmark(ABC):
         return hash(type(self))
 
     @abstractmethod
-    def homogeneous(
-        self, mean: Float[np.ndarray, "*#batch D"], const: Float[np.ndarray, "*#batch A"] | None = None
-    ) -> Float[np.ndarray, "*batch h"]:
+    def homogeneous(self, mean: Estimates, const: Constants = None) -> Float[np.ndarray, "*batch h"]:
         """World point of (…, D) and (…, A): (…, 4), (…, 3) in the plane; its last entry may be 0, at infinity."""
 
     def point(
-        self, mean: Float[np.ndarray, "*#batch D"], const: Float[np.ndarray, "*#batch A"] | None = None
+        self, mean: Estimates, const: Constants = None
     ) -> tuple[Float[np.ndarray, "*batch w"], Float[np.ndarray, "*batch w D"]]:
         """World point (…, 3), (…, 2) in the plane, and its derivative (…, 3, D) by the mean; by default a numeric one."""
         at, steps = partial(self._dehomogenised, const=const), STEP * np.eye(self.dim)
         return at(mean), np.stack([(at(mean + step) - at(mean - step)) / (2 * STEP) for step in steps], axis=-1)
 
     def seen_from(
-        self, space: RigidSpace, pose: States, mean: Float[np.ndarray, "*#batch D"]
+        self, space: RigidSpace, pose: States, mean: Estimates
     ) -> tuple[Float[np.ndarray, "*batch D"], Float[np.ndarray, "*#batch D D"]]:
         """The mean (…, D) in the frame of a pose (…, E), and its derivative (…, D, D); asked by a map whose frame moves.
 
@@ -413,7 +413,7 @@ class LikelihoodSensor(Sensor[Frame]):
     normalised: bool = True  #: Whether it is a density of the frame, as the evidence must be.
 
     @abstractmethod
-    def log_likelihood(self, frame: Frame, state: Float[np.ndarray, "N E"]) -> Float[np.ndarray, " N"]:
+    def log_likelihood(self, frame: Frame, state: AllStates) -> OfAll:
         """(N,) for states (N, E); zeros where the frame has nothing for this sensor."""
 
     @final
@@ -422,7 +422,7 @@ class LikelihoodSensor(Sensor[Frame]):
 
 
 #: What the observations say about the increment relative to the prior's mean, linearised at increments (N, d).
-LineariseAt = Callable[[Float[np.ndarray, "N d"]], Information]
+LineariseAt = Callable[[Increments], Information]
 
 
 class Proposal(ABC):
@@ -463,7 +463,7 @@ class Conditional(ABC):
         """The groups with what is decided once for all particles, given all of them; by default nothing is."""
         return groups
 
-    def information(self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: Prior) -> Information:
+    def information(self, state: AllStates, groups: Sequence[Observations], prior: Prior) -> Information:
         """What the groups, at least one, say about a right perturbation of the states (N, E): for proposal and look-ahead.
 
         By default nothing: then they count after sampling, by `correct`, which says so in `LogDensities.after_sampling`.
@@ -471,9 +471,7 @@ class Conditional(ABC):
         return Information.zeros(state.shape[0], prior.space.dim)
 
     @abstractmethod
-    def correct(
-        self, state: Float[np.ndarray, "N E"], increment: Float[np.ndarray, "N d"], groups: Sequence[Observations]
-    ) -> LogDensities:
+    def correct(self, state: AllStates, increment: Increments, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x) at the sampled states, and the update by the same observations; in every step, without any, too."""
 
     @abstractmethod
@@ -483,7 +481,7 @@ class Conditional(ABC):
         The copies must not share memory that is written to in place.
         """
 
-    def driving(self) -> Float[np.ndarray, "N m"] | None:
+    def driving(self) -> AllSubstates | None:
         """Mean of the substate that drives the motion, for `MotionModel.transition_given`; None holds no such."""
         return None
 
@@ -531,7 +529,7 @@ class Map(Conditional):
     def stored_fraction(self) -> float:
         """Memory of the records, as a fraction of what separate copies for all particles would take."""
 
-    def world(self, state: States, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> States:
+    def world(self, state: States, particles: Some = slice(None)) -> States:
         """World_from_robot (n, E) of states (n, E) of some particles; by default landmarks and states are in the world."""
         return state
 
@@ -548,11 +546,11 @@ class Map(Conditional):
         """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
 
     @abstractmethod
-    def read(self, ids: Ids, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
+    def read(self, ids: Ids, particles: Some = slice(None)) -> Records:
         """Estimates (N, K, …), in all or some particles. Raises InputError: a landmark is not held, or their kinds differ."""
 
     @abstractmethod
-    def add(self, new_landmarks: NewLandmarks, state: Float[np.ndarray, "N E"]) -> Ids:
+    def add(self, new_landmarks: NewLandmarks, state: AllStates) -> Ids:
         """Starts landmarks at the states (N, E); returns their ids (K,). Raises InputError: see `add_records`."""
 
     @abstractmethod
@@ -590,7 +588,7 @@ class Map(Conditional):
     def set_log_odds(self, ids: Ids, log_odds: Float[np.ndarray, "N K"]) -> None:
         """Overwrites log-odds (N, K), if the map keeps some; a landmark at −inf in every particle is removed."""
 
-    def existing(self, landmark_id: int, weights: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    def existing(self, landmark_id: int, weights: OfAll) -> OfAll:
         """The weights (N,), zero in the particles in which a landmark is not more probably there than not."""
         return weights * (self.log_odds(np.array([landmark_id]))[:, 0] > 0.0) if self.evidence else weights
 
@@ -601,33 +599,35 @@ class Map(Conditional):
         """ν (K, p) of landmarks (K,) in one particle at a state (E,), its Jacobians, and the records (1, K, …)."""
 
     @abstractmethod
-    def predictions(
-        self, model: ObservationModel, z: Z, cov: CovZ, ids: Int[np.ndarray, " M"], belief: "Belief"
-    ) -> tuple[Float[np.ndarray, "N K M p"], Float[np.ndarray, "N K M p p"]]:
-        """See `Belief.predictions`."""
+    def expected(self, model: ObservationModel, ids: Ids, belief: "Belief") -> Expected:
+        """What each particle expects to measure of landmarks, and J P Jᵀ + H Q Hᵀ, the state's uncertainty included."""
 
-    @abstractmethod
     def project(self, model: ObservationModel, ids: Ids, belief: "Belief") -> tuple[Z, CovZ]:
-        """See `Belief.project`."""
+        """See `Belief.project`; a map may fuse the particles' expectations and their moments for speed."""
+        predicted, within = self.expected(model, ids, belief)
+        # Relative to the particle of highest weight, so that angles need not be wrapped.
+        mode = predicted[belief.mode]
+        mean, cov = gaussian.mixture_moments(belief.weights, model.residual(predicted, mode), within)
+        return mode + mean, cov
 
 
 @dataclass(frozen=True)
 class Belief:
     """What a sensor may know before it measures: a weighted mixture of Gaussians, each with its own marginalised part."""
 
-    log_weights: Float[np.ndarray, " N"]  #: (N,) normalised.
+    log_weights: OfAll  #: (N,) normalised.
     prior: Prior  #: distribution of each particle's increment; after the update its factor is zero.
     parts: Mapping[Part, Conditional]  #: what is marginalised, by what it supplies.
     rng: np.random.Generator = field(default_factory=np.random.default_rng)  #: the filter's, for a sensor that draws.
     landmarks: Part = Part.LANDMARK  #: which of them `map` is: the asking sensor's.
 
     @cached_property
-    def state(self) -> Float[np.ndarray, "N E"]:
+    def state(self) -> AllStates:
         """(N, E) predicted states, or sampled ones after the update."""
         return self.prior.predicted()
 
     @cached_property
-    def weights(self) -> Float[np.ndarray, " N"]:
+    def weights(self) -> OfAll:
         """(N,) summing to one."""
         return np.exp(self.log_weights)
 
@@ -645,7 +645,7 @@ class Belief:
             raise InputError(f"this sensor needs a landmark map: give the filter a LandmarkMap{named}")
         return held
 
-    def read(self, ids: Sequence[int] | Ids, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
+    def read(self, ids: Sequence[int] | Ids, particles: Some = slice(None)) -> Records:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)
 
@@ -678,7 +678,8 @@ class Belief:
         self, model: ObservationModel, z: Z, cov: CovZ, ids: Int[np.ndarray, " M"]
     ) -> tuple[Float[np.ndarray, "N K M p"], Float[np.ndarray, "N K M p p"]]:
         """Innovations ν (N, K, M, p) of K measurements against M landmarks, and S + H Q Hᵀ (N, K, M, p, p)."""
-        return self.map.predictions(model, z, cov, ids, self)
+        predicted, within = self.map.expected(model, ids, self)
+        return model.residual(z[:, None, :], predicted[:, None]), within[:, None] + cov[:, None]
 
     def project(self, model: ObservationModel, ids: Ids) -> tuple[Z, CovZ]:
         """Where landmarks will be measured: mean (K, p) and covariance (K, p, p) under all particles (E06 §4.1).
@@ -695,5 +696,5 @@ class Resampler(ABC):
     """
 
     @abstractmethod
-    def ancestors(self, weights: Float[np.ndarray, " N"], rng: np.random.Generator) -> Int[np.ndarray, " N"] | None:
+    def ancestors(self, weights: OfAll, rng: np.random.Generator) -> Int[np.ndarray, " N"] | None:
         """(N,) normalised weights → (N,) ancestors, or None for no resampling in this step."""
