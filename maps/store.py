@@ -432,7 +432,7 @@ class SharedStore:
         for row, column in enumerate(self.ids.tolist()):
             self._members.setdefault(int(self.columns.generation[row]), set()).add(column)
         for generation in self._members:
-            self.lineage.take_up(generation)
+            self.lineage.retain(generation)
         for row, column in enumerate(self.ids.tolist()):
             name, sizes["fields"] = f"store/{column}/", int(self.columns.fields[row])
             if f"{name}kept" not in arrays:

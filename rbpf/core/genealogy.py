@@ -115,16 +115,12 @@ class Lineage:
         return self.survivors(generation).size
 
     def retain(self, generation: int) -> None:
-        """Keeps the nodes of a generation."""
+        """Keeps the nodes of a generation. Raises InputError: the ancestry does not hold it, as a checkpoint may say."""
+        if not self._oldest <= generation <= self.generation:
+            raise InputError(f"the ancestry does not hold generation {generation}")
         self._retained[generation] += 1
         if generation == self.generation:
             self._members[generation] = self._leaves.copy()
-
-    def take_up(self, generation: int) -> None:
-        """`retain` of a generation that a checkpoint says was kept. Raises InputError: the ancestry does not hold it."""
-        if not self._oldest <= generation <= self.generation:
-            raise InputError(f"the ancestry does not hold generation {generation}")
-        self.retain(generation)
 
     def release(self, generation: int) -> None:
         self._retained[generation] -= 1
@@ -308,7 +304,7 @@ class History:
         block = {**_BLOCK, "log_weights": numbers(*shape, values="log")}
         sizes = {"n": self.lineage.n} | ({} if size is None else {"size": size})
         for number, generation in enumerate(generations):
-            self.lineage.take_up(generation)
+            self.lineage.retain(generation)
             kept, stamps, states, log_weights = read(arrays, block, f"history/{number}/", **sizes).values()
             if not stamps.size or np.setdiff1d(self.lineage.survivors(generation), kept).size:
                 raise InputError(f"the array history/{number}/kept lacks particles that have descendants")

@@ -1,6 +1,6 @@
 """The vector space R^n, finite sets, and direct products of Lie groups."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import accumulate, pairwise
 from typing import final
 
@@ -12,8 +12,23 @@ from rbpf.errors import InputError
 from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
 
+class Commutative(LieGroup):
+    """A group in which a b = b a: Exp and Log are the same everywhere, and to move a tangent changes nothing."""
+
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
+        return np.zeros((*shape, self.size))
+
+    def adjoint(self, a: States) -> TangentMatrix:
+        return np.broadcast_to(np.eye(self.dim), (*np.shape(a)[:-1], self.dim, self.dim)).copy()
+
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
+        return self.adjoint(xi)
+
+    left_jacobian_inverse = left_jacobian
+
+
 @final
-class Euclidean(LieGroup):
+class Euclidean(Commutative):
     """The vector space R^n, n >= 0; storage and tangent are the vector itself."""
 
     def __init__(self, n: int) -> None:
@@ -23,9 +38,6 @@ class Euclidean(LieGroup):
 
     def __repr__(self) -> str:
         return f"Euclidean({self.dim})"
-
-    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
-        return np.zeros((*shape, self.size))
 
     def exp(self, xi: Tangents) -> StateArray:
         return np.array(xi, dtype=float)
@@ -48,14 +60,9 @@ class Euclidean(LieGroup):
     def normalise(self, x: States) -> StateArray:
         return np.array(x, dtype=float)
 
-    def adjoint(self, a: States) -> TangentMatrix:
-        return np.broadcast_to(np.eye(self.dim), (*np.shape(a)[:-1], self.dim, self.dim)).copy()
-
-    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return self.adjoint(xi)
-
-    left_jacobian_inverse = left_jacobian
-    rotation = adjoint
+    def rotation(self, a: States) -> TangentMatrix:
+        """I (…, D, D)."""
+        return self.adjoint(a)
 
     def inverse_transform(self, a: States, p: States) -> StateArray:
         """Points p seen from a: the group is that of translations."""
@@ -71,7 +78,7 @@ class Euclidean(LieGroup):
 
 
 @final
-class Finite(LieGroup):
+class Finite(Commutative):
     """The numbers 0, …, n − 1, as a mode or an answer: a group without a tangent, by addition modulo n.
 
     What is discrete moves by `MotionModel.sample` alone; its mean is the most probable value.
@@ -93,9 +100,6 @@ class Finite(LieGroup):
     def _first_guess(self, points: Array, weights: Array) -> Array:
         return np.array([float(np.argmax(self.probabilities(points, weights)))])
 
-    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
-        return np.zeros((*shape, 1))
-
     def exp(self, xi: Tangents) -> StateArray:
         return np.zeros((*np.shape(xi)[:-1], 1))
 
@@ -110,14 +114,6 @@ class Finite(LieGroup):
 
     def normalise(self, x: States) -> StateArray:
         return np.round(np.asarray(x, dtype=float)) % self.n
-
-    def adjoint(self, a: States) -> TangentMatrix:
-        return np.zeros((*np.shape(a)[:-1], 0, 0))
-
-    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return np.zeros((*np.shape(xi)[:-1], 0, 0))
-
-    left_jacobian_inverse = left_jacobian
 
 
 @final
@@ -187,19 +183,18 @@ class Product(LieGroup):
         return self._each("normalise", self.split(x))
 
     def adjoint(self, a: States) -> TangentMatrix:
-        return self._block_diagonal(self.split(a), [group.adjoint for group in self.groups])
+        return self._block_diagonal("adjoint", self.split(a))
 
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return self._block_diagonal(self.split_tangent(xi), [group.left_jacobian for group in self.groups])
+        return self._block_diagonal("left_jacobian", self.split_tangent(xi))
 
     def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        functions = [group.left_jacobian_inverse for group in self.groups]
-        return self._block_diagonal(self.split_tangent(xi), functions)
+        return self._block_diagonal("left_jacobian_inverse", self.split_tangent(xi))
 
-    def _block_diagonal(self, parts: list[Array], functions: Sequence[Callable[[Array], Array]]) -> Array:
+    def _block_diagonal(self, name: str, parts: list[Array]) -> Array:
         out = np.zeros((*parts[0].shape[:-1], self.dim, self.dim))
-        for block, part, function in zip(self._tangent, parts, functions, strict=True):
-            out[..., block, block] = function(part)
+        for group, block, part in zip(self.groups, self._tangent, parts, strict=True):
+            out[..., block, block] = getattr(group, name)(part)
         return out
 
 

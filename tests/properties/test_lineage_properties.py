@@ -80,7 +80,7 @@ def test_what_is_settled_is_forgotten_by_a_restoration():
         one.advance(np.array(ancestors))
         np.testing.assert_array_equal(one.rows(0), ancestors)
     lineage.restore(other.arrays())
-    lineage.take_up(0)
+    lineage.retain(0)
     np.testing.assert_array_equal(lineage.rows(0), [1, 1])
 
 
