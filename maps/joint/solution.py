@@ -83,6 +83,25 @@ class Solution(NamedTuple):
     solver: SuperLU
     is_whole: bool  #: is a minimum of all that is known, and nothing counts twice.
 
+    def seen_from(
+        self, space: SE2Group | SE3Group | Euclidean, number: int, rows: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Landmarks by rows (K,) as seen from a start by number (K, D), and the covariance of it and them (d + KD, d + KD)."""
+        d, dim = space.dim, self.world.shape[1]
+        start, first = self.starts[number], d * (len(self.starts) - 1)
+        seen = space.inverse_transform(start, self.world[rows])
+        columns = np.append(d * number - d + np.arange(d), first + dim * rows[:, None] + np.arange(dim))
+        turn = np.eye(columns.size)
+        turn[d:, :d] = -space.transform_jacobian(seen).reshape(-1, d)
+        turn[d:, d:] = np.kron(np.eye(rows.size), space.rotation(start).T)
+        return seen, gaussian.symmetrise(turn @ self.marginal(columns) @ turn.T)
+
+    def marginal(self, columns: np.ndarray) -> np.ndarray:
+        """The covariance (c, c) of some columns of what is solved for."""
+        unit = np.zeros((self.information.shape[0], columns.size))
+        unit[columns, np.arange(columns.size)] = 1.0
+        return np.asarray(self.solver.solve(unit)[columns])
+
     def covariance(self) -> sparse.csr_matrix:
         """The entries of the inverse that belong together in a factor, and more, at the work of factoring."""
         n, turned = self.solver.shape[0], self.solver.perm_c
@@ -200,35 +219,15 @@ def _weighed(info: np.ndarray, by_poses: np.ndarray, rotation: np.ndarray, first
 def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
     """What two say of their landmarks, as seen from the end of the new one; the old one ends `between` from there.
 
-    Gauss-Newton over how the old one lies, and the new one's end and all landmarks. Where the old one began is left out.
+    They are solved for with the new one's end and how the old one lies. Where the old one began is left out.
     """
-    d, dim = space.dim, new.points.shape[1]
     ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
     row_of = {landmark: row for row, landmark in enumerate(ids.tolist())}
     rows = np.array([row_of[landmark] for landmark in old.ids.tolist()])
-    points = np.empty((ids.size, dim))
+    points = np.empty((ids.size, new.points.shape[1]))
     points[rows] = space.transform(between, old.points)
     points[: new.ids.size] = new.points
-    moved, prior = np.zeros(d), np.append(np.zeros(d), new.points)
-    infos = information_of(new.cov, d), inverse_of(old.cov[d:, d:])
-    own, theirs = slice(d, d + prior.size), (2 * d + dim * rows[:, None] + np.arange(dim)).ravel()
-    for _ in range(ITERATIONS):
-        seen = space.inverse_transform(between, points[rows])
-        slope = np.zeros((seen.size, 2 * d + points.size))
-        slope[:, :d] = -space.transform_jacobian(seen).reshape(-1, d)
-        slope[:, theirs] = np.kron(np.eye(rows.size), space.rotation(between).T)
-        half = slope.T @ infos[1]
-        info, gradient = half @ slope, half @ (seen - old.points).ravel()
-        info[own, own] += infos[0]
-        gradient[own] += infos[0] @ (np.append(moved, points[: new.ids.size]) - prior)
-        cov = inverse_of(gaussian.symmetrise(info))
-        step = -cov @ gradient
-        between, moved = space.retract(between, step[:d]), moved + step[d : 2 * d]
-        points += step[2 * d :].reshape(-1, dim)
-        if np.abs(step).max() < CLOSE_ENOUGH:
-            break
-    cov = cov[d:, d:]
-    turn = space.right_jacobian(moved)
-    cov[:d] = turn @ cov[:d]
-    cov[:, :d] = cov[:, :d] @ turn.T
-    return SubMap(space.retract(new.end, moved), ids, points, gaussian.symmetrise(cov))
+    starts = np.array([space.identity(), new.end, space.compose(new.end, between)])
+    both = [new, old._replace(tied=False, given=None)]
+    solution = solve(space, both, ids, starts, space.transform(new.end, points))
+    return SubMap(solution.starts[1], ids, *solution.seen_from(space, 1, np.arange(ids.size)))

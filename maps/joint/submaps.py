@@ -199,10 +199,7 @@ class SubMaps:
         space, d, every = self.space, self.space.dim, self.copied()
         every._take(present)
         solution = every._solve(every._shared(alone=True))
-        one, other = d * number + np.arange(d), d * len(self.maps) + np.arange(d)
-        unit = np.zeros((solution.information.shape[0], 2 * d))
-        unit[np.append(one, other), np.arange(2 * d)] = 1.0
-        cov = solution.solver.solve(unit)[np.append(one, other)]
+        cov = solution.marginal(np.append(d * number + np.arange(d), d * len(self.maps) + np.arange(d)))
         mean = space.between(solution.starts[number + 1], solution.starts[-1])
         turn = np.concatenate([-space.adjoint(space.inverse(mean)), np.eye(d)], axis=1)
         return Estimate(mean, gaussian.symmetrise(turn @ cov @ turn.T))
@@ -484,28 +481,18 @@ class SubMaps:
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
-        space, d, dim = self.space, self.space.dim, self.dim
         asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
-        ids, world, starts, _, _, solver, is_whole = self._solve(np.union1d(self._shared(), asked))
-        if not is_whole:
+        solution = self._solve(np.union1d(self._shared(), asked))
+        if not solution.is_whole:
             return
-        self.starts, self._places = list(starts), None
-        seen = space.inverse_transform(self.start, world)
+        ids, self.starts, self._places = solution.ids, list(solution.starts), None
+        seen = self.space.inverse_transform(self.start, solution.world)
         last = np.isin(ids, self.maps[-1].ids) | np.isin(ids, asked)
         order = np.argsort(np.where(last, -1.0, np.linalg.norm(seen, axis=1)), kind="stable")
         kept = order[: max(self.most, int(last.sum()))]
         kept = kept[last[kept] | (ids[kept] >= 0)]
-        first = d * len(self.maps)
-        columns = np.append(first - d + np.arange(d), first + dim * kept[:, None] + np.arange(dim))
-        unit = np.zeros((first + world.size, columns.size))
-        unit[columns, np.arange(columns.size)] = 1.0
-        cov = solver.solve(unit)[columns]
-        turn = np.zeros(cov.shape)
-        turn[:d, :d] = np.eye(d)
-        turn[d:, :d] = -space.transform_jacobian(seen[kept]).reshape(-1, d)
-        turn[d:, d:] = np.kron(np.eye(kept.size), space.rotation(self.start).T)
-        self.near, self.points = ids[kept], seen[kept]
-        self.cov = gaussian.symmetrise(turn @ cov @ turn.T)
+        self.near = ids[kept]
+        self.points, self.cov = solution.seen_from(self.space, len(self.maps), kept)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All of it, for a checkpoint."""
