@@ -275,13 +275,8 @@ class RowEngine:
         columns, records = self._read(ids)
         means, covs = [], []
         for part in _spans(state.shape[0], ks.size):
-            mean, cov, const = _taken(records, part)
-            nu, jac = linearise(group.model, self.space, group.z[ks], state[part, None], mean, const, by=MAP)
-            assert jac.landmark is not None
             mask = None if batch.mask is None else batch.mask[part][:, rows]
-            mean, cov, log_terms = linearisation.updated(
-                nu, jac.landmark, mean, cov, group.cov[ks], _likelihood(group), mask
-            )
+            mean, cov, log_terms = self._updated(group, ks, state[part], *_taken(records, part), mask)
             log_density[part] += log_terms.sum(axis=1)
             means.append(mean)
             covs.append(cov)
@@ -341,21 +336,24 @@ class RowEngine:
         ids = np.array([row.landmark])
         columns, records = self._read(ids)
         assert records.log_weights is not None
-        mean, cov = records.mean[:, 0], records.cov[:, 0]
-        at = state[:, None, :]
-        nu, jac = linearise(group.model, self.space, group.z[row.k], at, mean, records.const, by=MAP)
-        assert jac.landmark is not None
-        mask = None if row.mask is None else np.repeat(row.mask[:, None], mean.shape[1], axis=1)
-        likelihood = group.likelihood or GAUSSIAN
-        new_mean, new_cov, log_terms = linearisation.updated(
-            nu, jac.landmark, mean, cov, group.cov[row.k], likelihood, mask
+        mask = None if row.mask is None else row.mask[:, None]
+        mean, cov, log_terms = self._updated(
+            group, row.k, state, records.mean[:, 0], records.cov[:, 0], records.const, mask
         )
         joint = records.log_weights[:, 0] + log_terms
         total = np.logaddexp.reduce(joint, axis=1)
         end = self.layout_of(row.landmark).gaussian_fields * mean.shape[1]
         columns[0, end : end + mean.shape[1]] = (joint - total[:, None]).T
-        self._write(ids, columns, new_mean[:, None], new_cov[:, None])
+        self._write(ids, columns, mean[:, None], cov[:, None])
         return total
+
+    def _updated(
+        self, group: Observations, ks: Any, state: Array, mean: Array, cov: Array, const: Array | None, mask: Any
+    ) -> tuple[Array, Array, Array]:
+        """`linearisation.updated` by some measurements of a group, at sampled states."""
+        nu, jac = linearise(group.model, self.space, group.z[ks], state[:, None], mean, const, by=MAP)
+        assert jac.landmark is not None
+        return linearisation.updated(nu, jac.landmark, mean, cov, group.cov[ks], _likelihood(group), mask)
 
 
 def fused_kernel(model: ObservationModel) -> FusedKernel | None:

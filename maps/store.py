@@ -121,8 +121,7 @@ class Columns:
         self.count = 0  #: Columns held.
         self.next_id = 0  #: One more than the largest id that was ever used.
         self._hold(np.zeros((5, _FIRST_ROWS), dtype=np.int64))
-        self._ascending = True  #: Whether the ids held ascend, as those that are counted up do.
-        #: Where they do not: the ids ascending, and the rows of each; made when it is asked for.
+        #: The ids ascending, and the rows of each; made when it is asked for, in one pass where they ascend already.
         self._sorted: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
@@ -131,11 +130,8 @@ class Columns:
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
         """Rows (K,) of columns (K,), which must be held."""
-        if not self._ascending:
-            ascending, rows = self._by_id()
-            return rows[ascending.searchsorted(ids)]
-        # All ids from 0 up are their own rows.
-        return ids if self.count == self.next_id else self.ids.searchsorted(ids)
+        ascending, rows = self._by_id()
+        return rows[ascending.searchsorted(ids)]
 
     def row(self, column: int) -> int:
         return int(self.rows(np.array(column)))
@@ -153,11 +149,8 @@ class Columns:
         """Rows (K,) of ids (K,), and whether they are held; the rows of others mean nothing."""
         if not self.count:
             return np.zeros(ids.shape, dtype=np.int64), np.zeros(ids.shape, dtype=bool)
-        if self._ascending:
-            rows = np.minimum(self.ids.searchsorted(ids), self.count - 1)
-        else:
-            ascending, order = self._by_id()
-            rows = order[np.minimum(ascending.searchsorted(ids), self.count - 1)]
+        ascending, order = self._by_id()
+        rows = order[np.minimum(ascending.searchsorted(ids), self.count - 1)]
         return rows, np.asarray(self.ids[rows] == ids)
 
     def _by_id(self) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +164,6 @@ class Columns:
         if self.count == self._ids.size:
             self._hold(np.concatenate([self._tables, np.zeros_like(self._tables)], axis=1))
         row, column = self.count, self.next_id if column is None else column
-        self._ascending = self._ascending and (not row or column > int(self._ids[row - 1]))
         self._ids[row], self.slab[row], self.kind[row] = column, -1, -1
         self.count, self.next_id, self._sorted = row + 1, max(self.next_id, column + 1), None
         return column
@@ -190,7 +182,6 @@ class Columns:
         if room < self._ids.size:
             self._hold(self._tables[:, :room].copy())
         self.count, self._sorted = count, None
-        self._ascending = self._ascending or not count
 
     def restore(self, ids: np.ndarray, next_id: int) -> None:
         """Holds the columns (M,) and no others; their tables have to be filled again. An id that comes twice is refused."""
@@ -200,8 +191,7 @@ class Columns:
         self._hold(np.zeros((5, room), dtype=np.int64))
         self.slab[:], self.kind[:] = -1, -1
         self._ids[: ids.size] = ids
-        self.count, self.next_id = ids.size, next_id
-        self._ascending, self._sorted = bool((np.diff(ids) > 0).all()), None
+        self.count, self.next_id, self._sorted = ids.size, next_id, None
 
     def _hold(self, tables: np.ndarray) -> None:
         """Five tables, one below the other."""

@@ -215,7 +215,6 @@ class KalmanSubstate(Conditional):
             raise InputError(f"the array substate/cov must have 1 or {n} matrices")
 
     def _rows(self, state: Array, substate: Array, groups: Sequence[Observations]) -> tuple[Array, Array, Array]:
-        n, m = substate.shape
         nus, jacs, noises = [], [], []
         for group in groups:
             if group.likelihood is not None and group.likelihood.kernel_id != 0:
@@ -226,12 +225,11 @@ class KalmanSubstate(Conditional):
             nu, jacobians = linearise(group.model, self.space, group.z, state[:, None], None, None, substate[:, None])
             assert jacobians.substate is not None
             by_state = np.zeros((1, 1, 1, 1)) if jacobians.state is None else jacobians.state
-            blocks = ((by_state, self.space.dim), (jacobians.substate, m))
+            blocks = ((by_state, self.space.dim), (jacobians.substate, substate.shape[1]))
             jac = np.concatenate([np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1)
-            for k in range(group.z.shape[0]):
-                nus.append(np.broadcast_to(nu[:, k], (n, nu.shape[2])).copy())
-                jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())
-                noises.append(group.cov[k])
+            nus += list(np.moveaxis(nu, 1, 0))
+            jacs += list(np.moveaxis(jac, 1, 0))
+            noises += list(group.cov)
         return stacked(nus, jacs, noises, [None] * len(nus))
 
 
