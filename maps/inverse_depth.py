@@ -1,38 +1,36 @@
 """A point on a ray: inverse depth in the frame of the first observation (E06 §5.1)."""
 
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
 from rbpf.core.models import Landmark, Records
-from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import NotNegative, Positive, Ranged
 
 MIN_RHO = 0.02  #: Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m.
 
 
 @final
-class InverseDepth(Landmark):
+@dataclass(frozen=True, eq=False)
+class InverseDepth(Ranged, Landmark):
     """b = (u, v, q): the point (u, v, 1)/q in the frame of the first observation, E06 §5.1.
 
     The record's constant is that frame, world_from_anchor (7,): the particle's own pose at the first observation, which
     its descendants inherit. u and v are normalised image coordinates, q = 1/z in 1/m; q = 0 is at infinity.
-
-    Args:
-        ready_ratio: it is ready to become a point when the standard deviation of q is below this fraction of q.
-        least_parallax: a change of q by its standard deviation that moves the measurement by less than this, in its units,
-            leaves q as it is in a joint map, which counts with its uncertainty all the same; 0 always measures depth.
     """
+
+    ready_ratio: Positive = (
+        0.1  #: it is ready to become a point when q's standard deviation is below this fraction of q.
+    )
+    #: a change of q by its standard deviation that moves the measurement by less than this, in its units, leaves q as it is in
+    #: a joint map, which counts with its uncertainty all the same; 0 always measures depth.
+    least_parallax: NotNegative = 0.0
 
     dim = 3
     constants = 7
     anchored = True
-
-    def __init__(self, ready_ratio: float = 0.1, least_parallax: float = 0.0) -> None:
-        if not ready_ratio > 0.0:
-            raise InputError(f"ready_ratio must be positive, got {ready_ratio}")
-        self.ready_ratio = ready_ratio
-        self.least_parallax = least_parallax
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """(R (u, v, 1) + q t, q): no division, so that q may be 0."""

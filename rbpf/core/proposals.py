@@ -7,14 +7,15 @@ joint marginal of the observations is log w₁ = −½[Σ νᵀS⁻¹ν − (L�
 Mathematics (look-ahead): E06 (10) for all observations together, with their correlation through the pose.
 """
 
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Information, Prior, Proposed
-from rbpf.errors import InputError
 from rbpf.kernels.dense import refine
+from rbpf.ranges import Count, NotNegative, Ranged
 
 
 @final
@@ -27,25 +28,19 @@ class PriorProposal(Proposal):
 
 
 @final
-class EkfProposal(Proposal):
-    """FastSLAM 2.0: the prior refined by the observations, linearised once or several times (E06 §4.2).
+@dataclass(frozen=True, eq=False)
+class EkfProposal(Ranged, Proposal):
+    """FastSLAM 2.0: the prior refined by the observations, linearised once or several times (E06 §4.2)."""
 
-    Args:
-        exact: correct by the importance ratio at the sampled state; False is E06's weight, the linearised marginal.
-        iterations: linearisations at most; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
-        start: (d,) increment in each particle's chart where the first one is, where more is known than the prior says;
-            None is the prior's mean.
-        settled: none is made any more when the last one moved no particle's mean by so many of its standard deviations.
-    """
-
-    def __init__(
-        self, exact: bool = True, iterations: int = 1, start: np.ndarray | None = None, settled: float = 0.0
-    ) -> None:
-        if iterations < 1:
-            raise InputError(f"EkfProposal needs at least one iteration, got {iterations}")
-        self.exact = exact
-        self.iterations, self.settled = iterations, settled
-        self.start = start
+    exact: bool = (
+        True  #: correct by the importance ratio at the sample; False is E06's weight, the linearised marginal.
+    )
+    iterations: Count = 1  #: linearisations at most; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
+    #: (d,) increment in each particle's chart where the first one is, where more is known than the prior says, whose mean
+    #: None is.
+    start: np.ndarray | None = None
+    #: none is made any more when the last one moved no particle's mean by so many of its standard deviations.
+    settled: NotNegative = 0.0
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
         at = prior.mean if self.start is None else np.tile(self.start, (prior.base.shape[0], 1))

@@ -10,7 +10,6 @@ import numpy as np
 
 from rbpf.core.models import Resampler
 from rbpf.core.particles import effective_sample_size
-from rbpf.errors import InputError
 from rbpf.ranges import Count, Fraction, Ranged
 
 _ROUNDING = 1e-12  #: Relative error within which weights count as equal, and N W as whole.
@@ -69,19 +68,12 @@ class Residual(Resampler):
 
 
 @final
-class EssTriggered(Resampler):
-    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step.
+@dataclass(frozen=True, eq=False)
+class EssTriggered(Ranged, Resampler):
+    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step."""
 
-    Args:
-        scheme: how to resample.
-        threshold: fraction of N in [0, 1]; 0 never resamples, 1 whenever the weights differ.
-    """
-
-    def __init__(self, scheme: Resampler, threshold: float = 0.5) -> None:
-        if not 0 <= threshold <= 1:
-            raise InputError(f"the threshold of the effective sample size must lie in [0, 1], got {threshold}")
-        self.scheme = scheme
-        self.threshold = threshold
+    scheme: Resampler  #: how to resample.
+    threshold: Fraction = 0.5  #: fraction of N; 0 never resamples, 1 whenever the weights differ.
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
         if effective_sample_size(weights) >= self.threshold * weights.size * (1.0 - _ROUNDING):

@@ -77,7 +77,7 @@ CONSTRUCTION: dict[str, Callable[[], object]] = {
     r"mean \(2,\) needs a cov of that size, got \(3, 3\)":
         lambda: KalmanSubstate(LINE, np.zeros(2), np.eye(3)),
     "negative eigenvalue": lambda: KalmanSubstate(LINE, np.zeros(2), np.diag([1.0, -1.0])),
-    "at least one iteration, got 0": lambda: EkfProposal(iterations=0),
+    "iterations must be a whole number, at least 1 .*, got 0": lambda: EkfProposal(iterations=0),
     "needs a landmark map: give the filter a LandmarkMap": lambda: in_the_plane(()).belief().map,
 }
 # fmt: on

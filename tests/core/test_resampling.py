@@ -111,5 +111,5 @@ def test_a_threshold_of_one_resamples_whenever_weights_differ():
 
 @pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
 def test_a_threshold_is_a_fraction(threshold):
-    with pytest.raises(InputError, match=r"must lie in \[0, 1\], got"):
+    with pytest.raises(InputError, match="threshold must be at least 0 and at most 1, got"):
         EssTriggered(Systematic(), threshold)

@@ -55,7 +55,7 @@ def test_ready(q, std, expected):
 
 @pytest.mark.parametrize("ratio", [0.0, -1.0, np.nan])
 def test_bad_ratio(ratio):
-    with pytest.raises(InputError, match="ready_ratio must be positive"):
+    with pytest.raises(InputError, match=r"ready_ratio must be above 0"):
         InverseDepth(ratio)
 
 
