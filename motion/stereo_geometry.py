@@ -149,15 +149,7 @@ def pixels_from_points(camera: StereoCamera) -> Array:
 
 def points_from_pixels(camera: StereoCamera) -> Array:
     """Q⁻¹ (4, 4)."""
-    one, shift = camera.camera, camera.camera.fx * camera.baseline_m
-    return np.array(
-        [
-            [1.0 / one.fx, 0.0, 0.0, -one.cx / one.fx],
-            [0.0, 1.0 / one.fy, 0.0, -one.cy / one.fy],
-            [0.0, 0.0, 0.0, 1.0],
-            [1.0 / shift, 0.0, -1.0 / shift, 0.0],
-        ]
-    )
+    return np.linalg.inv(pixels_from_points(camera))
 
 
 def homography(camera: StereoCamera, delta: Array) -> Array:

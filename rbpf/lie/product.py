@@ -22,7 +22,7 @@ class Commutative(LieGroup):
         return np.broadcast_to(np.eye(self.dim), (*np.shape(a)[:-1], self.dim, self.dim)).copy()
 
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return self.adjoint(xi)
+        return np.broadcast_to(np.eye(self.dim), (*np.shape(xi)[:-1], self.dim, self.dim)).copy()
 
     left_jacobian_inverse = left_jacobian
 
