@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from rbpf.kernels.dense import factor, solve, solve_lower
-from rbpf.kernels.se3 import cross, exp_pair, multiply, turned, unit
+from rbpf.kernels.se3 import cross, exp_pair, multiply, quaternion, turned
 
 #: Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open.
 STIFFNESS = 1e-9
@@ -183,26 +183,8 @@ def _align(before, now, triple):
     for i in range(3):
         for j in range(3):
             turn[i, j] = a0[i] * b0[j] + a1[i] * b1[j] + a2[i] * b2[j]
-    quat = _quat(turn)
+    quat = quaternion(turn)
     return quat, _difference(centre, turned(quat, middle))
-
-
-@njit(cache=True, error_model="numpy")
-def _quat(r):
-    """Of a rotation matrix: the row of 4 q qᵀ with the largest diagonal loses no digits."""
-    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
-    trace = r[0, 0] + r[1, 1] + r[2, 2]
-    most = max(trace, r[0, 0], r[1, 1], r[2, 2])
-    if most == trace:
-        q = (x, y, z, 1.0 + trace)
-    elif most == r[0, 0]:
-        q = (1.0 + 2.0 * r[0, 0] - trace, xy, xz, x)
-    elif most == r[1, 1]:
-        q = (xy, 1.0 + 2.0 * r[1, 1] - trace, yz, y)
-    else:
-        q = (xz, yz, 1.0 + 2.0 * r[2, 2] - trace, z)
-    return unit(q[0], q[1], q[2], q[3])
 
 
 @njit(cache=True, error_model="numpy")

@@ -96,6 +96,24 @@ def unit(x, y, z, w):
 
 
 @njit(cache=True, error_model="numpy")
+def quaternion(r):
+    """Of a rotation matrix (3, ≥3): the row of 4 q qᵀ with the largest diagonal loses no digits."""
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    most = max(trace, r[0, 0], r[1, 1], r[2, 2])
+    if most == trace:
+        q = (x, y, z, 1.0 + trace)
+    elif most == r[0, 0]:
+        q = (1.0 + 2.0 * r[0, 0] - trace, xy, xz, x)
+    elif most == r[1, 1]:
+        q = (xy, 1.0 + 2.0 * r[1, 1] - trace, yz, y)
+    else:
+        q = (xz, yz, 1.0 + 2.0 * r[2, 2] - trace, z)
+    return unit(q[0], q[1], q[2], q[3])
+
+
+@njit(cache=True, error_model="numpy")
 def turned(q, p):
     """A vector p turned: p + w t + u × t with t = 2 u × p."""
     u = (q[0], q[1], q[2])
@@ -188,6 +206,15 @@ def log(x, out):
     """Logarithm, with the rotation angle in [0, π]."""
     for i in range(out.shape[0]):
         _store_log(_quat(x, i), _vector(x, i, 4), out, i)
+
+
+@njit(_ONE, cache=True, error_model="numpy")
+def from_matrix(m, out):
+    """Elements of matrices (K, 12), 3 × 4 by rows, with qw ≥ 0."""
+    for i in range(out.shape[0]):
+        x, y, z, w = quaternion(m[i].reshape(3, 4))
+        sign = -1.0 if w < 0.0 else 1.0
+        _store((sign * x, sign * y, sign * z, sign * w), (m[i, 3], m[i, 7], m[i, 11]), out, i)
 
 
 @njit(_ONE, cache=True, error_model="numpy")

@@ -96,20 +96,7 @@ class SE3Group(LieGroup):
     def from_matrix(self, m: Like[ArrayLike, "*batch row 4"]) -> Float[np.ndarray, "*batch 7"]:
         """Element of a homogeneous (or 3 x 4) matrix, (..., 4, 4) -> (..., 7), with qw >= 0."""
         m = np.asarray(m, dtype=float)
-        rotation, swapped = m[..., :3, :3], np.swapaxes(m[..., :3, :3], -1, -2)
-        # All of 4 q q^T is linear in the matrix; its row with the largest diagonal loses no digits.
-        outer = np.empty((*m.shape[:-2], 4, 4))
-        trace = np.trace(rotation, axis1=-2, axis2=-1)
-        outer[..., :3, :3] = rotation + swapped + (1.0 - trace)[..., None, None] * np.eye(3)
-        odd = rotation - swapped
-        outer[..., 3, 0] = outer[..., 0, 3] = odd[..., 2, 1]
-        outer[..., 3, 1] = outer[..., 1, 3] = odd[..., 0, 2]
-        outer[..., 3, 2] = outer[..., 2, 3] = odd[..., 1, 0]
-        outer[..., 3, 3] = 1.0 + trace
-        best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-        quat = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-        quat = quat / np.sqrt(np.square(quat).sum(-1, keepdims=True))
-        return np.concatenate([np.where(quat[..., 3:] < 0.0, -quat, quat), m[..., :3, 3]], axis=-1)
+        return _one(kernels.from_matrix, m[..., :3, :].reshape(*m.shape[:-2], 12), 12, (7,))
 
     def from_ypr(
         self,
