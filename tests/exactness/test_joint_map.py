@@ -9,10 +9,9 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.special import logsumexp
 
-from rbpf import gaussian
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
-from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis, squared_mahalanobis
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.models import Belief, Likelihood, NewLandmarks, Observations, Part, Records
 from rbpf.core.particles import Particles, Prior, balanced, uniform_log_weights
 from rbpf.core.proposals import PriorProposal
@@ -24,7 +23,7 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
-from tests.exactness.models import Frame, Kalman, LinearObservation, Relative, Scripted
+from tests.exactness.models import Frame, Kalman, LinearObservation, Relative, Scripted, StudentT
 from tests.exactness.slam import ALONG, DRIFTING, NOISE, TURNED, LinearSlam, Walk, turned, velocity, walked
 
 EVERY_STEP = (Consolidation(window=1), Consolidation(window=9, threshold=1.0))
@@ -405,15 +404,6 @@ def test_nothing_but_outliers_updates_nothing(n):
     np.testing.assert_allclose(found.log_factor, density)
     np.testing.assert_array_equal(joint.mean, mean)
     np.testing.assert_array_equal(joint.cov, cov)
-
-
-class StudentT(Likelihood):
-    """One of a user's own, with heavy tails and no outliers: four degrees of freedom, not normalised."""
-
-    normalised = False
-
-    def log_density(self, nu, cov):
-        return -3.0 * np.log1p(0.25 * squared_mahalanobis(nu, cov)) - 0.5 * gaussian.log_det(gaussian.cholesky(cov))
 
 
 @pytest.mark.parametrize(

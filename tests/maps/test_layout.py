@@ -290,29 +290,19 @@ def grown(n: int, rng: np.random.Generator) -> tuple[LandmarkMap, Lineage, np.nd
 
 
 @pytest.mark.parametrize("n", [7, 300])
-def test_records_are_the_columns(n):
+@pytest.mark.parametrize("some", [slice(None), slice(3, 4), slice(2, 6), np.array([5, 0, 5])], ids=str)
+def test_records_are_the_columns(n, some):
+    """Of all particles or some, warm or cold."""
     landmark_map, _, points, rays = grown(n, np.random.default_rng(0))
-    for ids, landmark in ((points[-6:], Point(3)), (rays[-6:], InverseDepth())):
+    for layout, ids in zip(landmark_map.layouts, (points, rays), strict=True):
         assert landmark_map.store.is_warm(ids[-2:])
         for chosen in (ids[-2:], ids):
-            read = landmark_map.read(chosen)
-            layout = landmark_map.layouts[0 if isinstance(landmark, Point) else 1]
+            read = landmark_map.read(chosen, some)
             plain = layout.unpack(np.array([landmark_map.store.read(int(i)) for i in chosen]))
-            np.testing.assert_array_equal(read.mean, plain.mean)
-            np.testing.assert_array_equal(read.cov, plain.cov)
+            np.testing.assert_array_equal(read.mean, plain.mean[some])
+            np.testing.assert_array_equal(read.cov, plain.cov[some])
             if plain.const is not None:
-                np.testing.assert_array_equal(read.const, plain.const)
-
-
-@pytest.mark.parametrize("some", [slice(3, 4), slice(2, 6), np.array([5, 0, 5])], ids=str)
-def test_records_of_some_particles(some):
-    landmark_map, _, points, rays = grown(7, np.random.default_rng(1))
-    for ids in (points[-2:], rays[-2:], points, rays):
-        part, whole = landmark_map.read(ids, some), landmark_map.read(ids)
-        np.testing.assert_array_equal(part.mean, whole.mean[some])
-        np.testing.assert_array_equal(part.cov, whole.cov[some])
-        if whole.const is not None:
-            np.testing.assert_array_equal(part.const, whole.const[some])
+                np.testing.assert_array_equal(read.const, plain.const[some])
 
 
 @pytest.mark.parametrize("camera_model", [CameraPoint, CameraRay, EpipolarRay])

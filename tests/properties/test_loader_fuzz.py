@@ -104,16 +104,12 @@ def read_all(run: Path) -> None:
 def test_arrays_of_other_shapes_and_types(run, data):
     """An archive that is whole, but in which an array is another one."""
     path = run / data.draw(st.sampled_from(["trajectory.npz", "truth.npz", "map.npz"]))
-    whole = path.read_bytes()
     arrays = load_arrays(path)
     name = data.draw(st.sampled_from(sorted(arrays)))
-    arrays[name] = data.draw(others(arrays[name]))
-    try:
-        save_arrays(path, arrays)
+    with restored(path):
+        save_arrays(path, arrays | {name: data.draw(others(arrays[name]))})
         read_or_refused(lambda: read_all(run))
         read_or_refused(lambda: load(run).estimate)
-    finally:
-        path.write_bytes(whole)
 
 
 @FEW
@@ -193,6 +189,7 @@ def member(header: bytes, body: bytes = b"", compressed: bool = False) -> bytes:
 @pytest.mark.parametrize(
     "header",
     [
+        b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000,)}\n",
         b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}\n",
         b"{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}\n",
         b"{'descr': '<U0', 'fortran_order': False, 'shape': (1000000000000,)}\n",
@@ -203,17 +200,11 @@ def member(header: bytes, body: bytes = b"", compressed: bool = False) -> bytes:
         b"(" * 9000 + b"\n",
         b"{'descr': '<f8', 'fortran_order': False, 'shape': (True,)}\n",
     ],
-    ids=["huge", "negative", "no bytes each", "long text", "objects", "records", "code", "nested", "truth"],
+    ids=["unfolds", "huge", "negative", "no bytes each", "long text", "objects", "records", "code", "nested", "truth"],
 )
 def test_headers_that_claim_too_much(tmp_path, header):
-    (tmp_path / "a.npz").write_bytes(member(header, b"\0" * 8))
+    unfolds = b"(1000000,)" in header  # it has what it claims, but compressed
+    (tmp_path / "a.npz").write_bytes(member(header, b"\0" * (8_000_000 if unfolds else 8), compressed=unfolds))
     with pytest.raises(InputError, match="is damaged or cut off"):
         load_arrays(tmp_path / "a.npz")
     assert not Path("pwned").exists()
-
-
-def test_an_archive_that_unfolds_is_refused(tmp_path):
-    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000,)}\n"
-    (tmp_path / "a.npz").write_bytes(member(header, b"\0" * 8_000_000, compressed=True))
-    with pytest.raises(InputError, match="is damaged or cut off"):
-        load_arrays(tmp_path / "a.npz")
