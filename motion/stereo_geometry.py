@@ -149,7 +149,7 @@ def pixels_from_points(camera: StereoCamera) -> Array:
 
 def points_from_pixels(camera: StereoCamera) -> Array:
     """Q⁻¹ (4, 4)."""
-    return np.linalg.inv(pixels_from_points(camera))
+    return np.asarray(np.linalg.inv(pixels_from_points(camera)), dtype=float)
 
 
 def homography(camera: StereoCamera, delta: Array) -> Array:
