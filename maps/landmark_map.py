@@ -284,6 +284,9 @@ class LandmarkMap(Map):
 
         The filter that saves and the one that loads name the same ones in the same order.
         """
+        for number, layout in enumerate(self.layouts):
+            if layout.landmark is landmark:
+                return number
         layout = Layout(landmark, self.evidence)
         if layout not in self.layouts:
             self.layouts.append(layout)

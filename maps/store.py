@@ -94,7 +94,7 @@ class Layout:
 
     def unpack(self, columns: np.ndarray) -> Records:
         """Columns (K, fields, N) as records."""
-        rows = np.moveaxis(columns, -1, 0)
+        rows = columns.transpose(2, 0, 1)
         n, k = rows.shape[:2]
         dim, components = self.landmark.dim, self.landmark.components
         end = components * self.gaussian_fields
