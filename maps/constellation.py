@@ -14,7 +14,8 @@ MOST = 30  #: Points of one; a record's covariance grows with the square of thei
 #: Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors, of the points' means
 #: over the particles.
 ROUNDS = 20
-SETTLED = 1e-10  #: Length of the last step, radians and metres.
+#: Length of the last step, radians and metres: what is left after it is a hundredth of it, even where points fit badly.
+SETTLED = 1e-6
 LEAST = 1e-12  #: Variance, m², of exact points, which keeps the fit defined.
 
 
@@ -95,7 +96,7 @@ class Constellation(Landmark):
                 break
         # −Λ⁻¹ JᵀW Rᵀ.
         turned = SE3.rotation(frame)[:, None] @ weighed.reshape(n, -1, 3, 6)
-        slope = -np.linalg.solve(info, np.swapaxes(turned.reshape(n, -1, 6), 1, 2))
         cov_fit = gaussian.symmetrise(np.linalg.inv(info))
+        slope = -cov_fit @ np.swapaxes(turned.reshape(n, -1, 6), 1, 2)
         cov = gaussian.symmetrise(slope @ records.cov[:, 0] @ np.swapaxes(slope, -1, -2) + cov_fit)
         return frame, slope, cov_fit, cov

@@ -164,8 +164,7 @@ class LandmarkMap(Map):
         """Whether `project` runs compiled for landmarks (K,) of one parametrisation."""
         if not self.compiled or type(model).innovation is not ObservationModel.innovation:
             return False
-        plain = self._layout_of(int(ids[0])).landmark.components == 1
-        return plain and self.store.is_warm(ids) and model.kernel() is not None
+        return self._layout_of(int(ids[0])).landmark.components == 1 and model.kernel() is not None
 
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         self._known(ids)
@@ -176,7 +175,7 @@ class LandmarkMap(Map):
             landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim
             state = belief.state[belief.mode]
             anchor = -self.innovations(model, np.zeros((k, p)), ids, state, belief.mode)[0]
-            access = tuple(self.store.access(ids))
+            access = tuple(self.store.look(ids))
             mean, cov = np.empty((k, p)), np.empty((k, p, p))
             state, anchor, spread = map(np.ascontiguousarray, (prior.predicted(), anchor, prior.spread(prior.mean)))
             sizes = np.array([self.space.dim, landmark.dim, landmark.constants])

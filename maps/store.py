@@ -306,9 +306,12 @@ class SharedStore:
             cold.data.take(where, axis=1, out=out[k], mode="clip")
         return out
 
-    def is_warm(self, columns: np.ndarray) -> bool:
-        """Whether `access` may read columns (K,) as they are."""
-        return bool((self.columns.slab[self.columns.rows(columns)] >= 0).all())
+    def look(self, columns: np.ndarray) -> Access:
+        """As `access`, for a kernel that only reads: cold columns stay cold."""
+        if (self.columns.slab[self.columns.rows(columns)] >= 0).all():
+            return self.access(columns)
+        records, count = self.read_all(columns), columns.size
+        return Access(records, np.arange(count), np.zeros(count, dtype=np.int64), np.arange(self.n)[None])
 
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
