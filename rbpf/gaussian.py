@@ -101,9 +101,7 @@ def _triangle(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Lower Cholesky factor, upper triangle not read. Raises InputError: not positive definite, or NaN."""
-    cov = np.asarray(cov, dtype=float)
-    with np.errstate(invalid="ignore"):  # from entries that are infinite, which the complaint covers
-        chol, definite = _factored(cov, 0.0)
+    chol, definite = _factored(np.asarray(cov, dtype=float), 0.0)
     _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
     return chol
 
@@ -219,15 +217,16 @@ def _kept_factors(cov: bytes, shape: tuple[int, ...], floor: float) -> tuple[Arr
 
 def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
     n = cov.shape[-1]
-    if n <= _UNROLLED and cov.size > _MANY * n * n:
+    with np.errstate(invalid="ignore"):  # from entries that are infinite, which complaints cover
+        if n <= _UNROLLED and cov.size > _MANY * n * n:
+            return _cholesky_batch(cov, floor)
+        # An error does not say which one of the batch failed: the loops do.
+        with suppress(np.linalg.LinAlgError):
+            chol = np.linalg.cholesky(cov)
+            variances, pivots = (each.diagonal(axis1=-2, axis2=-1) for each in (cov, chol))
+            if (pivots * pivots > floor * variances).all():  # what is not finite leaves its row a pivot that is not
+                return chol, np.ones(cov.shape[:-2], dtype=bool)
         return _cholesky_batch(cov, floor)
-    # An error does not say which one of the batch failed: the loops do.
-    with suppress(np.linalg.LinAlgError), np.errstate(invalid="ignore"):
-        chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
-        variances, pivots = (np.diagonal(each, axis1=-2, axis2=-1) for each in (cov, chol))
-        if (np.square(pivots) > floor * variances).all() and np.isfinite(chol).all():
-            return chol, np.ones(cov.shape[:-2], dtype=bool)
-    return _cholesky_batch(cov, floor)
 
 
 def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -102,17 +102,22 @@ def refine(info, vector, root_prior, mean, root, squared, log_det):
                 white[r] += spread[a, r] * vector[i, a]
         factor(chol)
         solve_lower(chol, white)
-        # Columns of C⁻¹, which are the rows of its transposed.
+        # Columns of C⁻¹, which are the rows of its transposed: zero before the diagonal.
         for r in range(rank):
-            root[i, r] = 0.0
-            root[i, r, r] = 1.0
-            solve_lower(chol, root[i, r])
+            row = root[i, r]
+            row[:r] = 0.0
+            row[r] = 1.0 / chol[r, r]
+            for a in range(r + 1, rank):
+                row[a] = 0.0
+                for b in range(r, a):
+                    row[a] -= chol[a, b] * row[b]
+                row[a] /= chol[a, a]
         squared[i] = log_det[i] = 0.0
         for r in range(rank):
             squared[i] += white[r] * white[r]
             log_det[i] += 2.0 * math.log(chol[r, r])
             mean[i, r] = 0.0
-            for s in range(rank):
+            for s in range(r, rank):
                 mean[i, r] += root[i, r, s] * white[s]
 
 
