@@ -435,7 +435,7 @@ class JointMap(Map):
         """Mean (R,) and covariance (R, R) of the innovations under all particles, and whose rows they are."""
         prior, weights = belief.prior, belief.weights
         rows = self._seen_through(belief.state, groups, prior)
-        by_state = np.swapaxes(rows.said[:, 1:], 1, 2)
+        by_state = rows.said[:, 1:].transpose(2, 0, 1)
         spread = np.einsum("n,nra->ra", weights, by_state @ prior.spread(prior.mean))
         nu = weighted_mean(rows.nu, weights)
         apart = rows.nu - nu

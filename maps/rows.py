@@ -427,10 +427,10 @@ def innovations(
         assert jac.state is not None and jac.landmark is not None
         return nu[0], Jacobians(jac.state[0], jac.landmark[0]), records
     (_, k, dim), p = records.mean.shape, z.shape[1]
-    said, slope = np.zeros((1, 1 + space.dim, k * p)), np.zeros((k * p, dim))
+    said, slope = np.zeros((k * p, 1 + space.dim, 1)), np.zeros((k * p, dim))
     columns, none = np.arange(k * dim).reshape(k, dim), np.zeros((k, 0), dtype=np.int64)
     arrays = state[None], records.mean.reshape(1, -1), np.empty((k, 0)) if const is None else const[0], z
     at, mean, origins, z = (np.require(array, np.float64, ["C", "W"]) for array in arrays)
     linearise_group(kernel.function.address, kernel.params, at, mean, columns, none, origins, z, 0, said, slope)
-    by_state = said[0, 1:].T.reshape(k, p, space.dim)
-    return said[0, 0].reshape(k, p), Jacobians(by_state, slope.reshape(k, p, dim)), records
+    nu, by_state = said[:, 0].reshape(k, p), said[:, 1:].reshape(k, p, space.dim)
+    return nu, Jacobians(by_state, slope.reshape(k, p, dim)), records

@@ -222,7 +222,7 @@ def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
             return _cholesky_batch(cov, floor)
         # An error does not say which one of the batch failed: the loops do.
         with suppress(np.linalg.LinAlgError):
-            chol = np.linalg.cholesky(cov)
+            chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
             variances, pivots = (each.diagonal(axis1=-2, axis2=-1) for each in (cov, chol))
             if (pivots * pivots > floor * variances).all():  # what is not finite leaves its row a pivot that is not
                 return chol, np.ones(cov.shape[:-2], dtype=bool)

@@ -14,7 +14,7 @@ from rbpf.core.linearisation import linearise
 from rbpf.core.models import NEW, NULL, FusedKernel, Likelihood, Observations, Part
 from rbpf.core.particles import Information, weighted_mean
 from rbpf.errors import InputError
-from rbpf.kernels.dense import add_gram, add_inner, congruent, gather, mirror, product
+from rbpf.kernels.dense import add_gram, add_inner, add_turned, congruent, gather, grams, mirror, product
 from rbpf.kernels.landmarks import linearise_group
 from rbpf.lie import Array
 from rbpf.maps.joint.columns import JointColumns, Kind
@@ -37,7 +37,7 @@ class Group(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """All rows of a step: ν and H in one (N, 1 + d, R), and what all particles share: J P (R, n), S (R, R).
+    """All rows of a step: ν and H in one (R, 1 + d, N), and what all particles share: J P (R, n), S (R, R).
 
     J is sparse: a row reads the map in columns `at` (R, q), by slopes (R, q).
     """
@@ -52,7 +52,7 @@ class Rows(NamedTuple):
 
     @property
     def nu(self) -> np.ndarray:
-        return self.said[:, 0]
+        return self.said[:, 0].T
 
     def through(self, matrix: np.ndarray) -> np.ndarray:
         """J times (n, m)."""
@@ -76,29 +76,32 @@ class Rows(NamedTuple):
 
     def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
         """The same where all that is held moves with the state, by gain (n, d) times turn (N, d, d)."""
-        self.said[:, 1:] += np.swapaxes(turn, 1, 2) @ self.through(gain).T
+        add_turned(self.said, self.through(gain), turn)
         return self
 
     def information(self) -> Information:
         """What the rows say of the state."""
         inside, chol = self.factor()
-        white = whitened(chol, self.said[..., inside])
-        gram = white @ np.swapaxes(white, 1, 2)
+        _, size, n = self.said.shape
+        info, vector, quad = np.empty((n, size - 1, size - 1)), np.empty((n, size - 1)), np.empty(n)
+        white = whitened(chol, self.said[inside].reshape(len(chol), size * n))
+        grams(white.reshape(len(chol), size, n), info, vector, quad)
         log_factor, is_density = self.log_factor, np.ones(len(self.cov), dtype=bool)
         for likelihood, own, log_odds, _ in self.groups:
-            count = int((log_odds >= 0.0).sum())
-            log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
-            is_density[own] = likelihood.normalised
-        of_all = log_det(np.diagonal(chol)[is_density[inside]]), log_factor, float(len(chol))
-        return Information(gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0], *np.repeat([of_all], len(gram), axis=0).T)
+            if likelihood.kernel_id != 0:
+                count = int((log_odds >= 0.0).sum())
+                log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
+                is_density[own] = likelihood.normalised
+        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, float(len(chol))
+        return Information(info, vector, quad, *np.full((n, 3), of_all).T)
 
     def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One gain for all particles: log p(z | x) (N,), by what the means move (N, n), and the covariance (n, n) after."""
         inside, chol = self.factor()
-        nu = whitened(chol, self.nu[:, inside])
+        nu = whitened(chol, self.said[inside, 0]).T
         total = self.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(np.diagonal(chol)))
         total += beyond_gaussian(self, inside, chol, nu)
-        half = np.ascontiguousarray(whitened(chol, self.carried[inside].T).T)
+        half = whitened(chol, self.carried[inside])
         moves, after, fixed = multiplied(nu, half), plus_gram(cov, half, -1.0), self._considered(cov)
         if fixed.size:
             # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
@@ -178,7 +181,7 @@ class Reading:
         held, space, (n, d) = self.held, self.held.space, (len(state), self.held.space.dim)
         state, mean = (np.require(each, np.float64, ["C", "W"]) for each in (state, mean))
         count, parts = len(self._at), list[Group]()
-        said, by_held = np.zeros((n, 1 + d, count)), np.zeros(self._at.shape)
+        said, by_held = np.zeros((count, 1 + d, n)), np.zeros(self._at.shape)
         for group, (seen, kind, rows, kernel) in zip(groups, self._parts, strict=True):
             model, z, at = group.model, group.z[seen], state[:, None]
             log_odds = np.full(seen.size, np.inf) if group.log_odds is None else group.log_odds[seen]
@@ -193,7 +196,7 @@ class Reading:
                     const = held.poses(kind, middle) if kind.landmark.anchored else None
                     by_substate = model.by_substate(centre, middle[kind.columns], const).reshape(rows.size, -1)
                     own, used = slice(first, first + rows.size), kind.columns.shape[1] + kind.clones.shape[1]
-                    said[:, 0, own] -= (mean[:, d : held.first] - model.about) @ by_substate.T
+                    said[own, 0] -= by_substate @ (mean[:, d : held.first] - model.about).T
                     by_held[own, used : used + by_substate.shape[1]] = by_substate
                 continue
             landmarks = anchors = substate = None
@@ -226,10 +229,10 @@ class Reading:
             if not rows.size:
                 continue
             own = slice(int(rows[0, 0]), int(rows[-1, -1]) + 1)
-            said[:, 0, own] = np.broadcast_to(found, (n, *rows.shape)).reshape(n, -1)
+            said[own, 0] = np.broadcast_to(found, (n, *rows.shape)).reshape(n, -1).T
             if jac.state is not None:
                 slopes = np.broadcast_to(jac.state, (n, *rows.shape, d)).reshape(n, -1, d)
-                said[:, 1:, own] = np.swapaxes(slopes, 1, 2)
+                said[own, 1:] = slopes.transpose(1, 2, 0)
             slope = np.concatenate(used, axis=2)
             by_held[own, : slope.shape[2]] = slope.reshape(rows.size, -1)
         carried, innovation = np.empty((count, len(self._cov))), self._noise.copy()
@@ -320,7 +323,7 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray | slice, chol: np.ndarray, wh
         nu, cov = (lower @ white[:, at][..., None])[..., 0], gaussian.gram(lower)
         total += (likelihood.log_density(nu, cov) - gaussian.log_density(nu, cov)).sum(axis=1)
         out = own[log_odds < 0.0]
-        half = whitened(chol, rows.cov[out.ravel()][:, inside]).T
+        half = whitened(chol, rows.cov[inside][:, out.ravel()])
         nu = (rows.nu[:, out.ravel()] - white @ half).reshape(len(white), *out.shape)
         explained = diagonal_blocks(half.T @ half, np.arange(out.size).reshape(out.shape))
         total += likelihood.log_density(nu, diagonal_blocks(rows.cov, out) - explained).sum(axis=1)
@@ -328,11 +331,11 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray | slice, chol: np.ndarray, wh
 
 
 def whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """L⁻¹ of rows (…, R), with one L (R, R) for all."""
+    """L⁻¹ (R, R) of rows (R, k), C-contiguous."""
     if not rows.size:
         return rows
-    flat = np.ascontiguousarray(rows).reshape(-1, len(chol)).T
-    return np.asarray(dtrsm(1.0, chol, flat, lower=1).T).reshape(rows.shape)
+    # Of transposed matrices, which are as BLAS wants them.
+    return np.asarray(dtrsm(1.0, chol.T, np.ascontiguousarray(rows).T, side=1, lower=0).T)
 
 
 def multiplied(left: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -304,11 +304,11 @@ class Marginals(Conditional):
             return found
 
         def linearise_at(increment: np.ndarray) -> Information:
-            if increment is prior.mean:
-                found = information_at(prior.predicted())
-                return found if prior.centred else found.charted(prior.space.right_jacobian(increment))
-            found = information_at(prior.at(increment))
-            return found.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)
+            is_mean = increment is prior.mean
+            found = information_at(prior.predicted() if is_mean else prior.at(increment))
+            if is_mean and prior.centred:
+                return found
+            return found.charted(prior.space.right_jacobian(increment), increment - prior.mean)
 
         return linearise_at
 

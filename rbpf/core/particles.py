@@ -6,7 +6,7 @@ log-weights is that of S05 (8)–(12).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.arrays import Float, Int
 from rbpf.errors import InputError
+from rbpf.kernels.dense import chart
 from rbpf.lie import LieGroup
 
 #: Fields of `Information` that add up over independent observations.
@@ -142,19 +143,15 @@ class Information:
         for name in SUMMED:
             getattr(self, name).__iadd__(getattr(other, name))
 
-    def charted(self, jacobian: Float[np.ndarray, "#N d d"]) -> "Information":
-        """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d)."""
-        turned = np.swapaxes(jacobian, -1, -2)
-        vector = (turned @ self.vector[..., None])[..., 0]
-        otherwise = tuple(other.charted(jacobian) for other in self.otherwise)
-        return replace(self, info=turned @ self.info @ jacobian, vector=vector, otherwise=otherwise)
+    def charted(self, jacobian: Float[np.ndarray, "#N d d"], offset: Float[np.ndarray, "#N d"]) -> "Information":
+        """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d).
 
-    def shifted(self, offset: Float[np.ndarray, "#N d"]) -> "Information":
-        """The same relative to a point `offset` (N, d) before the one linearised at: ν + H·offset."""
-        moved = np.einsum("nab,nb->na", self.info, offset)
-        quad = self.quad + (offset * (2.0 * self.vector + moved)).sum(axis=1)
-        otherwise = tuple(other.shifted(offset) for other in self.otherwise)
-        return replace(self, vector=self.vector + moved, quad=quad, otherwise=otherwise)
+        It is then relative to a point `offset` (N, d) before the one linearised at: ν + H·offset.
+        """
+        info, vector, quad = (np.array(each, order="C") for each in (self.info, self.vector, self.quad))
+        chart(np.ascontiguousarray(jacobian), np.ascontiguousarray(offset), info, vector, quad)
+        otherwise = tuple(other.charted(jacobian, offset) for other in self.otherwise)
+        return Information(info, vector, quad, self.log_det, self.log_factor, self.rows, otherwise)
 
 
 @dataclass(frozen=True)

@@ -121,6 +121,31 @@ def refine(info, vector, root_prior, mean, root, squared, log_det):
                 mean[i, r] += root[i, r, s] * white[s]
 
 
+@njit(void(CUBE, MATRIX, CUBE, MATRIX, VECTOR), cache=True, error_model="numpy")
+def chart(jacobian, offset, info, vector, quad):
+    """Replaces Λ (N, d, d), η (N, d) and νᵀS⁻¹ν (N,) by those in another chart, see `rbpf.core.particles.Information`."""
+    dim = info.shape[1]
+    half, moved = np.empty((dim, dim)), np.empty(dim)
+    for i in range(len(info)):
+        turn, apart = jacobian[i if len(jacobian) > 1 else 0], offset[i if len(offset) > 1 else 0]
+        for a in range(dim):
+            moved[a] = 0.0
+            for b in range(dim):
+                moved[a] += turn[b, a] * vector[i, b]
+                half[a, b] = 0.0
+                for c in range(dim):
+                    half[a, b] += info[i, a, c] * turn[c, b]
+        for a in range(dim):
+            vector[i, a] = moved[a]
+            for b in range(dim):
+                info[i, a, b] = 0.0
+                for c in range(dim):
+                    info[i, a, b] += turn[c, a] * half[c, b]
+                moved[a] += info[i, a, b] * apart[b]
+            quad[i] += apart[a] * (vector[i, a] + moved[a])
+            vector[i, a] = moved[a]
+
+
 @njit(cache=True, error_model="numpy")
 def product(left, right):
     """(m, k) times (k, n), C-contiguous: the same bytes on any number of threads, which BLAS does not promise."""
@@ -161,6 +186,40 @@ def add_inner(at, slope, rows, out):
             out[r, s] += total
             if s < r:
                 out[s, r] = out[r, s]
+
+
+@njit(void(CUBE, MATRIX, CUBE), cache=True, error_model="numpy")
+def add_turned(said, weight, turn):
+    """Adds to `said` (R, 1 + d, N), from its second column on, rows `weight` (R, d) times each particle's `turn` (N, d, d)."""
+    count, size, particles = said.shape
+    lanes = np.empty((size - 1, size - 1, particles))
+    for i in range(particles):
+        lanes[:, :, i] = turn[i]
+    for r in range(count):
+        for a in range(size - 1):
+            for b in range(size - 1):
+                for i in range(particles):
+                    said[r, 1 + a, i] += weight[r, b] * lanes[b, a, i]
+
+
+@njit(void(CUBE, CUBE, MATRIX, VECTOR), cache=True, error_model="numpy")
+def grams(white, info, vector, quad):
+    """Fills HᵀH (N, d, d), Hᵀν (N, d) and νᵀν (N,) of each particle, of rows [ν H] in `white` (R, 1 + d, N)."""
+    count, size, particles = white.shape
+    total = np.empty(particles)
+    for a in range(size):
+        for b in range(a + 1):
+            total[:] = 0.0
+            for r in range(count):
+                for i in range(particles):
+                    total[i] += white[r, a, i] * white[r, b, i]
+            for i in range(particles):
+                if b > 0:
+                    info[i, a - 1, b - 1] = info[i, b - 1, a - 1] = total[i]
+                elif a > 0:
+                    vector[i, a - 1] = total[i]
+                else:
+                    quad[i] = total[i]
 
 
 @njit(cache=True, error_model="numpy")

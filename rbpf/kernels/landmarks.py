@@ -325,14 +325,14 @@ def _add_by_clone(own, clone, state, anchor, i, by_state, weight, tangent, jacob
 
 @njit(void(*_GROUP, MATRIX, int64, CUBE, MATRIX), cache=True, error_model="numpy")
 def linearise_group(address, params, state, mean, columns, clones, origins, z, first, said, slope):
-    """Fills rows from `first` on of `said` (N, 1 + d, R), ν and ∂z/∂state, and of slopes (R, q), averages over the particles.
+    """Fills rows from `first` on of `said` (R, 1 + d, N), ν and ∂z/∂state, and of slopes (R, q), averages over the particles.
 
     Of K landmarks, measured as z (K, p), in particles with states (N, E) and means (N, n): `columns` (K, D), the `clones`
     (K, 6) that they are anchored at by their columns, (K, 0) where they are at none; and their constants, or K of the clones,
     `origins` (K, A). The slopes are ∂z/∂landmark, then by the clone.
     """
     kernel = kernel_at(address)
-    particles, size = said.shape[:2]
+    size, particles = said.shape[1:]
     count, dim = columns.shape
     p = z.shape[1]
     anchored = clones.shape[1] > 0
@@ -353,9 +353,10 @@ def linearise_group(address, params, state, mean, columns, clones, origins, z, f
             for a in range(p):
                 row = first + k * p + a
                 for i in range(n):
-                    said[start + i, 0, row] = nu[a, i]
-                    for e in range(size - 1):
-                        said[start + i, 1 + e, row] = by_state[a, e, i]
+                    said[row, 0, start + i] = nu[a, i]
+                for e in range(size - 1):
+                    for i in range(n):
+                        said[row, 1 + e, start + i] = by_state[a, e, i]
                 for j in range(dim):
                     total = 0.0
                     for i in range(n):

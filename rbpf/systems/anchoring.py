@@ -136,8 +136,7 @@ class StartAnchor(Conditional):
 
         def linearise_at(increment: np.ndarray) -> Information:
             total = rest.information(prior.at(increment), groups, prior)
-            charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
-            return charted.shifted(np.broadcast_to(increment - prior.mean, (n, space.dim)))
+            return total.charted(space.right_jacobian(increment), increment - prior.mean)
 
         proposed = self._proposal.propose(prior, linearise_at, self._rng)
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))

@@ -161,7 +161,7 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
     by_mean = rows.through(np.eye(joint.mean.shape[1]))
     np.testing.assert_allclose(by_mean, numeric(measured, joint.mean[0]), atol=1e-4)
     by_state = numeric(lambda xi: measured(joint.mean[0], SE3.retract(particles.state, xi)), np.zeros(6))
-    np.testing.assert_allclose(rows.said[0, 1:].T, by_state, atol=1e-4)
+    np.testing.assert_allclose(rows.said[:, 1:, 0], by_state, atol=1e-4)
 
 
 def test_the_loops_do_what_numpy_does():

@@ -6,7 +6,7 @@ import pytest
 from rbpf import gaussian
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.kernels import forest
-from rbpf.kernels.dense import add_gram, add_inner, gather, product, refine
+from rbpf.kernels.dense import add_gram, add_inner, add_turned, chart, gather, grams, product, refine
 from rbpf.kernels.gate import is_inlier, log_likelihood
 
 
@@ -55,6 +55,34 @@ def test_rows_that_read_few_columns_are_a_matrix(count, rng):
     add_gram(cov, rows, -1.0)
     expected = covariances(np.random.default_rng(4), 1, 9)[0] - rows.T @ rows
     np.testing.assert_allclose(np.tril(cov), np.tril(expected), rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("count", [0, 7])
+def test_what_rows_say_of_each_particle_is_numpys(count, rng):
+    said, weight, turn = rng.normal(size=(count, 4, 9)), rng.normal(size=(count, 3)), rng.normal(size=(9, 3, 3))
+    expected = np.concatenate([said[:, :1], said[:, 1:] + np.einsum("rb,nba->ran", weight, turn)], axis=1)
+    add_turned(said, weight, turn)
+    np.testing.assert_allclose(said, expected, rtol=1e-12, atol=1e-12)
+    info, vector, quad = np.empty((9, 3, 3)), np.empty((9, 3)), np.empty(9)
+    grams(said, info, vector, quad)
+    gram = np.einsum("ran,rbn->nab", said, said)
+    for found, whole in ((info, gram[:, 1:, 1:]), (vector, gram[:, 1:, 0]), (quad, gram[:, 0, 0])):
+        np.testing.assert_allclose(found, whole, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shared", [1, 4])
+def test_what_is_said_in_another_chart_is_numpys(shared, rng):
+    """It is what turned rows say of what lies `offset` before."""
+    rows, nu = rng.normal(size=(4, 8, 3)), rng.normal(size=(4, 8))
+    turn, offset = rng.normal(size=(shared, 3, 3)), rng.normal(size=(shared, 3))
+    info, vector = np.swapaxes(rows, 1, 2) @ rows, np.einsum("nra,nr->na", rows, nu)
+    quad = np.square(nu).sum(axis=1)
+    chart(turn, offset, info, vector, quad)
+    rows = rows @ turn
+    nu = nu + np.einsum("nra,na->nr", rows, np.broadcast_to(offset, (4, 3)))
+    np.testing.assert_allclose(info, np.swapaxes(rows, 1, 2) @ rows, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(vector, np.einsum("nra,nr->na", rows, nu), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(quad, np.square(nu).sum(axis=1), rtol=1e-11)
 
 
 @pytest.mark.parametrize("shared", [1, 4])
