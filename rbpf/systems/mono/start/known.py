@@ -126,10 +126,33 @@ def constellation_records(
     """
     from scipy.optimize import least_squares  # takes long to import
 
-    fit = _FirstImage(camera, start, cov_frame)
-    x = least_squares(fit.residual, np.zeros(fit.size), fit.jacobian, method="lm").x
-    pose, local = fit.split(x)
-    half = np.linalg.pinv(fit.jacobian(x))
+    # Whitened residuals by x = (ξ, e_1, …, e_M): group_from_camera = T Exp(ξ), point m at k_m + e_m in the group.
+    model, given, seen = CameraPoint(camera), start.points, start.seen
+    chol_px = gaussian.cholesky(seen.cov_z)
+    chol_prior = gaussian.cholesky(block_diag(cov_frame, *(given.cov + LEAST * np.eye(3))))
+
+    def split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return SE3.retract(start.world_from_camera, x[:6]), given.positions + x[6:].reshape(-1, 3)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        pose, local = split(x)
+        nu = gaussian.solve_lower(chol_px, seen.z - model.predict(pose, local[start.rows]))
+        return np.concatenate([nu.ravel(), gaussian.solve_lower(chol_prior, -x)])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        pose, local = split(x)
+        by_pose, by_point, _ = model.jacobians(pose, local[start.rows])
+        assert by_pose is not None and by_point is not None
+        rows = np.zeros((*seen.z.shape, x.size))
+        rows[..., :6] = by_pose @ SE3.right_jacobian(x[:6])
+        for k, m in enumerate(start.rows.tolist()):
+            rows[k, :, 6 + 3 * m : 9 + 3 * m] = by_point[k]
+        rows = gaussian.solve_lower_matrix(chol_px, rows).reshape(-1, x.size)
+        return -np.concatenate([rows, gaussian.solve_lower_matrix(chol_prior, np.eye(x.size))])
+
+    x = least_squares(residual, np.zeros(6 + given.positions.size), jacobian, method="lm").x
+    pose, local = split(x)
+    half = np.linalg.pinv(jacobian(x))
     frame = SE3.inverse(pose)
     half[:6] = -SE3.adjoint(pose) @ SE3.right_jacobian(x[:6]) @ half[:6]  # in the frame's own right chart
     moved = half[6:].reshape(*local.shape, -1) + SE3.transform_jacobian(local) @ half[:6]
@@ -145,41 +168,6 @@ def world_of(filter_: Filter) -> Anchored | None:
     if not isinstance(group, Constellation):
         return None
     return Anchored(*group.frame(landmark_map.read(first)))
-
-
-class _FirstImage:
-    """Whitened residuals by x = (ξ, e_1, …, e_M): group_from_camera = T Exp(ξ), point m at k_m + e_m in the group."""
-
-    def __init__(self, camera: Pinhole, start: KnownStart, cov_frame: np.ndarray) -> None:
-        self.start = start
-        self.model = CameraPoint(camera)
-        self.size = 6 + start.points.positions.size
-        self._chol_px = gaussian.cholesky(start.seen.cov_z)
-        prior = [cov_frame, *(start.points.cov + LEAST * np.eye(3))]
-        self._chol_prior = gaussian.cholesky(block_diag(*prior))
-
-    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """group_from_camera (7,) and the points (M, 3) in the group's frame."""
-        return SE3.retract(self.start.world_from_camera, x[:6]), self.start.points.positions + x[6:].reshape(-1, 3)
-
-    def residual(self, x: np.ndarray) -> np.ndarray:
-        """Of what is seen, then of what was given."""
-        pose, local = self.split(x)
-        nu = self.start.seen.z - self.model.predict(pose, local[self.start.rows])
-        seen = gaussian.solve_lower(self._chol_px, nu).ravel()
-        return np.concatenate([seen, gaussian.solve_lower(self._chol_prior, -x)])
-
-    def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Its derivative by x."""
-        pose, local = self.split(x)
-        by_pose, by_point, _ = self.model.jacobians(pose, local[self.start.rows])
-        assert by_pose is not None and by_point is not None
-        rows = np.zeros((*self.start.seen.z.shape, self.size))
-        rows[..., :6] = by_pose @ SE3.right_jacobian(x[:6])
-        for k, m in enumerate(self.start.rows.tolist()):
-            rows[k, :, 6 + 3 * m : 9 + 3 * m] = by_point[k]
-        seen = gaussian.solve_lower_matrix(self._chol_px, rows).reshape(-1, self.size)
-        return -np.concatenate([seen, gaussian.solve_lower_matrix(self._chol_prior, np.eye(self.size))])
 
 
 def require_texture(image: np.ndarray, known: KnownPixels) -> None:
