@@ -1,6 +1,6 @@
-"""Settings of the filter that every system has: likelihood, proposal, resampling."""
+"""Settings of the filter that every system has: particles, likelihood, proposal, resampling."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -9,7 +9,7 @@ from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahal
 from rbpf.core.models import Likelihood, Proposal, Resampler
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
-from rbpf.ranges import Fraction, Positive, Probability, Range, Ranged
+from rbpf.ranges import Count, Fraction, Positive, Probability, Range, Ranged, Seed
 
 
 @dataclass(frozen=True)
@@ -62,3 +62,16 @@ class ResamplingConfig(Ranged):
         schemes: list[Resampler] = [Systematic(), Stratified(), Residual(), Multinomial()]
         named = {type(scheme).__name__.lower(): scheme for scheme in schemes}
         return EssTriggered(named[self.scheme], self.ess_threshold)
+
+
+@dataclass(frozen=True)
+class RunConfig(Ranged):
+    """A run of any system; what a frame is the system says: an image, a pair that updates the filter, a step, a scan."""
+
+    particles: Count = 100  #: number of particles.
+    seed: Seed = 0  #: of all random generators.
+    #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
+    #: With a joint map one.
+    lag: Count | None = None
+    checkpoint_every: Count = 500  #: frames between checkpoints.
+    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.

@@ -1,25 +1,20 @@
 """How exact what is measured in images is: learnt from what the map makes of it."""
 
 from collections.abc import Callable
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.checkpoint import Kept, integers, numbers
 from rbpf.core.models import Observations
 from rbpf.systems.system import MAP_IDS
 
 #: Measured numbers that a landmark's noise is worth before it is seen again, and that of all landmarks at first.
 OWN_NUMBERS, PRIOR_NUMBERS = 6.0, 30.0
-_SCHEMA = {
-    "ids": integers("learnt", least=0, ascending=True, refers=MAP_IDS),
-    "own": numbers("learnt", 2),
-    "all": numbers(2),
-}
 
 
 @final
-class LearntNoise:
+class LearntNoise(Kept):
     """A factor of the variance that is stated for what is measured, learnt as landmarks are seen: of each its own, or of all.
 
     A keypoint on a corner of a thing keeps its place; one on an edge with something farther behind it has none, and moves
@@ -30,6 +25,13 @@ class LearntNoise:
         alike: no landmark has a factor of its own, but that of all.
         right: as long as the factor of all is not above this, what is stated is right, and it is 1.
     """
+
+    kept: ClassVar = {
+        "_ids": integers("learnt", least=0, ascending=True, refers=MAP_IDS),
+        "_own": numbers("learnt", 2),
+        "_all": numbers(2),
+    }
+    prefix = "noise/"
 
     def __init__(self, alike: bool = False, right: float = 0.0) -> None:
         self.alike, self.right = alike, right
@@ -85,9 +87,3 @@ class LearntNoise:
     def remove(self, ids: np.ndarray) -> None:
         kept = ~np.isin(self._ids, ids)
         self._ids, self._own = self._ids[kept], self._own[kept]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"noise/ids": self._ids, "noise/own": self._own, "noise/all": self._all}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._ids, self._own, self._all = read(arrays, _SCHEMA, "noise/").values()

@@ -9,7 +9,7 @@ wants a record of a run, pictures or files listens to what `track` returns (`Fra
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -20,13 +20,15 @@ import numpy as np
 from rbpf.arrays import Float, Int
 from rbpf.core.checkpoint import elements, fitting, integers, numbers, read, split
 from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import Map, Part
+from rbpf.core.models import Conditional, Map, MotionModel, Part, Proposal, Sensor
+from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
 from rbpf.ranges import require_memory
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
+from rbpf.systems.filtering import RunConfig
 from rbpf.systems.map_estimate import MapEstimate
 
 #: Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds.
@@ -266,15 +268,28 @@ class System(ABC):
     observed: tuple[Ragged, ...] = ()  #: what `Tracked.observed` holds.
     space: SE2Group | SE3Group  #: group of the poses.
     gauge: Gauge = "first frame"  #: what its world has in common with the ground truth's.
-    config: Any  #: all settings.
+    config: RunConfig  #: all settings.
     filter: Filter  #: the particle filter as it is now.
     recorded: bool = False  #: whether the frames have a known end, see `keep_paths`.
 
     @property
     def lag(self) -> int | None:
         """Frames of the particles' paths that are kept, None for all: in bounded memory, unless a recording has an end."""
-        lag: int | None = self.config.lag
-        return LAG if lag is None and not self.recorded else lag
+        return LAG if self.config.lag is None and not self.recorded else self.config.lag
+
+    def new_filter(
+        self,
+        motion: MotionModel,
+        sensor: Sensor,
+        parts: Sequence[Conditional],
+        proposal: Proposal | None = None,
+        window: int = 1,
+    ) -> Filter:
+        """The particle filter as the settings have it; a joint map, its first part, is consolidated after `window` steps."""
+        config, is_joint, rng = self.config, isinstance(parts[0], JointMap), np.random.default_rng(self.config.seed)
+        due = Consolidation(window, config.resampling.ess_threshold) if is_joint else None
+        resampler, lag = config.resampling.build(), 1 if is_joint else self.lag
+        return Filter(motion, sensor, parts, proposal, resampler, config.particles, rng, lag=lag, consolidation=due)
 
     def keep_paths(self, frames: int) -> None:
         """So many frames will be taken, of which the particles' whole paths are kept, unless the settings have a lag.

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rbpf.maps.grid import GridConfig
-from rbpf.ranges import Count, NotNegative, Positive, Ranged, Seed
-from rbpf.systems.filtering import ResamplingConfig
+from rbpf.ranges import Count, NotNegative, Positive, Ranged
+from rbpf.systems.filtering import RunConfig
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,10 @@ class MotionConfig(Ranged):
 
 
 @dataclass(frozen=True)
-class LaserConfig(Ranged):
+class LaserConfig(RunConfig):
     """A run of grid SLAM with a laser scanner."""
 
     particles: Count = 30  #: number of particles.
-    seed: Seed = 0  #: of the only random generator.
     #: a scan is matched and written when the robot has moved so far since the last one that was (0: every scan); in
     #: between the odometry says where it is.
     distance_m: NotNegative = 0.5
@@ -50,9 +49,5 @@ class LaserConfig(Ranged):
     #: length of wall that counts as one measurement, see `rbpf.sensors.laser.Scanner.beams`.
     correlation_m: Positive = 0.25
     least_beams: Count = 10  #: a scan with fewer returns is not used.
-    #: scans of trajectory kept for smoothing; None keeps all of a log, and the last 150 where no end is known.
-    lag: Count | None = None
-    checkpoint_every: Count = 500  #: scans between checkpoints.
     grid: GridConfig = field(default_factory=GridConfig)  #: cells and likelihood.
     motion: MotionConfig = field(default_factory=MotionConfig)  #: noise of the odometry.
-    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.

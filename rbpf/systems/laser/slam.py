@@ -16,7 +16,6 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from rbpf.core.checkpoint import Kept, elements, integers, numbers
-from rbpf.core.filter import Filter
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Prior, Proposed
 from rbpf.core.proposals import PriorProposal
@@ -58,6 +57,7 @@ class LaserSlam(Kept, System):
     name = "laser"
     frame_word = "scan"
     space = SE2
+    config: LaserConfig
     kept: ClassVar = {
         "_pose": elements(SE2),
         "_cov": numbers(3, 3),
@@ -74,15 +74,7 @@ class LaserSlam(Kept, System):
     def __init__(self, scanner: Scanner, config: LaserConfig | None = None) -> None:
         self.scanner, self.config = scanner, (config := config or LaserConfig())
         self.grid = GridMap(config.grid)
-        self.filter = Filter(
-            OdometryMotion(SE2),
-            BeamSensor(GRID),
-            self.grid,
-            resampler=config.resampling.build(),
-            n=config.particles,
-            rng=np.random.default_rng(config.seed),
-            lag=self.lag,
-        )
+        self.filter = self.new_filter(OdometryMotion(SE2), BeamSensor(GRID), [self.grid])
         self.columns = (
             *FILTER_COLUMNS,
             Column("fit", "how well the scan fits the map, of 1; NaN where it was not matched", table=DIAGNOSTICS),

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from rbpf.ranges import Angle, Count, CountOrNone, Formerly, Fraction, NotNegative, Positive, Range, Ranged, Ratio, Seed
-from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
+from rbpf.ranges import Angle, Count, CountOrNone, Formerly, Fraction, NotNegative, Positive, Range, Ranged, Ratio
+from rbpf.systems.filtering import ProposalConfig, RunConfig
 
 
 @dataclass(frozen=True)
@@ -169,11 +169,10 @@ class CalibrationConfig(Ranged):
 
 
 @dataclass(frozen=True)
-class MonoConfig(Ranged):
+class MonoConfig(RunConfig):
     """Monocular SLAM."""
 
     particles: Count = 50  #: number of particles.
-    seed: Seed = 0  #: of the only random generator.
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
     #: how far from its resected place the camera may be at the start, before the known points count.
     start_std_m: NotNegative = 1.0
@@ -202,9 +201,6 @@ class MonoConfig(Ranged):
     calibrate: Literal["off", "online"] = "off"
     #: landmarks started in one frame at most.
     max_new_per_frame: Annotated[CountOrNone, Formerly("births_per_frame")] = 1000
-    #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
-    lag: Count | None = None
-    checkpoint_every: Count = 500  #: frames between checkpoints.
     velocity: VelocityConfig = field(default_factory=VelocityConfig)  #: how the camera moves.
     #: features whose depth is not known yet.
     inverse_depth: Annotated[InverseDepthConfig, Formerly("ray")] = field(default_factory=InverseDepthConfig)
@@ -216,7 +212,6 @@ class MonoConfig(Ranged):
     relocalisation: Annotated[RelocalisationConfig, Formerly("recovery")] = field(default_factory=RelocalisationConfig)
     #: where particles are sampled.
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))
-    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
 
     def start_cov(self) -> np.ndarray:
         """Covariance (6, 6) of where the camera may be at the start, [ω, v]."""

@@ -123,6 +123,7 @@ class MonoSlam(System):
         Ragged("started_px", "where, px", (2,), per="started"),
     )
     space = SE3
+    config: MonoConfig
 
     def __init__(
         self,
@@ -485,8 +486,6 @@ class MonoSlam(System):
         motion: MotionModel = MarginalVelocity(velocity.walk_std())
         if velocity.mode != "marginal":
             motion = SampledVelocity(velocity.walk_std(), velocity.mode, velocity.start_std())
-        proposal, resampling = config.proposal.build(), config.resampling.build()
-        rng = np.random.default_rng(config.seed)
         landmark_map = LandmarkMap(motion.space, compiled=config.compiled)
         landmark_map.register(Point(3))
         landmark_map.register(self.features.unknown_depth.landmark)
@@ -495,7 +494,7 @@ class MonoSlam(System):
         parts: list[Conditional] = [landmark_map]
         if velocity.mode == "marginal":
             parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
-        return Filter(motion, sensor, parts, proposal, resampling, self.config.particles, rng, lag=self.lag)
+        return self.new_filter(motion, sensor, parts, config.proposal.build())
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""

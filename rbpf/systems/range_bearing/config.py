@@ -8,9 +8,9 @@ import numpy as np
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.core.models import Likelihood
-from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged, Seed
+from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged
 from rbpf.sensors.readers import LogNoise
-from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, RunConfig
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,9 @@ class AssociationConfig(Ranged):
 
 
 @dataclass(frozen=True)
-class RangeBearingConfig(Ranged):
+class RangeBearingConfig(RunConfig):
     """A run of range-bearing SLAM."""
 
-    particles: Count = 100  #: number of particles.
-    seed: Seed = 0  #: of the only random generator.
     #: landmarks named by the log, or by maximum likelihood, in each of some hypotheses: on a joint map.
     association: Literal["known", "ml"] = "known"
     #: one Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true; or
@@ -60,16 +58,11 @@ class RangeBearingConfig(Ranged):
     #: the map becomes; a log that names fewer has one. None keeps one Gaussian of all.
     submap: Count | None = 150
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
-    #: steps of trajectory kept for smoothing; None keeps all of a log, and the last 150 where no end is known. With a joint
-    #: map one.
-    lag: Count | None = None
-    checkpoint_every: Count = 500  #: steps between checkpoints.
     #: steps between re-estimations of where the known start lies in each particle's world; 0 never. A joint map needs
     #: none: it knows its frame's place.
     anchor_every: CountOrNone = 10
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
     proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
-    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
     #: of an innovation; by default Gaussian. Of a log whose readings may be misread (MRCLAM) with outliers, if the log's
     #: names are used: particles that differ in what no reading tells, as the heading after a blind turn, are else
     #: chosen among by the first wrong one.

@@ -11,9 +11,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import elements, integers, read_one
 from rbpf.core.diagnostics import motion_correction
-from rbpf.core.filter import Filter
-from rbpf.core.models import NULL
-from rbpf.core.resampling import Consolidation
+from rbpf.core.models import NULL, Conditional
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
@@ -49,6 +47,7 @@ class RangeBearingSlam(System):
 
     name: ClassVar[str] = "range-bearing"
     frame_word: ClassVar[str] = "step"
+    config: RangeBearingConfig
 
     def __init__(
         self,
@@ -89,17 +88,8 @@ class RangeBearingSlam(System):
         self.anchor: StartAnchor | None = None
         if config.anchor_every and joint is None:
             self.anchor = StartAnchor(own, self.model, config.anchor_every, likelihood)
-        self.filter = Filter(
-            OdometryMotion(space),
-            sensor,
-            [joint or own, *([] if self.anchor is None else [self.anchor])],
-            config.proposal.build(),
-            config.resampling.build(),
-            config.particles,
-            np.random.default_rng(config.seed),
-            lag=1 if joint else self.lag,
-            consolidation=Consolidation(config.window, config.resampling.ess_threshold) if joint else None,
-        )
+        parts: list[Conditional] = [joint or own, *([] if self.anchor is None else [self.anchor])]
+        self.filter = self.new_filter(OdometryMotion(space), sensor, parts, config.proposal.build(), config.window)
         self.hypotheses: Hypotheses | None = None
         if is_unnamed:
             self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)

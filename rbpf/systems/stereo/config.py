@@ -9,12 +9,12 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import MotionPrior, VoConfig
-from rbpf.ranges import Angle, Count, CountOrNone, Formerly, NotNegative, Positive, Range, Ranged, Ratio, Seed
+from rbpf.ranges import Angle, Count, CountOrNone, Formerly, NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.descriptors import MatchLimits
 from rbpf.sensors.features import SiftConfig
 from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.stereo import PairConfig
-from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, RunConfig
 
 OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0
 """Of the pixels (u_left, v, u_right): an image, and disparities of so many pixels."""
@@ -119,17 +119,13 @@ class RecoveryConfig(Ranged):
 
 
 @dataclass(frozen=True)
-class StereoConfig(Ranged):
+class StereoConfig(RunConfig):
     """A run of stereo SLAM."""
 
     particles: Count = 400  #: number of particles.
-    seed: Seed = 0  #: of all random generators.
     #: degrees of freedom of the camera: 6, or 3 for one that moves in its x–z plane and turns about y.
     dof: Literal[3, 6] = 6
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
-    #: updates of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
-    lag: Count | None = None
-    checkpoint_every: Count = 500  #: pairs between checkpoints.
     sift: SiftConfig = field(default_factory=SiftConfig)  #: keypoints of the images.
     pair: PairConfig = field(default_factory=PairConfig)  #: matching of the two images of a pair.
     odometry: OdometryConfig = field(default_factory=OdometryConfig)  #: motion from pair to pair.
@@ -144,7 +140,6 @@ class StereoConfig(Ranged):
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))  #: where particles are sampled.
     #: what is done after a motion that was only assumed.
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
-    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
 
     @classmethod
     def joint(cls) -> Self:

@@ -14,10 +14,8 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, poses, read, truths
-from rbpf.core.filter import Filter
 from rbpf.core.models import NULL, Landmark, Part, Proposal
 from rbpf.core.particles import Estimate
-from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
@@ -110,6 +108,7 @@ class StereoSlam(System):
         Ragged("previous", "row of the point in the last measured pair; −1 where there is none", kind="int64", per="z"),
     )
     space = SE3
+    config: StereoConfig
 
     def __init__(
         self,
@@ -151,17 +150,8 @@ class StereoSlam(System):
             )
         own = LandmarkMap(SE3, compiled=config.compiled)
         own.register(front_end.landmarks.landmark)
-        self.filter = Filter(
-            OdometryMotion(SE3, added, free),
-            front_end.landmarks,
-            joint or own,
-            self._proposal.build(),
-            config.resampling.build(),
-            config.particles,
-            np.random.default_rng(config.seed),
-            lag=1 if joint else self.lag,
-            consolidation=Consolidation(config.map.window, config.resampling.ess_threshold) if joint else None,
-        )
+        odometry, sensor, proposal = OdometryMotion(SE3, added, free), front_end.landmarks, self._proposal.build()
+        self.filter = self.new_filter(odometry, sensor, [joint or own], proposal, config.map.window)
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
