@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from rbpf.cli import main
 from tests.cli.mono_sequences import as_folder, render_desk
+from tests.cli.run_outputs import STEPS
 from tests.cli.stereo_sequences import render_room
 
 
@@ -17,6 +19,14 @@ def cheap(plain_pictures: None) -> None:
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A few images of a desk with known points; not to be written to."""
     return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot's; not to be written to."""
+    folder = tmp_path_factory.mktemp("simulated") / "log"
+    assert main(["simulate", "range-bearing", "--out", str(folder), "--steps", str(STEPS), "--landmarks", "30"]) == 0
+    return folder
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+STEPS = 20  #: Of the robot that is simulated.
 #: What a run of every system leaves, of one with ground truth.
 FILES = {
     "checkpoint.npz", "trajectory.tum", "trajectory.npz", "map.npz", "map.csv", "truth.npz", "observations.csv", "timings.csv",

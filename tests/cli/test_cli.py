@@ -17,9 +17,8 @@ from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.cli.mono_sequences import sentence
-from tests.cli.run_outputs import FILES, REQUIRED, layout, names, outputs
+from tests.cli.run_outputs import FILES, REQUIRED, STEPS, layout, names, outputs
 
-STEPS = 20
 OWN_FILES = {
     "odometry.tum", "observations_odometry.csv", "ess.png", "groundtruth_landmarks.png", "groundtruth_map.png"
 }  # fmt: skip
@@ -27,13 +26,6 @@ OWN_ENTRIES = {
     "landmarks", "resamplings", "ess_mean", "log_evidence", "path_rmse_m", "landmark_error_mean_m",
     "landmark_error_aligned_mean_m",
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("simulated") / "log"
-    assert main(["simulate", "range-bearing", "--out", str(folder), "--steps", str(STEPS), "--landmarks", "30"]) == 0
-    return folder
 
 
 def run(log, out, *arguments):

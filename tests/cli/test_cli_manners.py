@@ -22,13 +22,6 @@ from tests.cli.run_outputs import outputs
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("simulated") / "log"
-    assert main(["simulate", "range-bearing", "--out", str(folder), "--steps", "30"]) == 0
-    return folder
-
-
 def quick(log, out, *arguments):
     """Arguments of a short run."""
     return ["run", "range-bearing", str(log), "--out", str(out), "--particles", "20", "--no-batch", *arguments]
