@@ -8,8 +8,8 @@ import json
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,23 +17,7 @@ import numpy as np
 from rbpf.core.checkpoint import _digest, load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.runs.run import Run
-from rbpf.systems.mono.config import MonoConfig, StartConfig
-from rbpf.systems.mono.slam import MonoSlam
-from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.slam import RangeBearingSlam
-from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.front_end import NamedFrontEnd
-from rbpf.systems.stereo.slam import StereoSlam
-from rbpf.systems.system import System
-
-
-@dataclass
-class Case:
-    """A system, frames before the checkpoint, and frames after it."""
-
-    make: Callable[[], System]
-    before: list
-    after: list
+from tests.systems.test_contract import RESUMED, Case
 
 
 @dataclass
@@ -46,76 +30,13 @@ class Listed:
         raise NotImplementedError
 
 
-def mono(known: bool) -> Case:
-    from tests.systems.plane_sequences import CAMERA, known_points, sequence
-
-    config, points = MonoConfig(particles=4), known_points() if known else None
-    frames = list(sequence(11).frames())
-    return Case(lambda: MonoSlam(CAMERA, config, points), frames[:9], frames[9:])
-
-
-def named(known: bool) -> Case:
-    from tests.systems.mono_logs import SMALL, desk, without_known
-
-    log = desk(2, frames=10)
-    config = replace(SMALL, start=StartConfig(first_adjustment=4))
-    used = log if known else without_known(log)
-    return Case(lambda: MonoSlam(log.camera, config, used.known), used.frames[:8], used.frames[8:])
-
-
-def stereo() -> Case:
-    from tests.systems.stereo_sequences import pairs
-
-    sequence = pairs(7)
-    frames = list(sequence.frames())
-    config = StereoConfig(particles=10, trigger=TriggerConfig(0.0, 0.0))
-    return Case(lambda: StereoSlam(sequence.rig, config), frames[:6], frames[6:])
-
-
-def named_stereo() -> Case:
-    from examples.studies.lab import LabDrive
-    from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
-
-    world = LabWorld(LabDrive(frames=8, every=4), points=2000)
-    log = simulate_features(world, Measuring(known=0, measurements=20, new_per_frame=20), STEREO, 0)
-    config = StereoConfig(particles=10, trigger=TriggerConfig(0.0, 0.0))
-    make = lambda: StereoSlam(log.camera, config, front_end=NamedFrontEnd(log.camera, config))  # noqa: E731
-    return Case(make, log.frames[:6], log.frames[6:])
-
-
-def robot(**options: str) -> Case:
-    from tempfile import TemporaryDirectory
-
-    from rbpf.sensors.readers import open_log
-    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-
-    with TemporaryDirectory() as folder:
-        simulate_robot(RobotWorld(steps=24, landmarks=8), Path(folder), seed=0)
-        log = open_log(Path(folder))
-    config = RangeBearingConfig(particles=4, anchor_every=3, **options)
-    return Case(lambda: RangeBearingSlam.of_log(log, config), log.frames[:20], log.frames[20:])
-
-
-def returning() -> Case:
-    from examples.studies.hypotheses import corridor
-
-    log, config = corridor(0), RangeBearingConfig(particles=4, association="ml", map="joint")
-    return Case(
-        lambda: RangeBearingSlam.of_log(log, config, keep_associations=True), log.frames[:59], log.frames[59:63]
+CASES = {
+    name: RESUMED[name]
+    for name in (
+        "known points", "nothing known", "named", "named, nothing known", "pairs", "named pairs", "robot, own maps",
+        "robot, unnamed", "robot, joint map",
     )
-
-
-CASES: dict[str, Callable[[], Case]] = {
-    "mono": lambda: mono(True),
-    "mono, nothing known": lambda: mono(False),
-    "named features": lambda: named(True),
-    "named features, nothing known": lambda: named(False),
-    "stereo": stereo,
-    "named stereo": named_stereo,
-    "robot": lambda: robot(map="particles"),
-    "robot, hypotheses": returning,
-    "robot, joint map": robot,
-}
+}  # fmt: skip
 
 
 def damages(array: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, np.ndarray | None]]:
@@ -144,12 +65,12 @@ def damages(array: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, 
         yield f"all are {value}", np.full_like(array, value)
 
 
-def tried(case: Case, path: Path) -> str:
+def tried(case: Case, after: list, path: Path) -> str:
     """What comes of a checkpoint: "refused", "went on", or a traceback."""
     run = Run(Listed(), case.make())
     try:
         run.load(path)
-        for frame in case.after:
+        for frame in after:
             run.take(frame)
         run.system.map(), run.system.summary(run.log), run.system.files(run.log)
         run.system.measurements("listed", run.log), run.log.states, [*map(run.log.observed, range(len(run.log)))]
@@ -166,13 +87,14 @@ def tell(name: str, damage: str, **result: str) -> None:
 
 def try_damages(name: str, folder: Path, most: int) -> None:
     """Tries so many damages of a case's checkpoint, in an order drawn at random."""
-    case, rng = CASES[name](), np.random.default_rng(0)
-    run = Run(Listed(), case.make())
-    for frame in case.before:
+    case, rng = CASES[name], np.random.default_rng(0)
+    run, frames = Run(Listed(), case.make()), case.frames()
+    before, after = frames[: case.after[-1] + 1], frames[case.after[-1] + 1 :]
+    for frame in before:
         run.take(frame)
     path = folder / "damaged.npz"
     run.save(path)
-    tell(name, "none", result=tried(case, path))
+    tell(name, "none", result=tried(case, after, path))
     arrays = load_arrays(path)
     header = json.loads(str(arrays.pop("header")))
     # Of many arrays of one kind the first two are enough.
@@ -183,7 +105,7 @@ def try_damages(name: str, folder: Path, most: int) -> None:
         tell(name, f"{key}: {words}")
         changed = {n: a for n, a in arrays.items() if n != key} | ({} if value is None else {key: value})
         save_arrays(path, {"header": np.array(json.dumps(header | {"digest": _digest(changed)})), **changed})
-        tell(name, f"{key}: {words}", result=tried(case, path))
+        tell(name, f"{key}: {words}", result=tried(case, after, path))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,8 @@ import pytest
 
 from examples.studies.hypotheses import corridor
 from examples.studies.image_faults import blur_motion
-from examples.studies.point_worlds import MONO, Measuring, RoomWorld, simulate_features
+from examples.studies.lab import LabDrive
+from examples.studies.point_worlds import MONO, STEREO, LabWorld, Measuring, RoomWorld, simulate_features
 from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
 from rbpf.lie import SE2
@@ -18,7 +19,8 @@ from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
-from rbpf.systems.stereo.config import MapConfig, StereoConfig
+from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import LAG, System, TrackingState
 from tests.core.worlds import content, same
@@ -31,6 +33,9 @@ pytestmark = pytest.mark.usefixtures("keypoints_once")
 KNOWN, LOG, DARK = known_points(), desk(2, frames=8), np.zeros((240, 320), dtype=np.uint8)
 ROOM = simulate_features(RoomWorld(frames=24, laps=0.15, points=120), Measuring(), MONO, 0)
 """A way along a wall: points leave the view."""
+PIXELS = simulate_features(
+    LabWorld(LabDrive(frames=8, every=4), points=2000), Measuring(known=0, measurements=20, new_per_frame=20), STEREO, 0
+)
 LOST = {TrackingState.TRACKED, TrackingState.LOST}
 
 
@@ -40,6 +45,11 @@ def mono(points=None, **options) -> System:
 
 def stereo(**options) -> System:
     return StereoSlam(pairs(1).rig, StereoConfig(particles=60, **options))
+
+
+def named_pairs() -> System:
+    config = StereoConfig(particles=10, trigger=TriggerConfig(0.0, 0.0))
+    return StereoSlam(PIXELS.camera, config, front_end=NamedFrontEnd(PIXELS.camera, config))
 
 
 def blinking(t, image):
@@ -119,6 +129,12 @@ RESUMED = {
         (0, 5, 7),
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
+    "named pairs": Case(named_pairs, lambda: PIXELS.frames, (0, 5)),
+    "robot, own maps": Case(
+        lambda: robot(RangeBearingConfig(particles=4, anchor_every=3, map="particles"))[0],
+        lambda: list(islice(robot()[1], 12)),
+        (0, 5, 9),
+    ),
     "robot, joint map": Case(
         lambda: robot(RangeBearingConfig(particles=10, window=4))[0], lambda: list(islice(robot()[1], 16)), (0, 5, 9)
     ),
