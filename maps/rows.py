@@ -84,17 +84,17 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
     says whether one has a single component. Raises InputError: ids are missing, of a wrong shape, or of no landmark held.
     """
     plan = Plan(np.zeros(n))
-    named = [_checked_ids(group, n, kinds) for group in groups]
+    found = [_checked_ids(group, n, kinds) for group in groups]
+    named = [ids for ids, _ in found]
     for group, ids in zip(groups, named, strict=True):
         for outcome, log_density in ((NEW, group.log_new), (NULL, group.log_clutter)):
             if log_density != 0.0:
                 count = (ids == outcome).sum(axis=-1)
                 plan.log_factor += np.where(count > 0, log_density, 0.0) * count
     # Where all particles agree, no landmark is observed twice and each group's have one plain parametrisation.
-    landmarks = [ids[ids >= 0] for ids in named]
-    seen = np.concatenate([np.zeros(0, dtype=np.int64), *landmarks])
-    agreed = all(ids.ndim == 1 for ids in named) and np.unique(seen).size == seen.size
-    if agreed and all(plain[of].all() and np.unique(of).size <= 1 for of in map(kinds, landmarks)):
+    seen = [landmark for ids in named if ids.ndim == 1 for landmark in ids.tolist() if landmark >= 0]
+    agreed = all(ids.ndim == 1 for ids in named) and len(set(seen)) == len(seen)
+    if agreed and all(plain[of[:1]].all() and (of == of[:1]).all() for _, of in found):
         chosen = [np.flatnonzero(ids >= 0) for ids in named]
         plan.batches = [Batch(number, ks, named[number][ks]) for number, ks in enumerate(chosen) if ks.size]
         return plan
@@ -126,7 +126,8 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
     return plan
 
 
-def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
+def _checked_ids(group: Observations, n: int, kinds: Kinds) -> tuple[np.ndarray, np.ndarray]:
+    """The landmarks of a group's measurements, and the kinds of those that are some."""
     ids, count = group.ids, group.z.shape[0]
     if ids is None:
         raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
@@ -135,10 +136,10 @@ def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
     if ids.dtype.kind != "i" or (ids.size and ids.min() < NEW):
         raise InputError(f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2")
     named = ids[ids >= 0]
-    held = kinds(named) >= 0
-    if not held.all():
-        raise InputError(f"a measurement names landmark {named[~held][0]}, which the map does not hold")
-    return ids
+    of = kinds(named)
+    if (of < 0).any():
+        raise InputError(f"a measurement names landmark {named[of < 0][0]}, which the map does not hold")
+    return ids, of
 
 
 def _rows(number: int, ids: np.ndarray) -> list[Row]:

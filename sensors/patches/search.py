@@ -128,8 +128,7 @@ def search(
     found = np.full((count, 7), np.nan)
     found[:, 2:4] = -1.0
     # What it costs, in the unit of `rbpf.kernels.signature`.
-    variance = np.nan_to_num(np.maximum(covs[:, [0, 1], [0, 1]], 0.0))
-    reach = np.minimum(limits[0] * np.sqrt(variance), limits[1])
+    reach = np.minimum(limits[0] * np.sqrt(np.fmax(covs.diagonal(axis1=1, axis2=2), 0.0)), limits[1])
     sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])
     products = float(sides.prod(axis=1).sum()) * templates.shape[1] ** 2
     pairs = int(products * PAIRS_PER_PRODUCT + count * PAIRS_PER_TEMPLATE)

@@ -83,6 +83,8 @@ class RobustMotionGate(OutlierGate):
         increment, spread = factor @ u, gaussian.symmetrise(factor @ np.linalg.solve(info, factor.T))
         squared = np.empty(nu.shape[0])
         squared[trusted] = np.square(white - slope @ u).sum(axis=1)
+        if trusted.all():
+            return MotionFit(squared, increment, spread)
         jac, cov, off = jac[~trusted], cov[~trusted], (nu - jac @ increment)[~trusted]
         given = cov + jac @ spread @ np.swapaxes(jac, -1, -2)
         squared[~trusted] = (off * np.linalg.solve(given, off[..., None])[..., 0]).sum(axis=-1)
@@ -236,5 +238,7 @@ class ActiveSearch:
         One with a depth more uncertain than that, cov (K, 2, 2) where the camera is known, agrees with every motion:
         which of several places that look alike is the right one cannot be told.
         """
-        own = self.config.ellipse_sigmas * np.sqrt(np.linalg.eigvalsh(cov)[:, -1])
+        # The larger eigenvalue of each.
+        middle, apart = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1]), 0.5 * (cov[:, 0, 0] - cov[:, 1, 1])
+        own = self.config.ellipse_sigmas * np.sqrt(middle + np.hypot(apart, cov[:, 0, 1]))
         return np.asarray(own <= WIDEST * self.config.max_radius_px)
