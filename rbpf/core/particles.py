@@ -19,6 +19,7 @@ from rbpf.lie import LieGroup
 
 #: Fields of `Information` that add up over independent observations.
 SUMMED = "info", "vector", "quad", "log_det", "log_factor", "rows"
+ROUNDING = 1e-15  #: Fraction of the largest variance of a sum that others must exceed.
 NOTHING_MOVED = 1e-12  #: χ² below which weights differ by rounding alone.
 
 
@@ -199,8 +200,11 @@ def balanced(
         return noise if left > 0.0 else np.zeros_like(noise)
     column = weights[:, None]
     noise, apart = noise - weighted_mean(noise, weights), apart - weighted_mean(apart, weights)
-    inverse = np.linalg.pinv((column * apart).T @ apart, hermitian=True)
-    noise = noise - apart @ (inverse @ ((column * apart).T @ noise))
+    # What is apart by rounding alone, against its largest spread, is not taken out.
+    values, vectors = np.linalg.eigh((column * apart).T @ apart)
+    spread = values > ROUNDING * values[-1:]
+    root = vectors[:, spread] / np.sqrt(values[spread])
+    noise = noise - apart @ (root @ (root.T @ ((column * apart).T @ noise)))
     chol = np.linalg.cholesky((column * noise).T @ noise / left)
     return np.linalg.solve(chol, noise.T).T
 
