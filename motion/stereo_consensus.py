@@ -45,16 +45,25 @@ def consensus(
     """
     config, search = config or RansacConfig(), _Search(matches, start)
     best, lowest, fraction = start, np.inf, 0.0
-    motions = np.stack([start, SE3.identity()])
-    for tried in range(0, config.max_triples, config.batch):
-        if tried > config.needed(fraction):
-            break
-        found = search.candidates(triples(len(matches), config.batch, rng))
+    motions, batch, tried = np.stack([start, SE3.identity()]), config.batch, 0
+    while tried < config.max_triples and tried <= config.needed(fraction):
+        # Twice as many each time, looked at batch by batch as if they were drawn so: what is not needed is not drawn.
+        before = rng.bit_generator.state
+        count = batch * min(max(tried // batch, 1), -(-(config.max_triples - tried) // batch))
+        found = search.candidates(triples(len(matches), count, rng))
         motions = np.concatenate([motions, found]) if tried == 0 else found
         scores, fractions = search.scores(motions, gate)
-        if scores.min() < lowest:
-            first = scores.argmin()
-            best, lowest, fraction = motions[first], scores[first], float(fractions[first])
+        last = tried + count
+        for end in range(len(motions) - count + batch, len(motions) + 1, batch):
+            first = int(scores[:end].argmin())
+            if scores[first] < lowest:
+                best, lowest, fraction = motions[first], scores[first], float(fractions[first])
+            tried += batch
+            if tried > config.needed(fraction):
+                break
+        if tried < last:
+            rng.bit_generator.state = before
+            triples(len(matches), count - (last - tried), rng)
     return best
 
 

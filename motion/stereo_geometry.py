@@ -16,6 +16,7 @@ says which m̂: by default that of least Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, Protocol
 
 import numpy as np
@@ -140,16 +141,21 @@ def intrinsics(camera: StereoCamera) -> Array:
 
 
 def pixels_from_points(camera: StereoCamera) -> Array:
-    """Q (4, 4)."""
-    one, shift = camera.camera, camera.camera.fx * camera.baseline_m
-    return np.array(
-        [[one.fx, 0.0, one.cx, 0.0], [0.0, one.fy, one.cy, 0.0], [one.fx, 0.0, one.cx, -shift], [0.0, 0.0, 1.0, 0.0]]
-    )
+    """Q (4, 4), which is not to be written into."""
+    return _projective(*intrinsics(camera).tolist())[0]
 
 
 def points_from_pixels(camera: StereoCamera) -> Array:
-    """Q⁻¹ (4, 4)."""
-    return np.asarray(np.linalg.inv(pixels_from_points(camera)), dtype=float)
+    """Q⁻¹ (4, 4), which is not to be written into."""
+    return _projective(*intrinsics(camera).tolist())[1]
+
+
+@lru_cache(maxsize=16)
+def _projective(fx: float, fy: float, cx: float, cy: float, shift: float) -> tuple[Array, Array]:
+    q = np.array([[fx, 0.0, cx, 0.0], [0.0, fy, cy, 0.0], [fx, 0.0, cx, -shift], [0.0, 0.0, 1.0, 0.0]])
+    back = np.asarray(np.linalg.inv(q), dtype=float)
+    q.flags.writeable = back.flags.writeable = False
+    return q, back
 
 
 def homography(camera: StereoCamera, delta: Array) -> Array:
