@@ -7,7 +7,7 @@ seeds: 5                               # 0 … 4; or a list
 options:                               # by default one, as it is
   as it is: {}
   one linearisation: {proposal.iterations: 1}
-settings: {anchor_every: 10}           # of all runs
+settings: {window: 10}                 # of all runs
 
 rows.jsonl   one line per finished run, written as soon as it is done; a sweep that is called again computes the rest
 table.csv    one row per run, one column per figure: CSV, because pandas, polars, R and spreadsheets read it and

@@ -5,7 +5,7 @@ honest filter, and stays in the green band in 95 % of the steps. A filter is ove
 leaves the band upwards and does not come back (`left_for_good`). The upper pictures have
 the curves for three numbers of particles. The lower ones have, for the middle number, what each remedy does to the mean
 over all steps: iterating the proposal's linearisation, the exact importance ratio instead of the linearised weight,
-re-estimating the start (range-bearing), marginalising the frame of the known points instead of sampling the start
+marginalising the frame of the known points instead of sampling the start
 (monocular), or the lack of each.
 """
 
@@ -320,8 +320,6 @@ def robot_trials(steps: int, particles: tuple[int, ...]) -> tuple[Trials, Trials
         "bootstrap proposal": replace(base, proposal=ProposalConfig(kind="prior")),
         "one linearisation": replace(base, proposal=ProposalConfig(iterations=1)),
         "linearised weights": replace(base, proposal=ProposalConfig(weights="linearised")),
-        "start never re-estimated": replace(base, anchor_every=0),
-        "start re-estimated in every step": replace(base, anchor_every=1),
     }
     sizes = {f"{n} particles": RobotTrial(world, RangeBearingConfig(particles=n, map="particles")) for n in particles}
     return sizes, {name: RobotTrial(world, config) for name, config in changed.items()}

@@ -24,7 +24,6 @@ from rbpf.core.models import (
     Belief,
     Conditional,
     MotionModel,
-    NewLandmarks,
     Observations,
     Part,
     Proposal,
@@ -75,8 +74,7 @@ class StepReport:
     #: does not associate it with a known landmark, or that the likelihood gates as an outlier.
     rows: float
     groups: Sequence[Observations]  #: the observations that were used.
-    first_observations: Sequence[NewLandmarks]  #: what landmarks were started from.
-    new_landmarks: np.ndarray  #: their ids, in that order.
+    new_landmarks: np.ndarray  #: ids of those that were started.
 
     @cached_property
     def estimate(self) -> Estimate:
@@ -255,7 +253,7 @@ class Filter:
             mixture, second = (Prior.exactly(self.space, state), None, log_weights), None
 
         # Start landmarks, look for signs of failure, and report.
-        first_observations, new_landmarks = self._start_landmarks(frame, groups)
+        new_landmarks = self._start_landmarks(frame, groups)
         evidence = look_ahead + correction if are_explained(groups) else float("nan")
         self.log_evidence += evidence
         ess = effective_sample_size(weights)
@@ -286,7 +284,6 @@ class Filter:
             nis=nis,
             rows=rows,
             groups=groups,
-            first_observations=first_observations,
             new_landmarks=new_landmarks,
         )
 
@@ -448,16 +445,15 @@ class Filter:
         self.stamp_ns = stamp_ns
         self.history.record(stamp_ns, self.particles.state, self.particles.log_weights)
 
-    def _start_landmarks(self, frame: object, groups: list[Observations]) -> tuple[list[NewLandmarks], np.ndarray]:
+    def _start_landmarks(self, frame: object, groups: list[Observations]) -> np.ndarray:
         belief = self.belief()
-        born, ids, first = list[NewLandmarks](), [np.zeros(0, dtype=np.int64)], 0
+        ids, first = [np.zeros(0, dtype=np.int64)], 0
         for sensor, end in zip(self.sensors, self._ends, strict=True):
             its = told(belief, sensor)
             for new_landmarks in sensor.new_landmarks(frame, its, groups[first:end]):
                 ids.append(its.map.add(new_landmarks, self.particles.state))
-                born.append(new_landmarks)
             first = end
-        return born, np.concatenate(ids)
+        return np.concatenate(ids)
 
 
 def are_explained(groups: Sequence[Observations]) -> bool:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from rbpf import gaussian
 from rbpf.core.filter import Filter
 from rbpf.core.models import Records
 from rbpf.lie import SE2Group
@@ -46,26 +45,22 @@ class MapEstimate:
         return MapEstimate(self.ids[full], self.mean[full], self.cov[full], columns)
 
 
-def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstimate:
-    """Moments of every landmark, relative to the start where it is `anchored`."""
+def estimate_map(filter_: Filter) -> MapEstimate:
+    """Moments of every landmark."""
     belief, dim = filter_.belief(), 2 if isinstance(filter_.space, SE2Group) else 3
     landmark_map = belief.map
     if isinstance(landmark_map, JointMap):
         return MapEstimate(*landmark_map.landmarks(filter_.particles))
     ids = landmark_map.ids
-    if anchored is None or not ids.size:
-        mean, cov = belief.moments(ids)
-    else:
-        points = relative_points(filter_.space, anchored, landmark_map.read(ids))
-        mean, cov = gaussian.mixture_moments(belief.weights, *points)
+    mean, cov = belief.moments(ids)
     return MapEstimate(ids, mean.reshape(-1, dim), cov.reshape(-1, dim, dim))
 
 
 def relative_points(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, K, D) of landmarks relative to the start, and their covariances with the start's."""
-    model, start = RelativePosition(space), anchored.mean[:, None]
-    jac = model.jacobians(start, records.mean)
+    """Positions (N, K, D) of landmarks relative to the frame, and their covariances with the frame's."""
+    model, frame = RelativePosition(space), anchored.mean[:, None]
+    jac = model.jacobians(frame, records.mean)
     assert jac.state is not None and jac.landmark is not None
     moved = jac.state @ anchored.factor[:, None]
     turned = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
-    return model.predict(start, records.mean), turned + moved @ np.swapaxes(moved, -1, -2)
+    return model.predict(frame, records.mean), turned + moved @ np.swapaxes(moved, -1, -2)

@@ -131,7 +131,7 @@ RESUMED = {
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
     "named pairs": Case(named_pairs, lambda: PIXELS.frames, (0, 5)),
     "robot, own maps": Case(
-        lambda: robot(RangeBearingConfig(particles=4, anchor_every=3, map="particles"))[0],
+        lambda: robot(RangeBearingConfig(particles=4, map="particles"))[0],
         lambda: list(islice(robot()[1], 12)),
         (0, 5, 9),
     ),

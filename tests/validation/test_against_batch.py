@@ -43,7 +43,7 @@ from tests.validation.worlds import linear_log
 
 @pytest.fixture(scope="module")
 def linear_run():
-    return filter_opened(open_robot_log(linear_log(), RangeBearingConfig(particles=2000, anchor_every=0)))
+    return filter_opened(open_robot_log(linear_log(), RangeBearingConfig(particles=2000)))
 
 
 @pytest.fixture

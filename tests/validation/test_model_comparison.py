@@ -123,7 +123,7 @@ def test_runs_are_compared_by_their_folders(tmp_path, capsys, plain_pictures):
     settings = {"a": {}, "b": {"noise": LogNoise(std_range_m=0.2)}, "c": {"likelihood": LikelihoodConfig("truncated")}}
     recording = RobotRecording(tmp_path / "log")
     for name, setting in settings.items():
-        run = filter_recording(recording, RangeBearingConfig(particles=50, anchor_every=0, **setting))
+        run = filter_recording(recording, RangeBearingConfig(particles=50, **setting))
         write_run(run, tmp_path / name, recording.sources())
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--seeds", "2", "--workers", "1"]) == 0
     assert "explains the recording better than" in capsys.readouterr().err.replace("\n", " ")

@@ -20,7 +20,7 @@ PLAN = {
     "particles": [5, 10],
     "seeds": 2,
     "options": {"as it is": {}, "one linearisation": {"proposal.iterations": 1}},
-    "settings": {"anchor_every": 5},
+    "settings": {"window": 5},
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.core.models import Likelihood
-from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged
+from rbpf.ranges import Count, NotNegative, Positive, Probability, Range, Ranged
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, RunConfig
 
@@ -58,9 +58,6 @@ class RangeBearingConfig(RunConfig):
     #: the map becomes; a log that names fewer has one. None keeps one Gaussian of all.
     submap: Count | None = 150
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
-    #: steps between re-estimations of where the known start lies in each particle's world; 0 never. A joint map needs
-    #: none: it knows its frame's place.
-    anchor_every: CountOrNone = 10
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
     proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
     #: of an innovation; by default Gaussian. Of a log whose readings may be misread (MRCLAM) with outliers, if the log's

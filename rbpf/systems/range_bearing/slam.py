@@ -11,7 +11,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import elements, integers, read_one
 from rbpf.core.diagnostics import motion_correction
-from rbpf.core.models import NULL, Conditional
+from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
@@ -23,7 +23,6 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.measurements import Kind, Measurements
-from rbpf.systems.anchoring import StartAnchor, relative_estimate
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.hypotheses import HYPOTHESES, Hypotheses
@@ -72,24 +71,23 @@ class RangeBearingSlam(System):
             self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
         self.kept_map, self.why_map = config.kept_map()
-        joint, is_unnamed = None, config.association == "ml"
-        if self.kept_map == "joint":
-            unnamed = is_unnamed and config.submap is not None
-            joint = JointMap(space, compiled=config.compiled, submap=config.submap, unnamed=unnamed)
-        elif is_unnamed:
+        is_joint, is_unnamed = self.kept_map == "joint", config.association == "ml"
+        if is_unnamed and not is_joint:
             raise InputError(
                 "association=ml needs a joint map: leave out map=particles and lag; in a program, a filter with an "
                 "AnonymousLandmarkSensor associates in every particle"
             )
-        own = LandmarkMap(space, compiled=config.compiled)
-        own.register(self.point)
+        landmark_map: JointMap | LandmarkMap
+        if is_joint:
+            unnamed = is_unnamed and config.submap is not None
+            landmark_map = JointMap(space, compiled=config.compiled, submap=config.submap, unnamed=unnamed)
+        else:
+            landmark_map = LandmarkMap(space, compiled=config.compiled)
+            landmark_map.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
-        self.anchor: StartAnchor | None = None
-        if config.anchor_every and joint is None:
-            self.anchor = StartAnchor(own, self.model, config.anchor_every, likelihood)
-        parts: list[Conditional] = [joint or own, *([] if self.anchor is None else [self.anchor])]
-        self.filter = self.new_filter(OdometryMotion(space), sensor, parts, config.proposal.build(), config.window)
+        motion = OdometryMotion(space)
+        self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
         self.hypotheses: Hypotheses | None = None
         if is_unnamed:
             self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
@@ -152,12 +150,7 @@ class RangeBearingSlam(System):
         if odometry is not None:
             self._odometry = self.space.compose(self._odometry, odometry.delta)
 
-        # Poses are reported relative to where the start lies in each particle's world, as far as that is known by now.
         estimate = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
-        if self.anchor is not None:
-            particles, anchored = self.filter.particles, self.anchor.after_step(report)
-            estimate = relative_estimate(self.space, anchored, particles.state, particles.log_weights)
-
         d, e = self.space.dim, self.space.size
         correction = motion_correction(report.mixture)
         return Tracked(
@@ -184,7 +177,7 @@ class RangeBearingSlam(System):
         return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
 
     def map(self) -> MapEstimate:
-        found = estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
+        found = estimate_map(self.filter)
         if self.hypotheses is None:
             return found
         held = self.hypotheses.held[0].exist(found.ids)
