@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 
 from rbpf.cli import main
-from tests.cli.mono_sequences import as_folder, render_desk
 from tests.cli.run_outputs import STEPS
-from tests.cli.stereo_sequences import render_room
+from tests.cli.sequences import as_folder, render_desk, render_room
 
 
 @pytest.fixture(scope="module", autouse=True)

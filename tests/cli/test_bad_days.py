@@ -18,7 +18,7 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.cli.mono_sequences import CAMERA, FRAMES, sentence
+from tests.cli.sequences import CAMERA, FRAMES, sentence
 
 pytestmark = pytest.mark.slow
 

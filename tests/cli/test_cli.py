@@ -16,8 +16,8 @@ from rbpf.runs.recordings import RobotRecording
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.cli.mono_sequences import sentence
 from tests.cli.run_outputs import FILES, REQUIRED, STEPS, layout, names, outputs
+from tests.cli.sequences import sentence
 
 OWN_FILES = {
     "odometry.tum", "observations_odometry.csv", "ess.png", "groundtruth_landmarks.png", "groundtruth_map.png"

@@ -5,9 +5,8 @@ import sys
 import pytest
 
 from rbpf.sensors.readers import open_images, open_stereo
-from tests.cli import stereo_sequences
-from tests.cli.mono_sequences import refused, run
 from tests.cli.run_outputs import outputs
+from tests.cli.sequences import refused, run, run_stereo
 from tests.readers.images.bags import KINDS, film_images, film_pairs, recorded
 
 pytestmark = pytest.mark.slow
@@ -39,8 +38,8 @@ def test_a_stereo_bag_gives_the_bytes_of_its_folder(room, tmp_path):
     with recorded(tmp_path / KINDS[0]) as bag:
         film_pairs(bag, open_stereo(room), "image_rect")
     quick = ["--no-video", "--no-batch"]
-    assert stereo_sequences.run(room, tmp_path / "folder", *quick) == 0
-    assert stereo_sequences.run(tmp_path / KINDS[0], tmp_path / "bag", *quick) == 0
+    assert run_stereo(room, tmp_path / "folder", *quick) == 0
+    assert run_stereo(tmp_path / KINDS[0], tmp_path / "bag", *quick) == 0
     for name in ("trajectory.tum", "map.csv"):
         assert (tmp_path / "folder" / name).read_bytes() == (tmp_path / "bag" / name).read_bytes()
 

@@ -16,7 +16,7 @@ from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from tests.cli.mono_sequences import FRAMES, run, sentence, summary
+from tests.cli.sequences import FRAMES, run, sentence, summary
 from tests.sensors.board_pictures import BOARD, CAMERA, pictures
 
 pytestmark = pytest.mark.slow

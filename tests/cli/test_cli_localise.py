@@ -12,7 +12,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from tests.cli.mono_sequences import run, sentence, summary
+from tests.cli.sequences import run, sentence, summary
 
 CAMERA = Pinhole(320, 240, 256.0, 256.0, 159.5, 119.5)
 MAPPED, FRAMES = 120, 170

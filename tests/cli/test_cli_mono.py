@@ -16,8 +16,8 @@ from rbpf.runs.recordings import filter_features as filter_log
 from rbpf.runs.trajectory import read_tum
 from rbpf.sensors.readers import open_images
 from rbpf.systems.mono.config import MonoConfig
-from tests.cli.mono_sequences import CAMERA, FRAMES, refused, run, sentence, summary
 from tests.cli.run_outputs import BATCH, FILES, OF_CAMERAS, REQUIRED, layout, names
+from tests.cli.sequences import CAMERA, FRAMES, refused, run, sentence, summary
 
 pytestmark = pytest.mark.slow
 

@@ -17,9 +17,8 @@ from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import read_tum
 from rbpf.validation.colmap.compare import ReconstructionOptions
-from tests.cli.mono_sequences import sentence
 from tests.cli.run_outputs import BATCH, FILES, OF_CAMERAS, REQUIRED, names, outputs, untimed_summary
-from tests.cli.stereo_sequences import FRAMES, run
+from tests.cli.sequences import PAIRS, run_stereo, sentence
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
 OWN_FILES = {"odometry.tum", "tracking.png", "observations_frames.csv", "annotated.mp4"}
@@ -31,7 +30,7 @@ OWN_ENTRIES = {
 @pytest.fixture(scope="module")
 def finished(room, tmp_path_factory, keypoints_once):
     out = tmp_path_factory.mktemp("finished") / "run"
-    assert run(room, out) == 0
+    assert run_stereo(room, out) == 0
     return out
 
 
@@ -43,7 +42,7 @@ def test_what_it_leaves(finished):
     assert names(finished) == FILES | BATCH | OWN_FILES
     entries = json.loads((finished / "summary.json").read_text())
     assert entries.keys() >= REQUIRED | OF_CAMERAS | OWN_ENTRIES
-    assert entries["frames"] == FRAMES and entries["particles"] == 50 and entries["dof"] == 6
+    assert entries["frames"] == PAIRS and entries["particles"] == 50 and entries["dof"] == 6
     assert entries["log_evidence"] is None
     assert "problems" not in entries and "failure" not in entries
     assert 0 < entries["landmarks_mean_per_particle"] < entries["sift_features"]
@@ -52,7 +51,7 @@ def test_what_it_leaves(finished):
 def test_the_files_agree(finished):
     entries = untimed_summary(finished)
     path, alone = read_tum(finished / "trajectory.tum"), read_tum(finished / "odometry.tum")
-    assert len(path) == len(alone) == FRAMES
+    assert len(path) == len(alone) == PAIRS
     np.testing.assert_allclose(path.world_from_body[0], SE3.identity(), atol=1e-12)
     steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
     assert entries["distance_m"] == pytest.approx(steps.sum())
@@ -85,8 +84,8 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_
     process.send_signal(signal.SIGINT)
     _, error = process.communicate("go on\n", timeout=120)
     assert process.returncode == 130, error
-    said = re.search(rf"stopped after (\d) of {FRAMES}; the same command with --resume", " ".join(error.split()))
-    assert said is not None and 3 <= int(said[1]) < FRAMES
+    said = re.search(rf"stopped after (\d) of {PAIRS}; the same command with --resume", " ".join(error.split()))
+    assert said is not None and 3 <= int(said[1]) < PAIRS
     assert {path.name for path in (tmp_path / "cut").iterdir()} == {"checkpoint.npz"}
     assert main([*arguments, "--resume"]) == 0
     again, whole = outputs(tmp_path / "cut"), outputs(finished)
@@ -114,7 +113,7 @@ def test_options(room, tmp_path):
     pytest.importorskip("rerun")
     out, recording = tmp_path / "run", tmp_path / "run.rrd"
     arguments = ["--dof", "3", "--seed", "4", "--set", "proposal.kind=ekf", "--rerun", str(recording)]
-    assert run(room, out, *arguments) == 0
+    assert run_stereo(room, out, *arguments) == 0
     settings = yaml.safe_load((out / "config.yaml").read_text())
     assert (settings["dof"], settings["seed"], settings["proposal"]["kind"]) == (3, 4, "ekf")
     np.testing.assert_allclose(read_tum(out / "trajectory.tum").positions[:, 1], 0.0, atol=1e-12)
@@ -122,16 +121,16 @@ def test_options(room, tmp_path):
 
 
 def test_bad_arguments(room, tmp_path, capsys):
-    assert run(room, tmp_path / "run", "--set", "map.gate=-1") == 2
+    assert run_stereo(room, tmp_path / "run", "--set", "map.gate=-1") == 2
     assert "map.gate must be above 0" in " ".join(capsys.readouterr().err.split())
     with pytest.raises(SystemExit, match="2"):  # of the parser
-        run(room, tmp_path / "run", "--dof", "5")
+        run_stereo(room, tmp_path / "run", "--dof", "5")
 
 
 def test_the_batch_stands_beside(finished):
     """The optimum of the same pixels is nearer to the truth than odometry, and near the filter."""
     entries = untimed_summary(finished)
-    assert len(read_tum(finished / "batch.tum")) == entries["batch_frames"] == FRAMES
+    assert len(read_tum(finished / "batch.tum")) == entries["batch_frames"] == PAIRS
     assert entries["batch_ate_rmse_m"] < entries["vo_ate_rmse_m"]
     assert 0.0 < entries["filter_minus_batch_rmse_m"] < 0.01
 
@@ -145,7 +144,7 @@ def test_a_run_is_compared_with_a_reconstruction(finished, tmp_path, monkeypatch
     assert main(["validate", str(folder), "--against", "colmap"]) == 0
     assert "(rms) from COLMAP's reconstruction" in " ".join(capsys.readouterr().err.split())
     figures = json.loads((folder / "validation_colmap.json").read_text())["figures"]
-    assert figures["run_registered"] == figures["run_key_frames"] == FRAMES
+    assert figures["run_registered"] == figures["run_key_frames"] == PAIRS
     assert figures["run_alignment"] == figures["truth_alignment"] == "rigid"
     assert figures["truth_ate_rmse_m"] < 0.01 and figures["run_ate_rmse_m"] < 0.03
     assert figures["run_landmarks"] > 10 and figures["run_surface_median_m"] < 0.05

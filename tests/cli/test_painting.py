@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
-from tests.cli import mono_sequences, stereo_sequences
+from tests.cli.sequences import run, run_stereo
 
 pytestmark = pytest.mark.slow
 
@@ -40,10 +40,10 @@ def test_a_robot_among_landmarks(tmp_path):
 
 
 def test_a_single_camera(desk, tmp_path):
-    assert mono_sequences.run(desk, tmp_path) == 0
+    assert run(desk, tmp_path) == 0
     check(tmp_path)
 
 
 def test_two_cameras(room, tmp_path):
-    assert stereo_sequences.run(room, tmp_path) == 0
+    assert run_stereo(room, tmp_path) == 0
     check(tmp_path)

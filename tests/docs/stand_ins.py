@@ -20,9 +20,8 @@ from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
-from tests.cli.mono_sequences import render_desk
-from tests.cli.stereo_sequences import render_room
+from tests.cli.sequences import CAMERA as DESK_CAMERA
+from tests.cli.sequences import render_desk, render_room
 from tests.readers.images.bags import film_images, film_pairs, recorded
 from tests.sensors.board_pictures import CAMERA, FISHEYE, pictures
 

@@ -15,8 +15,7 @@ from rbpf.sensors.readers import open_images, open_stereo, read_laser_log
 from rbpf.sensors.readers.images.bag import numbers_of, opened
 from rbpf.systems.laser.config import LaserConfig
 from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
-from tests.cli.mono_sequences import render_desk
-from tests.cli.stereo_sequences import render_room
+from tests.cli.sequences import render_desk, render_room
 from tests.readers.images.bags import film_images, film_pairs, recorded
 
 TYPES = get_typestore(Stores.LATEST)

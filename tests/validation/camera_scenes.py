@@ -1,7 +1,6 @@
 """Small scenes before a camera, and their batch solution by SciPy in another parametrisation."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -9,7 +8,7 @@ from scipy.optimize import least_squares
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints, Truth
-from tests.validation.worlds import shrunk, slope_of
+from tests.validation.worlds import Reference, shrunk, slope_of
 
 PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)
 BENT = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.0))
@@ -65,16 +64,6 @@ def _known(names: Array, places: Array, rng: np.random.Generator) -> KnownPoints
     return KnownPoints(names, places + errors, factor @ factor.mT)
 
 
-class Reference(NamedTuple):
-    """Optimum and covariances as in a `BatchSolution`, landmarks in the order of their names."""
-
-    world_from_camera: Array
-    landmarks: Array
-    cov_poses: Array
-    cov_landmarks: Array
-    error: float
-
-
 def solve_by_scipy(log: FeatureLog, robust: float | None = None) -> Reference:
     """Least squares over tangents at the truth; every term is written down once more."""
     names = np.unique(np.concatenate([frame.landmarks for frame in log.frames]))
@@ -83,7 +72,7 @@ def solve_by_scipy(log: FeatureLog, robust: float | None = None) -> Reference:
     z = np.concatenate([frame.z for frame in log.frames])
     whiten = np.linalg.inv(np.linalg.cholesky(np.concatenate([frame.cov_z for frame in log.frames])))
     fixed, whiten_fixed = (np.searchsorted(names, log.known.names), np.linalg.inv(np.linalg.cholesky(log.known.cov)))
-    count, split = len(log.frames), 6 * len(log.frames)
+    split = 6 * len(log.frames)
     around = np.array([log.truth.landmarks[name] for name in names.tolist()])
 
     def parts(x: Array) -> tuple[Array, Array]:
@@ -102,11 +91,4 @@ def solve_by_scipy(log: FeatureLog, robust: float | None = None) -> Reference:
     found = least_squares(
         residuals, x0, lambda x: slope_of(residuals, x), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
     )
-    slope = slope_of(residuals, found.x)
-    cov = np.linalg.inv(slope.T @ slope)
-    path, points = parts(found.x)
-    spread = slope_of(lambda x: SE3.local(path, parts(x)[0]).reshape(len(x), -1), found.x)
-    spread = spread.reshape(count, 6, -1)
-    blocks = cov[split:, split:].reshape(len(names), 3, len(names), 3)
-    cov_landmarks = np.array([blocks[i, :, i] for i in range(len(names))])
-    return Reference(path, points, spread @ cov @ spread.mT, cov_landmarks, float(found.cost))
+    return Reference.of(found, slope_of(residuals, found.x), SE3, lambda x: parts(x)[0], parts(found.x)[1])

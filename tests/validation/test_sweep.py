@@ -9,8 +9,7 @@ from rbpf.errors import InputError
 from rbpf.validation import sweep as sweeping
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.sweep import ROWS, TABLE, SweepFile, plan, read_plan, read_rows, sweep
-from tests.cli.mono_sequences import FRAMES, render_desk
-from tests.cli.stereo_sequences import render_room
+from tests.cli.sequences import FRAMES, render_desk, render_room
 
 pytestmark = pytest.mark.slow
 

@@ -1,18 +1,20 @@
 """Small worlds with a tilted sensor, and their batch solution by SciPy in another parametrisation."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from rbpf import gaussian
 from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.lie import SE2, SE3, Array, Euclidean
 from rbpf.sensors.readers import Frame, RobotLog, Truth
 from rbpf.sensors.readers.measurements import Kind, Measurements
+from rbpf.validation.gtsam.solvers import BatchSolution
 
 Index = NDArray[np.int64]
 
@@ -76,17 +78,25 @@ def seen(m: Measurements, steps: Index, landmarks: Index, z: Array, cov_z: Array
 
 
 class Reference(NamedTuple):
-    """Optimum and covariances as in a `BatchSolution`, landmarks in the order of their names.
+    """Optimum and covariances as in a `BatchSolution`, landmarks in the order of their names."""
 
-    The log-evidence is Laplace's, with a flat prior of the landmarks.
-    """
-
-    world_from_robot: Array
+    world_from_body: Array
     landmarks: Array
     cov_poses: Array
     cov_landmarks: Array
     error: float
-    log_evidence: float
+
+    @classmethod
+    def of(
+        cls, found: OptimizeResult, slope: Array, space: Any, path_of: Callable[[Array], Array], places: Array
+    ) -> Self:
+        """By the residuals' slope at the optimum, whose last parameters say where the landmarks (L, D) are."""
+        cov, path, size = np.linalg.inv(slope.T @ slope), path_of(found.x), places.size
+        spread = slope_of(lambda x: space.local(path, path_of(x)).reshape(len(x), -1), found.x)
+        spread = spread.reshape(len(path), space.dim, -1)
+        blocks = cov[-size:, -size:].reshape(*places.shape, *places.shape)
+        cov_landmarks = np.array([blocks[i, :, i] for i in range(len(places))])
+        return cls(path, places, spread @ cov @ spread.mT, cov_landmarks, float(found.cost))
 
 
 def solve_by_scipy(m: Measurements, robust: float | None = None) -> Reference:
@@ -120,18 +130,8 @@ def solve_by_scipy(m: Measurements, robust: float | None = None) -> Reference:
     found = least_squares(
         residuals, x0, lambda x: slope_of(residuals, x), xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=300
     )
-    optimum, path = found.x, path_of(found.x)
-    slope = slope_of(residuals, optimum) if robust is None else found.jac
-    cov = np.linalg.inv(slope.T @ slope)
-    spread = slope_of(lambda x: m.space.local(path, path_of(x)).reshape(len(x), -1), optimum)
-    spread = spread.reshape(len(path), m.space.dim, -1)
-    blocks = cov[split:, split:].reshape(len(names), m.z.shape[1], len(names), -1)
-    cov_landmarks = np.array([blocks[i, :, i] for i in range(len(names))])
-    points = optimum[split:].reshape(len(names), -1)
-    log_evidence = -found.cost + 0.5 * (np.linalg.slogdet(cov)[1] + points.size * np.log(2 * np.pi))
-    log_evidence -= 0.5 * np.linalg.slogdet(2 * np.pi * m.cov_z)[1].sum()
-    cost = float(found.cost)
-    return Reference(path, points, spread @ cov @ spread.mT, cov_landmarks, cost, float(log_evidence))
+    slope = slope_of(residuals, found.x) if robust is None else found.jac
+    return Reference.of(found, slope, m.space, path_of, found.x[split:].reshape(len(names), -1))
 
 
 def _thin_factor(cov: Array) -> Array:
@@ -184,10 +184,18 @@ def shrunk(whitened: np.ndarray, robust: float | None) -> np.ndarray:
     return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
 
 
-def assert_same_covariances(found: Iterable[np.ndarray], expected: Iterable[np.ndarray], tolerance: float) -> None:
-    """One by one, each up to a fraction of its largest entry."""
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * np.abs(other).max())
+def assert_same(
+    found: BatchSolution, expected: Reference, space: Any, error: float, path: float, points: float, cov: float
+) -> None:
+    """The same error and covariances up to fractions, of each matrix's largest entry, and the same places [m, rad]."""
+    assert found.error == pytest.approx(expected.error, rel=error)
+    assert np.abs(space.local(expected.world_from_body, found.world_from_body)).max() < path
+    names = sorted(found.landmarks)
+    np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=points)
+    cov_landmarks = [found.cov_landmarks[name] for name in names]
+    for covs, others in ((found.cov_poses, expected.cov_poses), (cov_landmarks, expected.cov_landmarks)):
+        for one, other in zip(covs, others, strict=True):
+            np.testing.assert_allclose(one, other, rtol=cov, atol=cov * np.abs(other).max())
 
 
 # A walk in the plane and fixes of it: a linear-Gaussian model of one's own.

@@ -72,7 +72,8 @@ def solve(
         cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
         if marginals:
             found = solvers.marginals(graph, values, problem.pose_keys + problem.landmark_keys)
-            cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(path)]])
+            ours = np.argsort(problem.chart.order)
+            cov_poses = np.array(found[: len(path)])[:, ours[:, None], ours]
             cov_landmarks = dict(zip(problem.names.tolist(), found[len(path) :], strict=True))
         return solvers.BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values))
 

@@ -65,12 +65,6 @@ class Chart:
     between: type  #: class of the native odometry factor.
     prior: type  #: class of the factor that holds the start.
 
-    def covariance(self, cov: Array) -> Array:
-        """Ours of GTSAM's (d, d)."""
-        out = np.empty_like(cov)
-        out[np.ix_(self.order, self.order)] = cov
-        return out
-
 
 def _storage2(values: Any, key: int) -> Array:
     pose = values.atPose2(key)

@@ -1,21 +1,30 @@
-"""Short image sequences for the tests of `rbpf run mono`."""
+"""Short image sequences for the tests of `rbpf run mono` and `rbpf run stereo`."""
 
 import json
 import shutil
 from pathlib import Path
 
 from rbpf.cli import main
-from rbpf.sensors.camera import Pinhole
-from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
 CAMERA = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
 FRAMES = 16
+RIG = RectifiedStereo(Pinhole(320, 240, 220.0, 220.0, 159.5, 119.5), 0.12)
+PAIRS = 8
 
 
 def render_desk(folder: Path) -> Path:
     """A desk, EuRoC ASL."""
     simulate_images(TexturedDesk(frames=FRAMES, texel_m=0.003), Imaging(noise_std=1.0), CAMERA, folder, seed=1)
+    return folder
+
+
+def render_room(folder: Path) -> Path:
+    """A room seen by two cameras, EuRoC ASL."""
+    world = TexturedRoom(frames=PAIRS, rate_hz=5.0)
+    simulate_images(world, Imaging(known=0, noise_std=1.0), RIG, folder, seed=1)
     return folder
 
 
@@ -36,6 +45,10 @@ def run(sequence, out, *arguments, known=True, video=False):
     shown = [] if "--video" in arguments else ["--no-video"]
     shown += [] if {"--video", "--batch"} & set(arguments) else ["--no-batch"]
     return main(["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments])
+
+
+def run_stereo(sequence: Path, out: Path, *arguments: str) -> int:
+    return main(["run", "stereo", str(sequence), "--particles", "50", "--out", str(out), *arguments])
 
 
 def summary(out):
