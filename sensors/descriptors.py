@@ -9,11 +9,11 @@ by one matrix product, or one by one with those of the landmarks that a predicti
 """
 
 from dataclasses import dataclass
-from typing import Annotated, final
+from typing import Annotated, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.checkpoint import Kept, integers, numbers
 from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
@@ -22,10 +22,6 @@ from rbpf.ranges import Range, Ranged
 BLOCK = 4096  #: Columns of a product that are looked at together: a block of a few hundred rows stays in the cache.
 #: Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer.
 LARGEST = {36: 0.25, 128: 0.55}
-_KEPT = {
-    "ids": integers("landmarks", least=0, ascending=True),
-    "descriptors": numbers("landmarks", "length", dtype=np.float32),
-}
 #: Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time.
 GATHERED, PAIRS = 8, 65536
 
@@ -175,8 +171,14 @@ def gate_pairs(
 
 
 @final
-class DescriptorStore:
+class DescriptorStore(Kept):
     """Descriptors of a length, of landmarks that come and go."""
+
+    kept: ClassVar = {
+        "ids": integers("landmarks", least=0, ascending=True),
+        "descriptors": numbers("landmarks", "length", dtype=np.float32),
+    }
+    prefix = "descriptors/"
 
     def __init__(self, length: int) -> None:
         self.length = length
@@ -213,14 +215,6 @@ class DescriptorStore:
         """Rows (k,) of landmarks (k,), and whether each is held (k,); the row of one that is not means nothing."""
         rows = np.minimum(np.searchsorted(self.ids, ids), max(self.ids.size - 1, 0))
         return rows, (self.ids[rows] == ids) if self.ids.size else np.zeros(rows.shape, dtype=bool)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
-        return {"descriptors/ids": self.ids.copy(), "descriptors/descriptors": self.descriptors.copy()}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        self.ids, self.descriptors = read(arrays, _KEPT, "descriptors/", length=self.length).values()
 
     def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
         """The landmark (K,) of each descriptor (K, d), each once; NULL where there is none, an InputError for another d."""
