@@ -150,9 +150,10 @@ class Adjusted:
 
 def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Poses (W, n, 7) of paths (n, T, 7) at other times (W,): on the way between two, or the first or the last."""
+    moved = SE3.log(SE3.between(paths[:, :-1], paths[:, 1:]))
     k = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, times.size - 2)
     fraction = np.clip((wanted - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
-    return np.swapaxes(SE3.interpolate(paths[:, k], paths[:, k + 1], fraction), 0, 1)
+    return np.swapaxes(SE3.retract(paths[:, k], fraction[:, None] * moved[:, k]), 0, 1)
 
 
 @dataclass(frozen=True)
