@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.core.models import Landmark, Records
 from rbpf.lie import SE3
-from rbpf.ranges import NotNegative, Positive, Ranged
+from rbpf.ranges import Positive, Ranged
 
 MIN_RHO = 0.02  #: Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m.
 
@@ -21,16 +21,13 @@ class InverseDepth(Ranged, Landmark):
     its descendants inherit. u and v are normalised image coordinates, q = 1/z in 1/m; q = 0 is at infinity.
     """
 
-    ready_ratio: Positive = (
-        0.1  #: it is ready to become a point when q's standard deviation is below this fraction of q.
-    )
-    #: a change of q by its standard deviation that moves the measurement by less than this, in its units, leaves q as it is in
-    #: a joint map, which counts with its uncertainty all the same; 0 always measures depth.
-    least_parallax: NotNegative = 0.0
+    #: it is ready to become a point when the standard deviation of q is below this fraction of q.
+    ready_ratio: Positive = 0.1
 
     dim = 3
     constants = 7
     anchored = True
+    learnt_alone = 2
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """(R (u, v, 1) + q t, q): no division, so that q may be 0."""
@@ -50,12 +47,6 @@ class InverseDepth(Ranged, Landmark):
         jac[..., 0, 0] = jac[..., 1, 1] = 1.0 / q
         jac[..., :, 2] = -direction / np.square(q)[..., None]
         return SE3.transform(const, direction / q[..., None]), SE3.matrix(const)[..., :3, :3] @ jac
-
-    def considered(self, slope: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """Of q, where there is not enough parallax: what is measured then says more of the pose than of depth."""
-        found = np.zeros((len(slope), 3), dtype=bool)
-        found[:, 2] = np.linalg.norm(slope[..., 2], axis=1) * np.sqrt(cov[:, 2, 2]) < self.least_parallax
-        return found
 
     def ready(self, records: Records) -> np.ndarray:
         """Whether q is positive and well known, (N, K): then depth is nearly Gaussian too (Fig. 2)."""

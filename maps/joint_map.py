@@ -208,7 +208,7 @@ class JointMap(Map):
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
         ids = [group.ids.ravel() for group in groups if group.ids is not None]
         self._observed = np.concatenate([np.zeros(0, dtype=np.int64), *ids])
-        return self._seen_through(state, groups, prior).information()
+        return self._seen_through(state, groups, prior).set_apart().information()
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
@@ -216,8 +216,14 @@ class JointMap(Map):
         self._gain, self._in_step, self._observed = None, False, self._observed[:0]
         if not groups:
             return LogDensities(np.zeros(self.n), np.zeros(self.n))
-        total, moves, self.cov = self._rows(state, self.mean, self.cov, groups).update(self.cov)
+        rows = self._rows(state, self.mean, self.cov, groups)
+        total, moves, self.cov = rows.set_apart().update(self.cov)
         self.mean, self._reading = self.mean + moves, None
+        for group, seen in zip(groups, rows.groups, strict=True):
+            if seen.along is not None:
+                reading = Reading(self.held, self.cov, [group], self.compiled)
+                told, self.mean, self.cov = reading.learn_alone(group, seen, state, self.mean)
+                total += told
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:

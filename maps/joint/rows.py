@@ -23,6 +23,11 @@ from rbpf.maps.rows import GAUSSIAN
 QUICK = 30_000_000
 """Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
 TINY = float(np.finfo(float).tiny)
+WIDE = 3.0
+"""Standard deviations of what is learnt alone, by which all else is measured the less."""
+LINEARISATIONS = 3
+SETTLED = 0.1
+"""Of what is learnt alone, at most so often and until its mean moves by less than this many standard deviations."""
 IN_WORLD = frozenset({Part.STATE})
 """What a model reads that measures the pose in the world."""
 
@@ -34,6 +39,8 @@ class Group(NamedTuple):
     rows: np.ndarray
     log_odds: np.ndarray
     kind: Kind | None  #: of the landmarks, where there are some.
+    #: (K, p) by what `WIDE` standard deviations of a coordinate that is learnt alone move them, where there is one.
+    along: np.ndarray | None = None
 
 
 class Rows(NamedTuple):
@@ -59,6 +66,16 @@ class Rows(NamedTuple):
         out = np.empty((len(self.at), matrix.shape[1]))
         gather(self.at, self.slope, np.ascontiguousarray(matrix), out)
         return out
+
+    def set_apart(self) -> "Rows":
+        """As all else reads them: uncertain by what is learnt alone besides, Mathematics (learnt-alone)."""
+        if all(group.along is None for group in self.groups):
+            return self
+        cov = self.cov.copy()
+        for group in self.groups:
+            if group.along is not None:
+                cov[group.rows[:, :, None], group.rows[:, None]] += group.along[:, :, None] * group.along[:, None]
+        return self._replace(cov=cov)
 
     def inliers(self) -> np.ndarray | slice:
         """The rows that update, those of the surest observations first."""
@@ -87,13 +104,23 @@ class Rows(NamedTuple):
         white = whitened(chol, self.said[inside].reshape(len(chol), size * n))
         grams(white.reshape(len(chol), size, n), info, vector, quad)
         log_factor, is_density = self.log_factor, np.ones(len(self.cov), dtype=bool)
-        for likelihood, own, log_odds, _ in self.groups:
+        for likelihood, own, log_odds, *_ in self.groups:
             if likelihood.kernel_id != 0:
                 count = int((log_odds >= 0.0).sum())
                 log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
                 is_density[own] = likelihood.normalised
-        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, float(len(chol))
+        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, len(chol) - self._untold()
         return Information(info, vector, quad, *np.full((n, 3), of_all).T)
+
+    def _untold(self) -> float:
+        """How many of the rows say nothing, of those that are set apart."""
+        total = 0.0
+        for group in self.groups:
+            if group.along is not None:
+                taken = group.log_odds >= 0.0
+                along, spread = group.along[taken], diagonal_blocks(self.cov, group.rows[taken])
+                total += float((along * np.linalg.solve(spread, along[..., None])[..., 0]).sum())
+        return total
 
     def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One gain for all particles: log p(z | x) (N,), by what the means move (N, n), and the covariance (n, n) after."""
@@ -102,25 +129,7 @@ class Rows(NamedTuple):
         total = self.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(np.diagonal(chol)))
         total += beyond_gaussian(self, inside, chol, nu)
         half = whitened(chol, self.carried[inside])
-        moves, after, fixed = multiplied(nu, half), plus_gram(cov, half, -1.0), self._considered(cov)
-        if fixed.size:
-            # Their mean over the particles stays, and so does their covariance, Mathematics (considered). Innovations that
-            # are wider apart than they are uncertain would take more out of it than there is: they are off, not informative.
-            moves[:, fixed] -= moves[:, fixed].mean(axis=0)
-            values, vectors = np.linalg.eigh(spread_of(nu, np.full(len(nu), 1.0 / len(nu))))
-            root = np.sqrt(np.clip(values, 0.0, 1.0))[:, None] * vectors.T @ half[:, fixed]
-            at = np.ix_(fixed, fixed)
-            after[at] = cov[at] - gaussian.symmetrise(root.T @ root)
-        return total, moves, after
-
-    def _considered(self, cov: np.ndarray) -> np.ndarray:
-        """Columns that the rows count with, but do not change."""
-        found = [np.zeros(0, dtype=np.int64)]
-        for group in self.groups:
-            if (kind := group.kind) is not None:
-                slope = self.slope[group.rows, : kind.columns.shape[1]]
-                found.append(kind.columns[kind.landmark.considered(slope, diagonal_blocks(cov, kind.columns))])
-        return np.unique(np.concatenate(found))
+        return total, multiplied(nu, half), plus_gram(cov, half, -1.0)
 
 
 class Reading:
@@ -238,7 +247,59 @@ class Reading:
         carried, innovation = np.empty((count, len(self._cov))), self._noise.copy()
         gather(self._at, by_held, self._cov, carried)
         add_inner(self._at, by_held, carried, innovation)
+        for number, part in enumerate(parts):
+            alone = None if part.kind is None else part.kind.landmark.learnt_alone
+            if part.kind is not None and alone is not None and part.rows.size:
+                column = part.kind.columns[:, alone]
+                std = WIDE * np.sqrt(self._cov[column, column])
+                parts[number] = part._replace(along=std[:, None] * by_held[part.rows, alone])
         return Rows(said, self._at, by_held, carried, innovation, parts, self._log_factor)
+
+    def learn_alone(
+        self, group: Observations, seen: Group, state: np.ndarray, mean: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Gives what `Rows.set_apart` has left of the one group that is read to the coordinates that are learnt alone.
+
+        It is linearised anew where they come to lie; `seen` are its rows as they were before. Returns the log-density, one of
+        all particles, means (N, n) and the covariance (n, n), Mathematics (learnt-alone).
+        """
+        assert seen.kind is not None and seen.along is not None
+        alone = seen.kind.landmark.learnt_alone
+        assert alone is not None
+        column = seen.kind.columns[:, alone]
+        wide = np.linalg.norm(seen.along, axis=1)
+        along = seen.along / np.maximum(wide, TINY)[:, None]
+        at, std, done = mean, np.sqrt(self._cov[column, column]), 0
+        while True:
+            rows = self.rows([group], state, at, None)
+            own = rows.groups[0].rows
+            noise = np.einsum("kp,kpq,kq->k", along, diagonal_blocks(self._noise, own), along)
+            # Of the information 1/r along the line 1/(r + w²) has been used.
+            ratio = np.where(seen.log_odds >= 0.0, np.square(wide) / noise, 0.0)
+            told = ratio / (1.0 + ratio) / noise
+            slope = np.einsum("kp,kpq->kq", along, rows.slope[own])
+            carried = np.einsum("kp,kpn->kn", along, rows.carried[own])
+            within = np.einsum("klq,lq->kl", carried[:, rows.at[own[:, 0]]], slope)
+            spread, reached = 1.0 + told * np.diagonal(within), np.take_along_axis(carried, column[:, None], 1)[:, 0]
+            gain = told * reached / spread
+            nu = np.einsum("kp,nkp->nk", along, rows.nu[:, own]) + (at - mean)[:, column] * slope[:, alone]
+            moved = mean.copy()
+            moved[:, column] += gain * nu
+            done += 1
+            if done == LINEARISATIONS or (np.abs(moved - at)[:, column] <= SETTLED * std).all():
+                break
+            at = moved
+        # Schmidt's filter: rows of the gain are zero but where a row is the coordinate's own.
+        after, mine = self._cov.copy(), np.ix_(column, column)
+        after[column] -= gain[:, None] * carried
+        after[:, column] = after[column].T
+        taken = gain[:, None] * carried[:, column]
+        block = self._cov[mine] - taken - taken.T + gain[:, None] * within * gain
+        block[np.diag_indices(column.size)] = self._cov[column, column] - gain * reached
+        after[mine] = block
+        spread += told * np.diagonal(spread_of(nu, np.full(len(nu), 1.0 / len(nu))))
+        total = 0.5 * (np.log1p(ratio) - np.log(spread) - told * np.square(nu.mean(axis=0)) / spread).sum()
+        return float(total), moved, after
 
 
 def checked_ids(group: Observations) -> np.ndarray | None:
@@ -315,7 +376,7 @@ def beyond_gaussian(rows: Rows, inside: np.ndarray | slice, chol: np.ndarray, wh
     """
     total, place = np.zeros(len(white)), np.empty(rows.nu.shape[1], dtype=np.int64)
     place[inside] = np.arange(len(chol))
-    for likelihood, own, log_odds, _ in rows.groups:
+    for likelihood, own, log_odds, *_ in rows.groups:
         if likelihood.kernel_id == 0:
             continue
         at = place[own[log_odds >= 0.0]]

@@ -293,6 +293,9 @@ class Landmark(ABC):
     #: Whether the estimate is in a frame of its own, world_from_anchor (E,), which its constants are; else in the
     #: world.
     anchored: bool = False
+    #: The coordinate that is hardly known at first and multiplies the pose in what is measured, as depth does: a joint map
+    #: lets measurements tell it to itself alone as far as it is uncertain, Mathematics (learnt-alone).
+    learnt_alone: int | None = None
 
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and vars(other) == vars(self)
@@ -321,13 +324,6 @@ class Landmark(ABC):
         if not self.anchored:
             raise InputError(f"{type(self).__name__} does not say how it moves with the frame: override seen_from")
         return mean, np.eye(self.dim)
-
-    def considered(self, slope: Float[np.ndarray, "K p D"], cov: Float[np.ndarray, "K D D"]) -> Bool[np.ndarray, "K D"]:
-        """Coordinates that a measurement of these slopes should count with, but not change (S. Schmidt 1966); by default none.
-
-        Asked by a map that holds landmarks jointly, of K landmarks of covariances (K, D, D).
-        """
-        return np.zeros((len(slope), self.dim), dtype=bool)
 
     def ready(self, records: Records) -> Bool[np.ndarray, "N K"]:
         """Whether an estimate is Gaussian enough to be promoted, (N, K) bool; by default never."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
@@ -13,6 +14,7 @@ from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.joint.rows import WIDE
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point
 from rbpf.motion.odometry import OdometryMotion
@@ -45,15 +47,12 @@ class FromAnchor(RelativePosition):
 
 
 class Careful(Landmark):
-    """An `AnchoredPoint` in the plane whose second coordinate measurements do not change."""
+    """An `AnchoredPoint` in the plane whose second coordinate is learnt alone."""
 
-    dim, constants, anchored = 2, 3, True
+    dim, constants, anchored, learnt_alone = 2, 3, True, 1
 
     def homogeneous(self, mean, const=None):
         return AnchoredPoint(SE2).homogeneous(mean, const)
-
-    def considered(self, slope, cov):
-        return np.tile([False, True], (len(slope), 1))
 
 
 def filtered(world, landmark: Landmark) -> Filter:
@@ -73,31 +72,49 @@ def test_anchored_at_clones_it_is_the_kalman_filter():
     assert len(filter_.belief().map.held.clones) == 2  # two landmarks are new in the first step, one in the third
 
 
-def test_what_is_considered_is_as_schmidt_has_it():
-    """The dense filter of (position, clone, landmark, clone, landmark …) whose gain leaves second coordinates out."""
+def test_what_is_learnt_alone_is_as_schmidt_has_it():
+    """The dense filter of (position, clone, landmark, clone, landmark …), which takes what is measured in two parts.
+
+    First all of it, as uncertain by second coordinates besides as they are; then what that left, by gains that are zero but
+    for a second coordinate's own row, and given the step that was sampled.
+    """
     world, turn, at = turned(), SE2.rotation(TURNED), dict[int, int]()
     kalman = Kalman(TURNED[1:], np.zeros((2, 2)))
     for seen, z in world.measured:
         size = len(kalman.mean)
-        motion = np.zeros((size, size))
+        kalman.augment(np.zeros(2), np.eye(2, size), np.zeros((2, 2)))  # where the robot was
+        motion = np.zeros((size + 2, size + 2))
         motion[:2, :2] = turn @ Q @ turn.T
-        kalman.predict(np.eye(size), motion, np.append(turn @ STEP, np.zeros(size - 2)))
+        kalman.predict(np.eye(size + 2), motion, np.append(turn @ STEP, np.zeros(size)))
         old = [k for k, landmark in enumerate(seen) if landmark in at]
         if old:
-            H = np.zeros((2 * len(old), size))
+            H, wide = np.zeros((2 * len(old), size + 2)), np.zeros((len(old), 2))
             for row, k in enumerate(old):
                 first = at[seen[k]]
                 H[2 * row : 2 * row + 2, :2] = -turn.T
                 H[2 * row : 2 * row + 2, first - 2 : first + 2] = np.hstack([turn.T, np.eye(2)])
-            noise = np.kron(np.eye(len(old)), NOISE)
-            S = H @ kalman.cov @ H.T + noise
-            nu = z[old].ravel() - H @ kalman.mean
-            kalman.log_evidence -= 0.5 * (nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(2 * np.pi * S)[1])
-            gain = kalman.cov @ H.T @ np.linalg.inv(S)
-            gain[[at[seen[k]] + 1 for k in old]] = 0.0
-            closed = np.eye(size) - gain @ H
+                wide[row] = WIDE * np.sqrt(kalman.cov[first + 1, first + 1]) * H[2 * row : 2 * row + 2, first + 1]
+            kalman.update(z[old].ravel(), H, block_diag(*(NOISE + np.outer(each, each) for each in wide)))
+            step = np.hstack([np.eye(2), np.zeros((2, size - 2)), -np.eye(2)])
+            given = kalman.cov - kalman.cov @ step.T @ np.linalg.solve(step @ kalman.cov @ step.T, step @ kalman.cov)
+            gain, slopes, noises = np.zeros((size + 2, len(old))), np.zeros((len(old), size + 2)), np.zeros(len(old))
+            nu = np.zeros(len(old))
+            for row, k in enumerate(old):
+                squared = wide[row] @ wide[row]
+                along = wide[row] / np.sqrt(squared)
+                used = along @ NOISE @ along + squared
+                noises[row] = (used - squared) * used / squared  # of what is left: 1/r = 1/(r + w²) + 1/r′
+                slopes[row] = h = along @ H[2 * row : 2 * row + 2]
+                nu[row] = along @ z[k] - h @ kalman.mean
+                own = at[seen[k]] + 1
+                gain[own, row] = given[own] @ h / (h @ given @ h + noises[row])
+                spread = h @ kalman.cov @ h + noises[row]
+                both = 2.0 * np.pi * used * noises[row] / (used - squared)  # of N(0; r) / N(0; r + w²) N(0; r′)
+                kalman.log_evidence += 0.5 * (np.log(both / (2.0 * np.pi * spread)) - nu[row] ** 2 / spread)
+            closed = np.eye(size + 2) - gain @ slopes
             kalman.mean = kalman.mean + gain @ nu
-            kalman.cov = closed @ kalman.cov @ closed.T + gain @ noise @ gain.T
+            kalman.cov = closed @ kalman.cov @ closed.T + gain @ np.diag(noises) @ gain.T
+        kalman.mean, kalman.cov = kalman.mean[:-2], kalman.cov[:-2, :-2]
         for k, landmark in enumerate(seen):
             if landmark not in at:
                 kalman.augment(np.zeros(2), np.eye(2, len(kalman.mean)), np.zeros((2, 2)))
@@ -263,9 +280,8 @@ def test_a_ray_that_becomes_a_point_keeps_what_it_is_correlated_with():
 
 
 def test_particles_that_are_far_off_leave_a_covariance():
-    """Innovations of many standard deviations: what is considered is not told to be better known than that allows."""
+    """Innovations of many standard deviations: what is learnt alone is not told to be better known than that allows."""
     joint, _ = rays(5)
-    joint.held.kinds[1] = InverseDepth(0.1, least_parallax=1e9)
     joint.mean[:, :6] = 0.0
     state, ids = SE3.exp(0.2 * np.random.default_rng(3).normal(size=(5, 6))), np.array([20, 21, 22, 23])
     z, cov = np.full((4, 2), 300.0), np.repeat(np.eye(2)[None], 4, axis=0)

@@ -23,14 +23,13 @@ from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE3, skew
 from rbpf.maps.constellation import LEAST
-from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.systems.learnt_noise import LearntNoise
-from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
+from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.start.adjustment import (
@@ -53,8 +52,6 @@ LINEARISATIONS = 3
 """Of the proposal: moments of the samples hand on what a few weights cannot mend."""
 SETTLED = 0.2
 """Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that."""
-LEAST_PARALLAX_PX = 3.0
-"""Parallax of one standard deviation of depth from where on it is measured; before, it is considered."""
 RIGHT = 1.1
 """Times a stated standard deviation, up to which it is right: as much as a report has for right."""
 JOINT = "joint/mean"
@@ -70,10 +67,6 @@ KNOWN_FRACTION = 0.5
 @final
 class JointRays(InverseDepthRays):
     """Rays with an inverse depth in a joint map, which holds where they were seen first: each is observed as it is."""
-
-    def __init__(self, camera: Pinhole, config: InverseDepthConfig) -> None:
-        super().__init__(camera, config)
-        self.landmark = InverseDepth(config.promote_std_ratio, LEAST_PARALLAX_PX)
 
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
