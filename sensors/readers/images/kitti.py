@@ -86,9 +86,21 @@ class Kitti(ImageFormat):
             for folder, number in zip(folders, held, strict=False)
             if stereo and number < count
         )
-        truth = _read_truth(path, first_from_camera, rows.stamps_ns)
+        folder, truth = path.resolve(), None
+        for file in (path / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
+            if truth is not None or not file.exists():
+                continue
+            table = read_columns(file, _POSE)
+            if len(table.lines) != count:
+                problem = f"expected {count} poses, one per time in times.txt, found {len(table.lines)}"
+                raise InputError(f"{file}: {problem}; copy both from one sequence.")
+            matrices = table.values.reshape(-1, 3, 4)
+            for row, matrix in enumerate(matrices):
+                if (wrong := rigid_motion_error(matrix)) is not None:
+                    raise table.error(row, wrong)
+            truth = Truth(rows.stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
         source = FileImages(rows.stamps_ns, shape, *files)
-        return ImageSequence(path.resolve().name, used.camera, rows.stamps_ns, truth, baseline_m, source, notes)
+        return ImageSequence(folder.name, used.camera, rows.stamps_ns, truth, baseline_m, source, notes)
 
 
 def _projection(path: Path, hint: str, camera: int) -> tuple[str, Array, Array]:
@@ -124,20 +136,3 @@ def _files(folder: Path, count: int) -> list[Path]:
         problem = f"found image {max(found)} but {count} times in times.txt"
         raise InputError(f"{folder}: {problem}, expected one time per image; copy both from one sequence.")
     return [found.get(i, folder / f"{i:06d}.png") for i in range(count)]
-
-
-def _read_truth(path: Path, first_from_camera: Array, stamps_ns: np.ndarray) -> Truth | None:
-    folder = path.resolve()
-    for file in (path / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
-        if not file.exists():
-            continue
-        table = read_columns(file, _POSE)
-        if len(table.lines) != len(stamps_ns):
-            problem = f"expected {len(stamps_ns)} poses, one per time in times.txt, found {len(table.lines)}"
-            raise InputError(f"{file}: {problem}; copy both from one sequence.")
-        matrices = table.values.reshape(-1, 3, 4)
-        for row, matrix in enumerate(matrices):
-            if (wrong := rigid_motion_error(matrix)) is not None:
-                raise table.error(row, wrong)
-        return Truth(stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
-    return None
