@@ -117,7 +117,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     sections.append({"title": "The run", "beside": beside, "figures": alone, "images": _images(folder, ordered)})
     loader = PackageLoader("rbpf.validation.report", "templates")
     environment = Environment(loader=loader, autoescape=select_autoescape(), trim_blocks=True, lstrip_blocks=True)
-    environment.filters["digits"], environment.filters["share"] = digits, share
+    environment.filters["digits"] = digits
     # System, size, date and version.
     day, kind = str(record.summary.get("finished", ""))[:10], CONFIGS.get(record.system)
     counted = [f"{record.summary[name]} {name}" for name in ("frames", "particles") if name in record.summary]
@@ -207,11 +207,6 @@ def digits(value: Any, name: str = "") -> str:
         whole = int(np.floor(np.log10(abs(value)))) + 1 if value else 1
         text = f"{value:,.{max(0, 3 - max(whole, 1) if abs(value) >= 1.0 else 3 - whole)}f}"
     return f"{text}{'' if unit == '°' else ' ' if unit else ''}{unit}"
-
-
-def share(value: float) -> str:
-    """A fraction in whole per cent."""
-    return f"{100.0 * value:.0f} %"
 
 
 #: Most of each that are drawn: a page is to be sent and turned on a telephone.
