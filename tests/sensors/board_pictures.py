@@ -17,39 +17,28 @@ CAMERA = Pinhole(640, 480, 520.0, 523.0, 330.0, 236.0, (-0.25, 0.08, 0.001, -0.0
 FISHEYE = Pinhole(640, 480, 262.0, 264.0, 322.0, 236.0, (-0.03, 0.02, -0.012, 0.002), "equidistant")
 
 
-def directions(count: int) -> np.ndarray:
+def directions(count: int, seed=5, tilts=(0.15, 0.7), distances=(0.24, 0.36), shift=0.03, aside=0.0) -> np.ndarray:
     """Poses (count, 7) of a camera around a board at the origin that lies face up: tilted, turned, near and far."""
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     poses = []
     for k in range(count):
-        tilt, around = rng.uniform(0.15, 0.7), 2.0 * np.pi * k / count
-        distance = rng.uniform(0.24, 0.36)
-        aim = np.append(rng.uniform(-0.03, 0.03, 2), 0.0)
+        tilt, around = rng.uniform(*tilts), 2.0 * np.pi * k / count
+        distance = rng.uniform(*distances)
+        aim = np.append(rng.uniform(-shift, shift, 2), 0.0)
         back = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
-        poses.append(_looking(aim + distance * back, aim, rng.uniform(-0.5, 0.5)))
+        at = aim + distance * back
+        if aside:
+            aim = aim + np.append(rng.uniform(-aside, aside, 2), 0.0)
+        roll, z = rng.uniform(-0.5, 0.5), (aim - at) / np.linalg.norm(aim - at)
+        x = np.cross(z, [np.sin(roll), np.cos(roll), 0.0])
+        x /= np.linalg.norm(x)
+        poses.append(SE3.from_matrix(np.column_stack([x, np.cross(z, x), z, at])))
     return np.array(poses)
 
 
 def nearby(count: int) -> np.ndarray:
     """Poses (count, 7) of a wide camera: so near that the board reaches the borders of its image."""
-    rng = np.random.default_rng(3)
-    poses = []
-    for k in range(count):
-        tilt, around = rng.uniform(0.1, 0.8), 2.0 * np.pi * k / count
-        distance = rng.uniform(0.10, 0.25)
-        back = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
-        at = np.append(rng.uniform(-0.05, 0.05, 2), 0.0) + distance * back
-        aim = at - distance * back + np.append(rng.uniform(-0.15, 0.15, 2), 0.0)
-        poses.append(_looking(at, aim, rng.uniform(-0.5, 0.5)))
-    return np.array(poses)
-
-
-def _looking(at: np.ndarray, aim: np.ndarray, roll: float) -> np.ndarray:
-    """Pose (7,) of a camera at one place that looks at another."""
-    z = (aim - at) / np.linalg.norm(aim - at)
-    x = np.cross(z, [np.sin(roll), np.cos(roll), 0.0])
-    x /= np.linalg.norm(x)
-    return SE3.from_matrix(np.column_stack([np.column_stack([x, np.cross(z, x), z]), at]))
+    return directions(count, 3, (0.1, 0.8), (0.10, 0.25), 0.05, 0.15)
 
 
 @cache

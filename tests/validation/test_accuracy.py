@@ -13,6 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import Similarity, Trajectory, align
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
+from tests.validation.worlds import wander
 
 TRANSLATION = metrics.PoseRelation.translation_part
 ANGLE_DEG = metrics.PoseRelation.rotation_angle_deg
@@ -41,7 +42,7 @@ def aligned_in_evo(
 
 
 @pytest.mark.parametrize("alignment", ["none", "rigid", "similarity"])
-def test_absolute_error_is_that_of_evo(wander, alignment):
+def test_absolute_error_is_that_of_evo(alignment):
     truth = wander(150, 0)
     estimate = disturbed(truth, 0)
     evo_ape = metrics.APE(TRANSLATION)
@@ -54,7 +55,7 @@ def test_absolute_error_is_that_of_evo(wander, alignment):
 
 
 @pytest.mark.parametrize("alignment", ["none", "similarity"])
-def test_relative_error_is_that_of_evo(wander, alignment):
+def test_relative_error_is_that_of_evo(alignment):
     truth = wander(150, 1)
     estimate = disturbed(truth, 1)
     found = rpe(estimate, truth, alignment)
@@ -91,7 +92,7 @@ def test_landmarks_that_both_maps_have_are_compared():
     assert landmark_errors(truth, estimate, quarter_turn).max == pytest.approx(0.0, abs=1e-12)
 
 
-def test_unpaired_trajectories_and_foreign_maps_are_refused(wander):
+def test_unpaired_trajectories_and_foreign_maps_are_refused():
     with pytest.raises(InputError, match="found 5 and 6; pair them with associate"):
         ate(wander(5, 1), wander(6, 1))
     with pytest.raises(InputError, match="two poses or more"):

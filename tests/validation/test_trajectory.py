@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.runs.trajectory import Trajectory, associate, read_tum, write_tum
+from tests.validation.worlds import wander
 
 MS = 1_000_000
 
@@ -77,7 +78,7 @@ def test_what_is_no_trajectory_is_said(stamps_ns, poses, words):
         Trajectory(stamps_ns, poses)
 
 
-def test_tum_keeps_every_bit_and_every_nanosecond(tmp_path, wander):
+def test_tum_keeps_every_bit_and_every_nanosecond(tmp_path):
     poses = wander(20, 1).world_from_body
     stamps = np.sort(np.random.default_rng(2).integers(-10, 2_000_000_000_000_000_000, size=20))
     stamps[:2] = [-1_000_000_001, -1]
@@ -96,7 +97,7 @@ def test_tum_skips_comments_and_scales_short_quaternions(tmp_path):
     assert np.linalg.norm(trajectory.world_from_body[0, :4]) == pytest.approx(1.0, abs=1e-15)
 
 
-def test_writing_that_fails_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, wander, monkeypatch):
+def test_writing_that_fails_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkeypatch):
     target = tmp_path / "a.tum"
     target.write_text("old")
 

@@ -12,6 +12,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from rbpf import gaussian
 from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.lie import SE2, SE3, Array, Euclidean
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.readers import Frame, RobotLog, Truth
 from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.validation.gtsam.solvers import BatchSolution
@@ -230,3 +231,12 @@ class Receiver(Sensor):
 
     def observe(self, frame, belief):
         return [Observations(frame[None], self.std**2 * np.eye(2)[None], Position())]
+
+
+def wander(length: int, seed: int) -> Trajectory:
+    """A trajectory far from the origin, with steps of about 0.3 m and 10 degrees."""
+    rng = np.random.default_rng(seed)
+    poses = [SE3.retract(SE3.identity(), rng.normal(scale=[1.0, 1.0, 1.0, 50.0, 50.0, 50.0]))]
+    for step in rng.normal(scale=[0.1, 0.1, 0.1, 0.3, 0.1, 0.1], size=(length - 1, 6)):
+        poses.append(SE3.retract(poses[-1], step))
+    return Trajectory(1_400_000_000_000_000_000 + 100_000_000 * np.arange(length), np.array(poses))

@@ -79,28 +79,25 @@ class Recorder:
 
     def transform(self, topic, stamp, parent, child, pose):
         """A pose (7,) in the tree of transforms."""
-        qx, qy, qz, qw, x, y, z = map(float, pose)
-        turn = self.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
-        place = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-        transform = self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
-        one = self.make(
-            "geometry_msgs/msg/TransformStamped", header=self.header(stamp, parent), child_frame_id=child,
-            transform=transform,
-        )  # fmt: skip
+        named = {"header": self.header(stamp, parent), "child_frame_id": child}
+        one = self.make("geometry_msgs/msg/TransformStamped", transform=self.turn_and_place(pose)[2], **named)
         kind = "tf2_msgs/msg/TFMessage"
         self.add_raw(topic, stamp, kind, self.bytes(self.make(kind, transforms=[one]), kind))
 
-    def pose(self, topic, stamp, pose, kind="geometry_msgs/msg/PoseStamped", child="cam", received=None):
-        """A pose (7,), by any of the messages that hold one."""
+    def turn_and_place(self, pose):
+        """A pose (7,) as a quaternion, a vector and a transform."""
         qx, qy, qz, qw, x, y, z = map(float, pose)
         turn = self.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
+        place = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        return turn, place, self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
+
+    def pose(self, topic, stamp, pose, kind="geometry_msgs/msg/PoseStamped", child="cam", received=None):
+        """A pose (7,), by any of the messages that hold one."""
+        turn, place, transform = self.turn_and_place(pose)
         if kind == "geometry_msgs/msg/TransformStamped":
-            place = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-            transform = self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
             return self.add(topic, stamp, kind, received, frame="world", child_frame_id=child, transform=transform)
-        told = self.make(
-            "geometry_msgs/msg/Pose", position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=turn
-        )
+        point = self.make("geometry_msgs/msg/Point", x=place.x, y=place.y, z=place.z)
+        told = self.make("geometry_msgs/msg/Pose", position=point, orientation=turn)
         more = {}
         if kind != "geometry_msgs/msg/PoseStamped":
             told = self.make("geometry_msgs/msg/PoseWithCovariance", pose=told, covariance=np.zeros(36))
