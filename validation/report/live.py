@@ -22,7 +22,8 @@ from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder
-from rbpf.runs.plots import SIGMAS, near_box, outline
+from rbpf.runs.plots import SIGMAS, near_box, outline, position_covariances
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import fit, in_space
 from rbpf.systems.laser.slam import LaserSlam
@@ -87,8 +88,8 @@ class RunView:
                 stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
             for name, colour in DRAWN.get(system.name, (None, {}))[1].items():
                 stream.log(f"plots/tracking/{name}", rr.SeriesLines(colors=[colour], names=[name]), static=True)
-        pose = in_space(np.zeros(1, dtype=np.int64), tracked.pose[None]).world_from_body[0]
-        cov, values = tracked.cov, tracked.values
+        now, values = PathAndMap(np.zeros(1, dtype=np.int64), tracked.pose[None], tracked.cov[None]), tracked.values
+        pose = now.trajectory.world_from_body[0]
         log_time(stream, t, tracked.stamp_ns - self._start_ns)
         body = "camera" if camera is not None else "body"
         log_pose(rr, stream, body, pose)
@@ -96,9 +97,7 @@ class RunView:
             stream.log("world/body", rr.TransformAxes3D(1.0))
         if image is not None:
             stream.log("world/camera/image", rr.Image(image).compress(jpeg_quality=JPEG_QUALITY))
-        local = cov[-3:, -3:] if cov.shape[0] == 6 else np.pad(cov[1:, 1:], ((0, 1), (0, 1)))
-        turn = SE3.rotation(pose)
-        at = MapEstimate(np.zeros(1, dtype=int), pose[None, 4:], (turn @ local @ turn.T)[None])
+        at = MapEstimate(np.zeros(1, dtype=int), pose[None, 4:], position_covariances(now))
         stream.log("world/uncertainty", ellipsoids(rr, at))
         drawn, plotted = DRAWN.get(system.name, (None, ()))
         if drawn is not None:
