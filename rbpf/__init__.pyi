@@ -70,7 +70,6 @@ from .sensors.readers import open_images as open_images
 from .sensors.readers import open_log as open_log
 from .sensors.readers import open_stereo as open_stereo
 from .sensors.readers.images.calibration import read_calibration as read_calibration
-from .systems.anchoring import StartAnchor as StartAnchor
 from .systems.mono.config import MonoConfig as MonoConfig
 from .systems.mono.slam import MonoSlam as MonoSlam
 from .systems.range_bearing.config import RangeBearingConfig as RangeBearingConfig
