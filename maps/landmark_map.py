@@ -171,17 +171,13 @@ class LandmarkMap(Map):
         prior, weights = belief.prior, belief.weights
         kernel = rows.fused_kernel(model) if self.is_compiled(model, ids) else None
         if kernel is not None:
-            # Relative to the particle of highest weight, so that angles need not be wrapped.
             landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim
-            state = belief.state[belief.mode]
-            anchor = -self.innovations(model, np.zeros((k, p)), ids, state, belief.mode)[0]
-            access = tuple(self.store.look(ids))
             mean, cov = np.empty((k, p)), np.empty((k, p, p))
-            state, anchor, spread = map(np.ascontiguousarray, (prior.predicted(), anchor, prior.spread(prior.mean)))
+            state, spread = map(np.ascontiguousarray, (prior.predicted(), prior.spread(prior.mean)))
             sizes = np.array([self.space.dim, landmark.dim, landmark.constants])
             fused = kernel.function.address, kernel.params, state
-            project(fused, access, anchor, weights, spread, sizes, mean, cov)
-            return anchor + mean, cov
+            project(fused, tuple(self.store.look(ids)), belief.mode, weights, spread, sizes, mean, cov)
+            return mean, cov
         return super().project(model, ids, belief)
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:

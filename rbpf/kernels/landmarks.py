@@ -37,7 +37,7 @@ _REFINE = FUSED, RECORDS, OBSERVED, CUBE, INDICES, types.Tuple((CUBE, MATRIX, VE
 _UPDATE = FUSED, RECORDS, INDICES, OBSERVED, INDICES, VECTOR
 #: Types of (address, params, state, mean, columns, clones, origins), see `linearise_group`.
 _GROUP = int64, VECTOR, MATRIX, MATRIX, INDEX_MATRIX, INDEX_MATRIX, MATRIX
-_PROJECT = void(FUSED, RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE)
+_PROJECT = void(FUSED, RECORDS, int64, VECTOR, CUBE, INDICES, MATRIX, CUBE)
 
 _refine_at, _refine_part = part_of(*_REFINE)
 
@@ -235,17 +235,18 @@ def _add_between(weights, offset, mean, cov):
 
 
 @njit(_PROJECT, cache=True, error_model="numpy")
-def project(fused, records, anchor, weights, factor, sizes, mean, cov):
-    """Fills `mean` (K, p), relative to `anchor` (K, p), and `cov` (K, p, p) = within + between particles.
+def project(fused, records, mode, weights, factor, sizes, mean, cov):
+    """Fills `mean` (K, p) and `cov` (K, p, p) = within + between particles.
 
-    The kernel's residual of `anchor`, with the sign reversed, is where a particle expects the landmark. Within is
-    J P Jᵀ + H L (H L)ᵀ, with the `factor` L (N or 1, d, r) of the state. Other arguments as in `refine`.
+    What particle `mode` expects of a landmark is what all are compared with, so that angles need not be wrapped: a kernel's
+    residual of it, with the sign reversed, is how far off a particle expects the landmark. Within is J P Jᵀ + H L (H L)ᵀ,
+    with the `factor` L (N or 1, d, r) of the state. Other arguments as in `refine`.
     """
     address, params, state = fused
     pool, slabs, which, maps = records
     kernel = kernel_at(address)
     n_particles, size = state.shape
-    p = anchor.shape[1]
+    p = mean.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
     x, record, packed_cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(
         size, p, dim, dim_map, size_const
@@ -253,14 +254,20 @@ def project(fused, records, anchor, weights, factor, sizes, mean, cov):
     column = np.empty((p, BLOCK))
     offset = np.empty((p, n_particles))
     nothing = np.zeros((p, p))
-    for k in range(anchor.shape[0]):
+    at, anchor = np.empty((size, BLOCK)), np.empty(p)
+    lanes.load_states(state, mode, 1, at)
+    for k in range(mean.shape[0]):
         cov[k] = 0.0
+        lanes.load_record(pool, slabs[k], maps[which[k]], mode, 1, record, packed_cov, const)
+        kernel(at, record, const, nothing[0], params, 1, nu, jac_state, jac_map)
+        for a in range(p):
+            anchor[a] = -nu[a, 0]
         for start in range(0, n_particles, BLOCK):
             count = min(BLOCK, n_particles - start)
             if k == 0 or n_particles > BLOCK:
                 lanes.load_states(state, start, count, x)
             lanes.load_record(pool, slabs[k], maps[which[k]], start, count, record, packed_cov, const)
-            kernel(x, record, const, anchor[k], params, count, nu, jac_state, jac_map)
+            kernel(x, record, const, anchor, params, count, nu, jac_state, jac_map)
             lanes.innovation_covariance(jac_map, packed_cov, nothing, count, cross, total)
             lanes.add_spread(jac_state, factor, start, count, column, total)
             for a in range(p):
@@ -272,6 +279,8 @@ def project(fused, records, anchor, weights, factor, sizes, mean, cov):
                         within += weights[start + i] * total[a, b, i]
                     cov[k, a, b] += within
         _add_between(weights, offset, mean[k], cov[k])
+        for a in range(p):
+            mean[k, a] += anchor[a]
 
 
 @njit(void(int64, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE), cache=True, error_model="numpy")
