@@ -248,17 +248,6 @@ def _score(field, window, border, side, x, y, cos, sin, beams):
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def _retracted(base, increment, out):
-    """Base · Exp(increment) in SE(2)."""
-    half = 0.5 * increment[0]
-    sinc = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
-    cos, sin = sinc * math.cos(base[0] + half), sinc * math.sin(base[0] + half)
-    out[0] = base[0] + increment[0]
-    out[1] = base[1] + cos * increment[1] - sin * increment[2]
-    out[2] = base[2] + sin * increment[1] + cos * increment[2]
-
-
 @njit(cache=True, error_model="numpy", inline="always")
 def _penalty(info, increment):
     """½ εᵀ info ε."""
@@ -271,7 +260,13 @@ def _penalty(info, increment):
 
 @njit(cache=True, error_model="numpy")
 def _value(field, window, border, side, base, increment, beams, state):
-    _retracted(base, increment, state)
+    """The score at base · Exp(increment) in SE(2), which goes to `state`."""
+    half = 0.5 * increment[0]
+    sinc = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
+    cos, sin = sinc * math.cos(base[0] + half), sinc * math.sin(base[0] + half)
+    state[0] = base[0] + increment[0]
+    state[1] = base[1] + cos * increment[1] - sin * increment[2]
+    state[2] = base[2] + sin * increment[1] + cos * increment[2]
     return _score(field, window, border, side, state[1], state[2], math.cos(state[0]), math.sin(state[0]), beams)
 
 

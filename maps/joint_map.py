@@ -238,17 +238,12 @@ class JointMap(Map):
         if self.submap is not None:
             if self.leaving.size or self._returning.size:
                 self._exchange()
-            elif not self._in_step and self._is_over():
+            # Where nothing is passed on, a sub-map that has been joined to the old ones is followed by one with nothing.
+            elif not (self._in_step or self.passed_on) and self.old.take(self.finished(), len(self.ids) >= self.submap):
                 self._begin_submap()
             if self.old.maps:
                 self.old.look_from(self.finished())
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
-
-    def _is_over(self) -> bool:
-        """Whether the present sub-map has been joined to the old ones, and another begins with nothing."""
-        if self.submap is None or self.passed_on:
-            return False
-        return self.old.take(self.finished(), len(self.ids) >= self.submap)
 
     @property
     def is_full(self) -> bool:

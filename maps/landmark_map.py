@@ -142,9 +142,11 @@ class LandmarkMap(Map):
             landmark, records = self.landmark_of(landmark_id), self.read(np.array([landmark_id]))
             if not isinstance(landmark, Point):
                 records = landmark.promote(records)
-            weights = self.existing(landmark_id, particles.weights)
-            if not weights.any():
-                weights = particles.weights * np.isfinite(self.log_odds(np.array([landmark_id]))[:, 0])
+            weights = particles.weights
+            if self.evidence:
+                log_odds = self.log_odds(np.array([landmark_id]))[:, 0]
+                exists = weights * (log_odds > 0.0)
+                weights = exists if exists.any() else weights * np.isfinite(log_odds)
             moments.append(gaussian.mixture_moments(weights / weights.sum(), records.mean[:, 0], records.cov[:, 0]))
         if not moments:
             return np.zeros((0, 0)), np.zeros((0, 0, 0))

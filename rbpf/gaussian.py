@@ -168,7 +168,9 @@ def log_density(
 
     Raises InputError: cov is not positive definite.
     """
-    chol = cholesky(_distinct(np.asarray(cov, dtype=float)))
+    cov = np.asarray(cov, dtype=float)
+    # One of each axis of the batch along which all are the same entries in memory: they are factored once.
+    chol = cholesky(cov[tuple(slice(None) if stride else slice(1) for stride in cov.strides[:-2])])
     white = solve_lower(chol, residual)
     return -0.5 * (np.square(white).sum(-1) + log_det(chol) + white.shape[-1] * _LOG_2PI)
 
@@ -195,11 +197,6 @@ def unscented_transform(
     values = function(mean + offsets)
     mean_y = np.einsum("s,s...->...", weights, values)
     return mean_y, gram(np.moveaxis(values - mean_y, 0, -1) * np.sqrt(weights))
-
-
-def _distinct(cov: Array) -> Array:
-    # One of each axis of the batch along which all are the same entries in memory: they are factored once.
-    return cov[tuple(slice(None) if stride else slice(1) for stride in cov.strides[:-2])]
 
 
 def _factored(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -532,38 +532,27 @@ class SubMaps:
             "near_cov": checkpoint.numbers("size", "size"),
         }  # fmt: skip
         found = checkpoint.read(arrays, schema, "submaps/")
-        counts = found["counts"].tolist()
-        sizes = [self.space.dim + self.dim * count for count in counts]
-        ids = checkpoint.split(found["ids"], counts, "submaps/ids")
-        points = checkpoint.split(found["points"], counts, "submaps/points")
-        covs = checkpoint.split(found["covs"], [size * size for size in sizes], "submaps/covs")
-        known = found["given"].tolist()
-        given = zip(
-            checkpoint.split(found["given_ids"], known, "submaps/given_ids"),
-            checkpoint.split(found["given_points"], known, "submaps/given_points"),
-            checkpoint.split(found["given_covs"], [(self.dim * k) ** 2 for k in known], "submaps/given_covs"),
-            strict=True,
-        )
-        if (
-            len(found["starts"]) != len(counts) + 1
-            or len(found["near_cov"]) != self.space.dim + found["near_points"].size
-        ):
+        d, dim, counts, known = self.space.dim, self.dim, found["counts"], found["given"]
+        rows = {
+            "ids": counts, "points": counts, "covs": (d + dim * counts) ** 2,
+            "given_ids": known, "given_points": known, "given_covs": (dim * known) ** 2,
+        }  # fmt: skip
+        parts = [checkpoint.split(found[name], each.tolist(), f"submaps/{name}") for name, each in rows.items()]
+        if len(found["starts"]) != len(counts) + 1 or len(found["near_cov"]) != d + found["near_points"].size:
             raise InputError("the arrays submaps/starts and submaps/near_cov do not fit the sub-maps")
         self.maps, self._last = [], {}
-        for end, names, places, cov, size, tied, (others, before, prior) in zip(
-            found["ends"], ids, points, covs, sizes, found["tied"].tolist(), given, strict=True
-        ):
+        every = zip(found["ends"], found["tied"].tolist(), *parts, strict=True)
+        for end, tied, names, places, cov, others, before, prior in every:
             if np.unique(names).size < names.size or not np.isin(others, names).all():
                 raise InputError("the arrays submaps/ids and submaps/given_ids name a landmark twice in a sub-map")
             own = Given(others, before, prior.reshape(before.size, before.size)) if others.size else None
-            self._hold(SubMap(end, names, places, cov.reshape(size, size), bool(tied), own))
+            self._hold(SubMap(end, names, places, cov.reshape(d + places.size, -1), bool(tied), own))
         if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
             raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
         self.starts, self.near = list(found["starts"]), found["near"]
         self.points, self.cov = found["near_points"], found["near_cov"]
         if not self.maps:
             return
-        d, dim = self.space.dim, self.dim
         schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}
         found = checkpoint.read(arrays, schema, "joint/")
         self.frame = Estimate(found["frame"], found["frame_cov"])

@@ -584,10 +584,6 @@ class Map(Conditional):
     def set_log_odds(self, ids: Ids, log_odds: Float[np.ndarray, "N K"]) -> None:
         """Overwrites log-odds (N, K), if the map keeps some; a landmark at −inf in every particle is removed."""
 
-    def existing(self, landmark_id: int, weights: OfAll) -> OfAll:
-        """The weights (N,), zero in the particles in which a landmark is not more probably there than not."""
-        return weights * (self.log_odds(np.array([landmark_id]))[:, 0] > 0.0) if self.evidence else weights
-
     @abstractmethod
     def innovations(
         self, model: ObservationModel, z: Z, ids: Ids, state: Float[np.ndarray, " E"], particle: int
