@@ -81,7 +81,10 @@ class _Search:
 
     def __init__(self, matches: Matches, start: Array) -> None:
         self.matches, self.start = matches, np.ascontiguousarray(start, dtype=float)
-        self.before, self.now = (_points(matches, z) for z in (matches.z_prev, matches.z_now))
+        # The points of both frames' pixels, those at infinity and beyond put far away.
+        raised = times_pixels(points_from_pixels(matches.camera), np.stack([matches.z_prev, matches.z_now]))
+        nearest = 1.0 / (FARTHEST * matches.camera.baseline_m)
+        self.before, self.now = raised[..., :3] / np.maximum(raised[..., 3:], nearest)
         # W = L⁻¹ with L Lᵀ = R⁻ + R.
         chol = gaussian.cholesky(matches.cov_prev + matches.cov_now)
         self.white = np.ascontiguousarray(gaussian.solve_lower_matrix(chol, np.eye(3)))
@@ -104,10 +107,3 @@ class _Search:
         matrices = homography(matches.camera, motions)
         scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
         return score, agreeing / len(matches)
-
-
-def _points(matches: Matches, pixels: Array) -> Array:
-    """Points (K, 3) of pixels (K, 3), those at infinity and beyond put far away."""
-    raised = times_pixels(points_from_pixels(matches.camera), pixels)
-    least = 1.0 / (FARTHEST * matches.camera.baseline_m)
-    return raised[:, :3] / np.maximum(raised[:, 3:], least)

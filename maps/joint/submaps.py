@@ -114,9 +114,24 @@ class SubMaps:
 
     def look_from(self, present: SubMap) -> None:
         """What is known of the end of the present sub-map is so until it is looked from anew."""
-        if self.maps:
-            self.frame = self.end(present)
-            self.beside = self._about(present) if self.unnamed else None
+        if not self.maps:
+            return
+        self.frame = self.end(present)
+        if not self.unnamed:
+            return
+        # The old landmarks about the end of the present sub-map, by all that is known.
+        x, cov, half, mine = tied = self._tied(present)
+        own = slice(self.space.dim * 2 + self.dim * self.near.size, len(x))
+        others = np.setdiff1d(np.arange(self.near.size), mine)
+        seen, of_others = self._seen_from_end(tied, present, others)
+        # Rows of the joint covariance, then what of it goes with the present landmarks.
+        rows, halves = of_others(cov), of_others(half.T)
+        within = of_others(rows.T) - halves @ halves.T
+        cross = rows[:, own] - halves @ half[:, own]
+        spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(own.stop - own.start)
+        slope = cross @ inverse_of(gaussian.symmetrise(spread)) if present.ids.size else cross
+        rest = gaussian.symmetrise(within - slope @ cross.T)
+        self.beside = Beside(self.near[others], seen, present.ids, present.points, slope, rest)
 
     def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
         """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
@@ -246,21 +261,6 @@ class SubMaps:
         slope = turn @ by_new
         slope[:, :d] -= space.transform_jacobian(seen).reshape(-1, d)
         return seen, slope, turn @ gaussian.symmetrise(rest) @ turn.T
-
-    def _about(self, present: SubMap) -> Beside:
-        """The old landmarks about the end of the present sub-map, by all that is known."""
-        x, cov, half, mine = tied = self._tied(present)
-        own = slice(self.space.dim * 2 + self.dim * self.near.size, len(x))
-        others = np.setdiff1d(np.arange(self.near.size), mine)
-        seen, of_others = self._seen_from_end(tied, present, others)
-        # Rows of the joint covariance, then what of it goes with the present landmarks.
-        rows, halves = of_others(cov), of_others(half.T)
-        within = of_others(rows.T) - halves @ halves.T
-        cross = rows[:, own] - halves @ half[:, own]
-        spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(own.stop - own.start)
-        slope = cross @ inverse_of(gaussian.symmetrise(spread)) if present.ids.size else cross
-        rest = gaussian.symmetrise(within - slope @ cross.T)
-        return Beside(self.near[others], seen, present.ids, present.points, slope, rest)
 
     def _seen_from_end(
         self, tied: _Tied, new: SubMap, others: np.ndarray

@@ -84,10 +84,6 @@ class Scene:
         """Leading axes of a prediction."""
         return np.broadcast_shapes(*(part.shape[:-1] for part in self.args if part is not None))
 
-    def one(self, i: int, k: int) -> "Scene":
-        """Particle i and landmark k, without leading axes."""
-        return self._mapped(lambda part: part[i, min(k, part.shape[1] - 1)])
-
     def moved(self, shape: tuple[int, ...], part: Part) -> "Scene":
         """The same with more axes in front of one part."""
         name = {Part.STATE: "state", Part.LANDMARK: "landmark"}.get(part, "substate")
@@ -102,9 +98,10 @@ class Scene:
         def flat(part: np.ndarray) -> np.ndarray:
             return np.broadcast_to(part, (*batch, part.shape[-1])).reshape(-1, part.shape[-1])
 
-        return self._mapped(flat)
+        return self.mapped(flat)
 
-    def _mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Scene":
+    def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Scene":
+        """A function of every part."""
         state, *others = (None if part is None else function(part) for part in self.args)
         assert state is not None
         return Scene(self.space, state, *others)
