@@ -105,11 +105,11 @@ def quaternion(r):
     if most == trace:
         q = (x, y, z, 1.0 + trace)
     elif most == r[0, 0]:
-        q = (1.0 + 2.0 * r[0, 0] - trace, xy, xz, x)
+        q = (r[0, 0] + r[0, 0] + (1.0 - trace), xy, xz, x)
     elif most == r[1, 1]:
-        q = (xy, 1.0 + 2.0 * r[1, 1] - trace, yz, y)
+        q = (xy, r[1, 1] + r[1, 1] + (1.0 - trace), yz, y)
     else:
-        q = (xz, yz, 1.0 + 2.0 * r[2, 2] - trace, z)
+        q = (xz, yz, r[2, 2] + r[2, 2] + (1.0 - trace), z)
     return unit(q[0], q[1], q[2], q[3])
 
 
