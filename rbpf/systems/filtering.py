@@ -1,6 +1,6 @@
 """Settings of the filter that every system has: particles, likelihood, proposal, resampling."""
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -70,6 +70,7 @@ class RunConfig(Ranged):
 
     particles: Count = 100  #: number of particles.
     seed: Seed = 0  #: of all random generators.
+    _: KW_ONLY  # a system's own settings follow by their places, as dof of a stereo camera
     #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
     #: With a joint map one.
     lag: Count | None = None
