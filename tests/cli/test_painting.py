@@ -39,11 +39,8 @@ def test_a_robot_among_landmarks(tmp_path):
     check(out)
 
 
-def test_a_single_camera(desk, tmp_path):
-    assert run(desk, tmp_path) == 0
-    check(tmp_path)
-
-
-def test_two_cameras(room, tmp_path):
-    assert run_stereo(room, tmp_path) == 0
-    check(tmp_path)
+def test_one_camera_and_two(desk, room, tmp_path):
+    assert run(desk, tmp_path / "one") == 0
+    assert run_stereo(room, tmp_path / "two") == 0
+    check(tmp_path / "one")
+    check(tmp_path / "two")

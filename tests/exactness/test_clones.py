@@ -304,14 +304,6 @@ def test_rays_without_parallax_or_doubt_tell_the_pose_alone():
     assert joint.cov[depths[1], depths[1]] == 0.0 and (joint.cov[depths, depths] <= spread + 1e-15).all()
 
 
-def test_a_ray_is_observed_once_in_a_group():
-    joint, particles = rays(2)
-    z, cov = np.zeros((2, 2)), np.repeat(np.eye(2)[None], 2, axis=0)
-    group = Observations(z, cov, CameraRay(CAMERA), ids=np.array([20, 20]))
-    with pytest.raises(InputError, match="unknown depth twice"):
-        joint.correct(particles.state, np.zeros((2, 6)), [group])
-
-
 def test_kinds_that_a_joint_map_does_not_hold():
     class Mute(Landmark):
         dim = 2
@@ -330,3 +322,6 @@ def test_kinds_that_a_joint_map_does_not_hold():
         joint.read(np.array([5, 20]))
     with pytest.raises(InputError, match=r"into Point\(3\)"):
         joint.promote(np.array([5]))
+    twice = Observations(np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1)), CameraRay(CAMERA), ids=np.array([20, 20]))
+    with pytest.raises(InputError, match="unknown depth twice"):
+        joint.correct(SE3.identity((2,)), np.zeros((2, 6)), [twice])

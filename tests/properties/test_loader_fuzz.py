@@ -30,20 +30,22 @@ SETTINGS = b"rbpf: 0.1.0\nsystem: mono\nparticles: 20\nray:\n  constrain: margin
 SWEEP = b"system: range-bearing\nsequences: [log]\nparticles: [10]\nseeds: 2\noptions: {plain: {}}\n"
 
 
-@FEW
-@given(whole=damaged(SETTINGS), kind=st.sampled_from([MonoConfig, StereoConfig]))
-def test_settings(tmp_path_factory, whole, kind):
-    path = tmp_path_factory.getbasetemp() / "settings.yaml"
-    path.write_bytes(whole)
-    read_or_refused(lambda: load_settings(kind, "mono", path, (), {}))
+ROWS = b'{"key": "a", "figures": {"x": 1}}\n{"key": "b", "figures": {}}\n'
+TEXTS = {
+    "settings of one camera": (SETTINGS, lambda path: load_settings(MonoConfig, "mono", path, (), {})),
+    "settings of two": (SETTINGS, lambda path: load_settings(StereoConfig, "mono", path, (), {})),
+    "a sweep": (SWEEP, read_plan),
+    "its finished rows": (ROWS, read_rows),
+}
 
 
+@pytest.mark.parametrize(("sound", "read"), TEXTS.values(), ids=TEXTS)
 @FEW
-@given(whole=damaged(SWEEP))
-def test_sweeps(tmp_path_factory, whole):
-    path = tmp_path_factory.getbasetemp() / "sweep.yaml"
-    path.write_bytes(whole)
-    read_or_refused(lambda: read_plan(path))
+@given(data=st.data())
+def test_texts(tmp_path_factory, sound, read, data):
+    path = tmp_path_factory.getbasetemp() / "text"
+    path.write_bytes(data.draw(damaged(sound)))
+    read_or_refused(lambda: read(path))
 
 
 @pytest.mark.parametrize(
@@ -110,14 +112,6 @@ def test_arrays_of_other_shapes_and_types(run, data):
         save_arrays(path, arrays | {name: data.draw(others(arrays[name]))})
         read_or_refused(lambda: read_all(run))
         read_or_refused(lambda: load(run).estimate)
-
-
-@FEW
-@given(whole=damaged(b'{"key": "a", "figures": {"x": 1}}\n{"key": "b", "figures": {}}\n'))
-def test_finished_rows_of_a_sweep(tmp_path_factory, whole):
-    path = tmp_path_factory.getbasetemp() / "rows.jsonl"
-    path.write_bytes(whole)
-    read_or_refused(lambda: read_rows(path))
 
 
 @pytest.fixture(scope="module")
