@@ -42,8 +42,9 @@ from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.validation.gtsam import robot
-from rbpf.validation.gtsam.batch_problem import AFAR, Optimum, adjust_near, refine_calibration, solve_problem
+from rbpf.validation.gtsam.batch_problem import AFAR, Optimum, solve_problem
 from rbpf.validation.gtsam.observations import HUBER
+from rbpf.validation.gtsam.self_calibration import adjust_near, refine_calibration
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 

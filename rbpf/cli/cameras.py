@@ -65,7 +65,7 @@ class Recalibrate(Printed):
     out: Path = Path("recalibration")  #: folder for camera.yaml.
 
     def __call__(self) -> None:
-        from rbpf.validation.gtsam.batch_problem import recalibrate as from_run
+        from rbpf.validation.gtsam.self_calibration import recalibrate as from_run
 
         with progress() as bar:
             entries, found = from_run(self.run, self.out, bar("adjusting the camera with poses and landmarks"))

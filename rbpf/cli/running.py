@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes as Group  # in the help; its options have no prefix
 
 from rbpf.cli.commands import Commands
-from rbpf.cli.installed import compile_kernels
+from rbpf.cli.compiling import compile_kernels
 from rbpf.cli.options import MOST_PX, Flag, Printed, RealPositive, Text, Where, Whole, WholeCount, given_board
 from rbpf.cli.showing import OnProgress, answer, progress, say
 from rbpf.errors import InputError

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from rbpf.cli.commands import Commands
-from rbpf.cli.installed import compile_kernels
+from rbpf.cli.compiling import compile_kernels
 from rbpf.cli.options import MOST_PX, Flag, Printed, Real, RealPositive, Text, given_board
 from rbpf.cli.showing import answer, progress
 from rbpf.errors import InputError

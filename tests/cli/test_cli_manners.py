@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from rbpf.cli import main
-from rbpf.cli.installed import cached, compile_kernels, kernel_modules
+from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
 from rbpf.runs.provenance import instruction_set
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
@@ -130,7 +130,7 @@ def test_the_first_compilation_is_announced_before_it_begins(log, tmp_path):
     """In an empty cache, by a process that ends with its first word."""
     cache = tmp_path / "cache"
     program = (
-        f"import os, rbpf.cli.installed as c; c.say = lambda words: (print(words, flush=True), os._exit(0))\n{_MAIN}"
+        f"import os, rbpf.cli.compiling as c; c.say = lambda words: (print(words, flush=True), os._exit(0))\n{_MAIN}"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, *quick(log, tmp_path / "run")],

@@ -11,9 +11,10 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
-from rbpf.validation.gtsam.batch_problem import Optimum, connected_frames, refine_calibration, solve_problem
+from rbpf.validation.gtsam.batch_problem import Optimum, connected_frames, solve_problem
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.observations import HUBER
+from rbpf.validation.gtsam.self_calibration import refine_calibration
 from tests.exactness.models import known
 
 pytestmark = pytest.mark.slow

@@ -1,7 +1,6 @@
 """The batch problem of any run: its measurements, from memory or from its folder; the optimum; how likely they are.
 
-Range-bearing measurements are those of `rbpf.sensors.readers.measurements`, a camera's are a `FeatureLog`. Of one camera
-the focal length and k1 that its adjustment prefers are part of the problem, if that is asked for (`refine_calibration`).
+Range-bearing measurements are those of `rbpf.sensors.readers.measurements`, a camera's are a `FeatureLog`.
 """
 
 from collections.abc import Callable
@@ -9,33 +8,22 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from pathlib import Path
-from typing import Any, final
+from typing import final
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3, Array
-from rbpf.runs.files import OnDone, prepare_folder, write_text
-from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.lie import Array
+from rbpf.runs.reading import PathAndMap
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog, KnownPoints
-from rbpf.sensors.readers.images.calibration import NAME, camera_text
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam import robot
-from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, adjust, begin, solve_features, together
-from rbpf.validation.gtsam.observations import (
-    HUBER,
-    Residuals,
-    in_one_piece,
-    known_by_name,
-    observation_table,
-    reprojection,
-)
-from rbpf.validation.gtsam.solvers import BatchSolution, levenberg_marquardt, marginals
+from rbpf.validation.gtsam.camera import FINE, solve_features
+from rbpf.validation.gtsam.observations import in_one_piece, observation_table, reprojection
+from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
@@ -50,8 +38,6 @@ LEAST_ITERATIONS = 100  #: That are allowed however many observations there are.
 #: Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre.
 STEREO_TOLERANCE = 1e-6
 AFAR = 300  #: Steps from which on a robot's batch is begun incrementally.
-ITERATIONS = 200  #: Most of an adjustment with the camera.
-_STEP = 1e-6  #: Of focal length and k1, for the residuals' derivatives by them.
 
 
 @final
@@ -195,92 +181,3 @@ def _optimum(problem: Problem, found: BatchSolution, steps: NDArray[np.intp]) ->
     )
     estimate = PathAndMap(problem.stamps_ns, found.world_from_body, found.cov_poses, points)
     return Optimum(problem, estimate, steps, found.error)
-
-
-@dataclass(frozen=True)
-class Calibrated:
-    """A camera whose focal length and k1 explain the measurements best, and the optimum with it.
-
-    `std` (2,) are standard deviations of the focal length, as a fraction, and of k1, with all poses and landmarks unknown;
-    NaN where the measurements do not determine them.
-    """
-
-    camera: Pinhole
-    batch: Optimum
-    std: np.ndarray
-
-
-def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None = None) -> Calibrated:
-    """Focal length and k1 adjusted together with all poses and landmarks, from the optimum with the given camera.
-
-    `on_round` is called with the iterations done, and the most that there can be. Errors as of `solve_problem`.
-    """
-    assert isinstance(batch.problem, FeatureLog) and isinstance(batch.problem.camera, Pinhole)
-    camera, full, path = batch.problem.camera, observation_table(batch.problem), batch.estimate.world_from_body
-    known = known_by_name(softened(batch.problem.known), full.names)
-    given = CameraProblem(log.name, len(path), full.determined(known), known, HUBER)
-    found = adjust(given, begin(given, InitialEstimate(path, batch.estimate.landmarks.named())))
-    problem, key = found.problem, int(gtsam.symbol("c", 0))
-
-    def changed(change: np.ndarray) -> Pinhole:
-        k1, *others = camera.distortion
-        focal = 1.0 + float(change[0])
-        lens = (k1 + float(change[1]), *others)
-        return replace(camera, fx=camera.fx * focal, fy=camera.fy * focal, distortion=lens)
-
-    def evaluate(values: Any) -> Residuals:
-        state, change = problem.state(values), values.atVector(key)
-
-        def at(change: np.ndarray) -> Residuals:
-            return reprojection(replace(problem.table, camera=changed(change)), state.path, state.points)
-
-        residuals, slopes = at(change)
-        moved = [at(change + step)[0] - at(change - step)[0] for step in _STEP * np.eye(2)]
-        return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
-
-    factor = together(evaluate)
-    factors = problem.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point, key], model))
-    graph = problem.graph(found.state, found.loose, path, SCALE, factors)
-    values = problem.values(found.state)
-    values.insert(key, np.zeros(2))
-    done = count(1)
-    tell, std = on_round or (lambda _done, _most: None), np.full(2, np.nan)
-    try:
-        values, _, _ = levenberg_marquardt(graph, values, FINE, ITERATIONS, lambda _error: tell(next(done), ITERATIONS))
-        std = np.sqrt(np.diagonal(marginals(graph, values, [key])[0]))
-    except RuntimeError:
-        pass
-    better = adjust_near(replace(log, camera=changed(values.atVector(key))), batch)
-    best = min(batch, better, key=lambda one: one.error)
-    assert isinstance(best.problem, FeatureLog) and isinstance(best.problem.camera, Pinhole)
-    return Calibrated(best.problem.camera, best, std)
-
-
-def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
-    """The optimum of a log that is nearly the batch's, from the batch's."""
-    path = np.tile(SE3.identity(), (len(log.frames), 1))
-    path[batch.steps] = batch.estimate.world_from_body
-    return solve_problem(log, path, HUBER, marginals=False, twice=False)
-
-
-def recalibrate(folder: Path, out: Path, on_round: OnDone | None = None) -> tuple[dict[str, Any], Calibrated]:
-    """Calibrates the camera of a finished monocular run; writes camera.yaml; returns what changed, and the camera."""
-    record = RunFolder.open(folder)
-    problem = record.measurements
-    if not isinstance(problem, FeatureLog) or not isinstance(problem.camera, Pinhole):
-        raise InputError(f"{folder} is no run of one camera: only that can calibrate its camera")
-    start = solve_problem(problem, record.estimate.world_from_body, HUBER, marginals=False)
-    found = refine_calibration(problem, start, on_round)
-    prepare_folder(out)
-    about = f"focal length and k1 from what the run over {problem.name} measured"
-    write_text(out / NAME, camera_text(found.camera, about))
-    before, after = problem.camera, found.camera
-    entries: dict[str, Any] = {
-        "fx": {"before": before.fx, "after": after.fx},
-        "fy": {"before": before.fy, "after": after.fy},
-        "k1": {"before": before.distortion[0], "after": after.distortion[0]},
-    }
-    fractions = {"std_focal_share": found.std[0], "std_k1": found.std[1]}
-    entries |= {name: float(value) if np.isfinite(value) else None for name, value in fractions.items()}
-    entries["error_before"], entries["error_after"] = start.error, found.batch.error
-    return entries, found
