@@ -19,9 +19,10 @@ class InverseDepth(Ranged, Landmark):
 
     The record's constant is that frame, world_from_anchor (7,): the particle's own pose at the first observation, which
     its descendants inherit. u and v are normalised image coordinates, q = 1/z in 1/m; q = 0 is at infinity.
+    Raises InputError: `ready_ratio` is not positive.
     """
 
-    #: it is ready to become a point when the standard deviation of q is below this fraction of q.
+    #: A ray is ready to become a point when the standard deviation of q is below this fraction of q.
     ready_ratio: Positive = 0.1
 
     dim = 3

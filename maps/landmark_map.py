@@ -178,7 +178,7 @@ class LandmarkMap(Map):
             state, spread = map(np.ascontiguousarray, (prior.predicted(), prior.spread(prior.mean)))
             sizes = np.array([self.space.dim, landmark.dim, landmark.constants])
             fused = kernel.function.address, kernel.params, state
-            project(fused, tuple(self.store.look(ids)), belief.mode, weights, spread, sizes, mean, cov)
+            project(fused, tuple(self.store.access_read_only(ids)), belief.mode, weights, spread, sizes, mean, cov)
             return mean, cov
         return super().project(model, ids, belief)
 

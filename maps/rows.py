@@ -94,7 +94,8 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
     # Where all particles agree, no landmark is observed twice and each group's have one plain parametrisation.
     seen = [landmark for ids in named if ids.ndim == 1 for landmark in ids.tolist() if landmark >= 0]
     agreed = all(ids.ndim == 1 for ids in named) and len(set(seen)) == len(seen)
-    if agreed and all(plain[of[:1]].all() and (of == of[:1]).all() for _, of in found):
+    # A group that names no landmark has no kind that could differ.
+    if agreed and all(of.size == 0 or (plain[of[0]] and (of == of[0]).all()) for _, of in found):
         chosen = [np.flatnonzero(ids >= 0) for ids in named]
         plan.batches = [Batch(number, ks, named[number][ks]) for number, ks in enumerate(chosen) if ks.size]
         return plan

@@ -306,7 +306,7 @@ class SharedStore:
             cold.data.take(where, axis=1, out=out[k], mode="clip")
         return out
 
-    def look(self, columns: np.ndarray) -> Access:
+    def access_read_only(self, columns: np.ndarray) -> Access:
         """As `access`, for a kernel that only reads: cold columns stay cold."""
         if (self.columns.slab[self.columns.rows(columns)] >= 0).all():
             return self.access(columns)

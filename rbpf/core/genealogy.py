@@ -6,7 +6,6 @@ row of the particle that wrote it, and read back through `Lineage.rows`. Resampl
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import accumulate, repeat, takewhile
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from rbpf.kernels import forest
 from rbpf.kernels.forest import CHILDREN, GENERATION, ROW
 from rbpf.ranges import require_memory
 
-#: Ages in generations at which what is stored is looked through for dead rows: each a quarter above the one before.
-_AGES = tuple(takewhile(lambda age: age < 2**62, accumulate(repeat(4), lambda age, least: age + max(least, age // 4))))
+#: Age in generations at which what is stored is first looked through for dead rows, and least time until the next look.
+_FIRST_CHECK = 4
 _MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
 
 _COLUMNS = "parent", "children", "generation", "row"
@@ -107,8 +106,17 @@ class Lineage:
         return np.asarray(self._nodes[nodes, ROW])
 
     def due(self) -> list[int]:
-        """Past generations whose rows are worth compacting now: at ages growing by a quarter, as lineages coalesce."""
-        return [self.generation - age for age in takewhile(self.generation.__ge__, _AGES)][::-1]
+        """Past generations, ascending, whose rows are worth compacting now: at ages growing by a quarter.
+
+        Lineages coalesce ever more slowly.
+        """
+        due = []
+        age = _FIRST_CHECK
+        while age <= self.generation:
+            due.append(self.generation - age)
+            age += max(_FIRST_CHECK, age // 4)
+        due.reverse()
+        return due
 
     def distinct(self, generation: int) -> int:
         """Number of particles of a retained generation that still have descendants."""

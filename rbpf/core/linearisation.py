@@ -3,8 +3,6 @@
 Shapes: N particles, K observations, p rows, d increment, D landmark. `mask` (N, K): who took an observation; None is all.
 """
 
-from typing import Any
-
 import numpy as np
 
 from rbpf import gaussian
@@ -20,50 +18,66 @@ _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 
 
 def numeric_jacobians(
-    model: ObservationModel, space: LieGroup, *read: Any, by: frozenset[Part] = EVERYTHING
+    model: ObservationModel,
+    space: LieGroup,
+    state: np.ndarray,
+    landmark: np.ndarray | None = None,
+    const: np.ndarray | None = None,
+    substate: np.ndarray | None = None,
+    by: frozenset[Part] = EVERYTHING,
 ) -> Jacobians:
     """Central differences of −ν for z = h, in the right chart at the state; `model.residual` wraps.
 
-    What is `read` are the arguments of `model.predict`, or the first of them. Differences by a part that `by` does not name
-    are left out: each costs two predictions per coordinate.
+    Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
     """
-    read = (*read, None, None, None)[:4]
     steps = np.array([STEP, -STEP])
     constrains = type(model).innovation is not ObservationModel.innovation
-    z = model.predict(*read) if constrains else None
-    blocks = list[np.ndarray | None]()
-    for part, number in (Part.STATE, 0), (Part.LANDMARK, 1), (Part.SUBSTATE, 3):
-        if (at := read[number]) is None or part not in model.reads & by:
+    z = model.predict(state, landmark, const, substate) if constrains else None
+    blocks: list[np.ndarray | None] = []
+    for part, at in ((Part.STATE, state), (Part.LANDMARK, landmark), (Part.SUBSTATE, substate)):
+        if at is None or part not in model.reads & by:
             blocks.append(None)
             continue
         dim = space.dim if part == Part.STATE else at.shape[-1]
         offsets = (steps[:, None, None] * np.eye(dim)).reshape(2, dim, *(1,) * (at.ndim - 1), dim)
         moved = space.retract(at, offsets) if part == Part.STATE else at + offsets
-        arguments = (*read[:number], moved, *read[number + 1 :])
+        moved_state = moved if part == Part.STATE else state
+        moved_landmark = moved if part == Part.LANDMARK else landmark
+        moved_substate = moved if part == Part.SUBSTATE else substate
         if z is not None:
-            nu = model.innovation(z, *arguments)
+            nu = model.innovation(z, moved_state, moved_landmark, const, moved_substate)
             difference = nu[1] - nu[0]
         else:  # half as many residuals
-            difference = model.residual(*model.predict(*arguments))
+            difference = model.residual(*model.predict(moved_state, moved_landmark, const, moved_substate))
         blocks.append(np.moveaxis(difference, 0, -1) / (2 * STEP))
     return Jacobians(*blocks)
 
 
 def linearise(
-    model: ObservationModel, space: LieGroup, z: np.ndarray, *read: Any, by: frozenset[Part] = EVERYTHING
+    model: ObservationModel,
+    space: LieGroup,
+    z: np.ndarray,
+    state: np.ndarray,
+    landmark: np.ndarray | None = None,
+    const: np.ndarray | None = None,
+    substate: np.ndarray | None = None,
+    by: frozenset[Part] = EVERYTHING,
 ) -> tuple[np.ndarray, Jacobians]:
     """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), constants (N, K, A), substates (N, 1, m).
 
-    These are what is `read`, as `numeric_jacobians` takes it. Raises InputError: a result has the wrong shape.
+    Numeric Jacobians by a part that `by` does not name are left out. Raises InputError: a result has the wrong shape.
     """
-    state, landmark, _, substate = read = (*read, None, None, None)[:4]
-    nu, name, parts = model.innovation(z, *read), type(model).__name__, (state, landmark, substate)
+    nu = model.innovation(z, state, landmark, const, substate)
+    name = type(model).__name__
+    parts = (state, landmark, substate)
     if nu.dtype != np.float64:
         nu = numbers(nu, f"{name}.predict or its residual")
     expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
     if nu.shape != np.broadcast_shapes(expected, z.shape):
         raise InputError(f"{name}.predict returned shape {nu.shape}, expected {expected}")
-    jacobians = model.jacobians(*read) or numeric_jacobians(model, space, *read, by=by)
+    jacobians = model.jacobians(state, landmark, const, substate)
+    if jacobians is None:
+        jacobians = numeric_jacobians(model, space, state, landmark, const, substate, by)
     sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
     blocks: list[np.ndarray | None] = []
     for block, size in zip(jacobians, sizes, strict=True):

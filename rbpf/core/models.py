@@ -30,11 +30,11 @@ STEP = float(np.finfo(float).eps) ** (1 / 3)
 Control = TypeVar("Control", contravariant=True)  #: What a motion model moves by, as odometry.
 Frame = TypeVar("Frame", contravariant=True)  #: What a sensor takes, as an image.
 RigidSpace = SE2Group | SE3Group | Euclidean  #: Poses that points are seen from; of Euclidean(n), places.
-#: What all particles have: states, weights or densities, increments, substates.
-AllStates = Float[np.ndarray, "N E"]
-OfAll = Float[np.ndarray, " N"]
+#: What all particles have: states, a number each (weights, densities), increments, substates.
+ParticleStates = Float[np.ndarray, "N E"]
+PerParticle = Float[np.ndarray, " N"]
 Increments = Float[np.ndarray, "N d"]
-AllSubstates = Float[np.ndarray, "N m"]
+ParticleSubstates = Float[np.ndarray, "N m"]
 #: What is observed, with leading axes that broadcast: states, landmarks, their constants and substates.
 States = Float[np.ndarray, "*#batch E"]
 Estimates = Float[np.ndarray, "*#batch D"]
@@ -49,7 +49,7 @@ Ids = Int[np.ndarray, " K"]
 Z = Float[np.ndarray, "K p"]
 CovZ = Float[np.ndarray, "K p p"]
 Expected = tuple[Float[np.ndarray, "N K p"], Float[np.ndarray, "N K p p"]]  #: Of K landmarks in all particles.
-Some = Int[np.ndarray, " n"] | slice  #: Of the particles.
+ParticleRows = Int[np.ndarray, " n"] | slice  #: Some of the particles.
 Moments = tuple[Float[np.ndarray, "*K D"], Float[np.ndarray, "*K d d"]]
 
 NULL = -1  #: An observation that a particle takes as clutter.
@@ -79,7 +79,7 @@ class Transition:
     Mathematics (substate). Arrays may have a first axis of length 1 where they do not differ between particles.
     """
 
-    mean: AllStates  #: (N, E) chart's origin, x_t = mean · Exp(ε).
+    mean: ParticleStates  #: (N, E) chart's origin, x_t = mean · Exp(ε).
     #: (N or 1, joint = d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
     noise_factor: Float[np.ndarray, "#N joint r"]
     coupling: Float[np.ndarray, "#N d m"] | None = None  #: B, (N or 1, d, m); None where there is no substate.
@@ -159,8 +159,8 @@ class NewLandmarks:
 class LogDensities(NamedTuple):
     """log p(z | x) (N,) of all observations, and of those that could enter only after sampling."""
 
-    all: OfAll
-    after_sampling: OfAll
+    all: PerParticle
+    after_sampling: PerParticle
 
 
 class MotionModel(ABC, Generic[Control]):
@@ -172,23 +172,25 @@ class MotionModel(ABC, Generic[Control]):
 
     space: LieGroup
 
-    def sample(self, state: AllStates, control: Control, dt: float, rng: np.random.Generator) -> AllStates:
+    def sample(self, state: ParticleStates, control: Control, dt: float, rng: np.random.Generator) -> ParticleStates:
         """States (N, E) drawn from any distribution given those before (N, E); by default they stay as they are."""
         return state
 
-    def transition(self, state: AllStates, control: Control, dt: float) -> Transition:
+    def transition(self, state: ParticleStates, control: Control, dt: float) -> Transition:
         """Gaussian of the next state, given states (N, E), a control and a time step in seconds; they come from `sample`.
 
         Its noise may depend on the state. By default nothing moves any more.
         """
         return Transition(state, np.zeros((1, self.space.dim, 0)))
 
-    def transition_given(self, state: AllStates, substate: AllSubstates, control: Control, dt: float) -> Transition:
+    def transition_given(
+        self, state: ParticleStates, substate: ParticleSubstates, control: Control, dt: float
+    ) -> Transition:
         """`transition`, linearised about the substate's mean (N, m): to be overridden where it is not linear in it."""
         return self.transition(state, control, dt)
 
     def log_density(
-        self, before: AllStates, after: Float[np.ndarray, "J E"], control: Control, dt: float
+        self, before: ParticleStates, after: Float[np.ndarray, "J E"], control: Control, dt: float
     ) -> Float[np.ndarray, "J N"] | None:
         """Log p(after | before) (J, N) for states (N, E) and (J, E), which backward simulation needs where `sample` draws."""
         return None
@@ -240,7 +242,7 @@ class ObservationModel(ABC):
         """The landmark (…, D) that would be measured as z (…, p) from the state, for `initialise`."""
         raise InputError(f"{type(self).__name__} cannot start landmarks: override invert or initialise")
 
-    def initialise(self, state: AllStates, z: Z, cov: CovZ) -> Records:
+    def initialise(self, state: ParticleStates, z: Z, cov: CovZ) -> Records:
         """First estimate of landmarks from (N, E), (K, p), (K, p, p).
 
         By default `invert`, with the covariance J R Jᵀ of its numeric derivative by the measurement.
@@ -409,7 +411,7 @@ class LikelihoodSensor(Sensor[Frame]):
     normalised: bool = True  #: Whether it is a density of the frame, as the evidence must be.
 
     @abstractmethod
-    def log_likelihood(self, frame: Frame, state: AllStates) -> OfAll:
+    def log_likelihood(self, frame: Frame, state: ParticleStates) -> PerParticle:
         """(N,) for states (N, E); zeros where the frame has nothing for this sensor."""
 
     @final
@@ -459,7 +461,7 @@ class Conditional(ABC):
         """The groups with what is decided once for all particles, given all of them; by default nothing is."""
         return groups
 
-    def information(self, state: AllStates, groups: Sequence[Observations], prior: Prior) -> Information:
+    def information(self, state: ParticleStates, groups: Sequence[Observations], prior: Prior) -> Information:
         """What the groups, at least one, say about a right perturbation of the states (N, E): for proposal and look-ahead.
 
         By default nothing: then they count after sampling, by `correct`, which says so in `LogDensities.after_sampling`.
@@ -467,7 +469,7 @@ class Conditional(ABC):
         return Information.zeros(state.shape[0], prior.space.dim)
 
     @abstractmethod
-    def correct(self, state: AllStates, increment: Increments, groups: Sequence[Observations]) -> LogDensities:
+    def correct(self, state: ParticleStates, increment: Increments, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x) at the sampled states, and the update by the same observations; in every step, without any, too."""
 
     @abstractmethod
@@ -477,7 +479,7 @@ class Conditional(ABC):
         The copies must not share memory that is written to in place.
         """
 
-    def driving(self) -> AllSubstates | None:
+    def driving(self) -> ParticleSubstates | None:
         """Mean of the substate that drives the motion, for `MotionModel.transition_given`; None holds no such."""
         return None
 
@@ -525,7 +527,7 @@ class Map(Conditional):
     def stored_fraction(self) -> float:
         """Memory of the records, as a fraction of what separate copies for all particles would take."""
 
-    def world(self, state: States, particles: Some = slice(None)) -> States:
+    def world(self, state: States, particles: ParticleRows = slice(None)) -> States:
         """World_from_robot (n, E) of states (n, E) of some particles; by default landmarks and states are in the world."""
         return state
 
@@ -542,11 +544,11 @@ class Map(Conditional):
         """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
 
     @abstractmethod
-    def read(self, ids: Ids, particles: Some = slice(None)) -> Records:
+    def read(self, ids: Ids, particles: ParticleRows = slice(None)) -> Records:
         """Estimates (N, K, …), in all or some particles. Raises InputError: a landmark is not held, or their kinds differ."""
 
     @abstractmethod
-    def add(self, new_landmarks: NewLandmarks, state: AllStates) -> Ids:
+    def add(self, new_landmarks: NewLandmarks, state: ParticleStates) -> Ids:
         """Starts landmarks at the states (N, E); returns their ids (K,). Raises InputError: see `add_records`."""
 
     @abstractmethod
@@ -607,19 +609,19 @@ class Map(Conditional):
 class Belief:
     """What a sensor may know before it measures: a weighted mixture of Gaussians, each with its own marginalised part."""
 
-    log_weights: OfAll  #: (N,) normalised.
+    log_weights: PerParticle  #: (N,) normalised.
     prior: Prior  #: distribution of each particle's increment; after the update its factor is zero.
     parts: Mapping[Part, Conditional]  #: what is marginalised, by what it supplies.
     rng: np.random.Generator = field(default_factory=np.random.default_rng)  #: the filter's, for a sensor that draws.
     landmarks: Part = Part.LANDMARK  #: which of them `map` is: the asking sensor's.
 
     @cached_property
-    def state(self) -> AllStates:
+    def state(self) -> ParticleStates:
         """(N, E) predicted states, or sampled ones after the update."""
         return self.prior.predicted()
 
     @cached_property
-    def weights(self) -> OfAll:
+    def weights(self) -> PerParticle:
         """(N,) summing to one."""
         return np.exp(self.log_weights)
 
@@ -637,7 +639,7 @@ class Belief:
             raise InputError(f"this sensor needs a landmark map: give the filter a LandmarkMap{named}")
         return held
 
-    def read(self, ids: Sequence[int] | Ids, particles: Some = slice(None)) -> Records:
+    def read(self, ids: Sequence[int] | Ids, particles: ParticleRows = slice(None)) -> Records:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)
 
@@ -688,5 +690,5 @@ class Resampler(ABC):
     """
 
     @abstractmethod
-    def ancestors(self, weights: OfAll, rng: np.random.Generator) -> Int[np.ndarray, " N"] | None:
+    def ancestors(self, weights: PerParticle, rng: np.random.Generator) -> Int[np.ndarray, " N"] | None:
         """(N,) normalised weights → (N,) ancestors, or None for no resampling in this step."""

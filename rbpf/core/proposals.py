@@ -30,16 +30,19 @@ class PriorProposal(Proposal):
 @final
 @dataclass(frozen=True, eq=False)
 class EkfProposal(Ranged, Proposal):
-    """FastSLAM 2.0: the prior refined by the observations, linearised once or several times (E06 §4.2)."""
+    """FastSLAM 2.0: the prior refined by the observations, linearised once or several times (E06 §4.2).
 
-    exact: bool = (
-        True  #: correct by the importance ratio at the sample; False is E06's weight, the linearised marginal.
-    )
-    iterations: Count = 1  #: linearisations at most; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
-    #: (d,) increment in each particle's chart where the first one is, where more is known than the prior says, whose mean
-    #: None is.
+    Raises InputError: there is not at least one iteration, or `settled` is negative.
+    """
+
+    #: Whether a particle is corrected by the importance ratio at its sample; False is E06's weight, the linearised marginal.
+    exact: bool = True
+    #: Linearisations at most; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
+    iterations: Count = 1
+    #: (d,) increment in each particle's chart at which the first linearisation is, where more is known than the prior says;
+    #: None is the prior's mean.
     start: np.ndarray | None = None
-    #: none is made any more when the last one moved no particle's mean by so many of its standard deviations.
+    #: No further linearisation is made when the last one moved no particle's mean by so many of its standard deviations.
     settled: NotNegative = 0.0
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:

@@ -70,10 +70,15 @@ class Residual(Resampler):
 @final
 @dataclass(frozen=True, eq=False)
 class EssTriggered(Ranged, Resampler):
-    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step."""
+    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step.
 
-    scheme: Resampler  #: how to resample.
-    threshold: Fraction = 0.5  #: fraction of N; 0 never resamples, 1 whenever the weights differ.
+    Raises InputError: the threshold does not lie in [0, 1].
+    """
+
+    #: How to resample.
+    scheme: Resampler
+    #: Fraction of N in [0, 1]; 0 never resamples, 1 does whenever the weights differ.
+    threshold: Fraction = 0.5
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
         if effective_sample_size(weights) >= self.threshold * weights.size * (1.0 - _ROUNDING):
@@ -84,12 +89,16 @@ class EssTriggered(Ranged, Resampler):
 @final
 @dataclass(frozen=True)
 class Consolidation(Ranged):
-    """When what the particles differ by is taken into what is marginalised, in place of resampling."""
+    """When what the particles differ by is taken into what is marginalised, in place of resampling.
 
-    #: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
+    Raises InputError: the window is shorter than a step, or the threshold does not lie in [0, 1].
+    """
+
+    #: Steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
     window: Count = 5
-    threshold: Fraction = 0.5  #: fraction of N below which the effective sample size calls for it earlier.
-    #: not now: while it is not known where the robot is, its frame must not move there.
+    #: Fraction of N below which the effective sample size calls for it earlier.
+    threshold: Fraction = 0.5
+    #: Whether it waits: while it is not known where the robot is, its frame must not move there.
     held: bool = field(default=False, repr=False)
 
     def is_due(self, age: int, weights: np.ndarray) -> bool:
