@@ -183,18 +183,23 @@ class Product(LieGroup):
         return self._each("normalise", self.split(x))
 
     def adjoint(self, a: States) -> TangentMatrix:
-        return self._block_diagonal("adjoint", self.split(a))
+        parts = self.split(a)
+        return self._block_diagonal([group.adjoint(part) for group, part in zip(self.groups, parts, strict=True)])
 
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return self._block_diagonal("left_jacobian", self.split_tangent(xi))
+        parts = self.split_tangent(xi)
+        return self._block_diagonal([group.left_jacobian(part) for group, part in zip(self.groups, parts, strict=True)])
 
     def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        return self._block_diagonal("left_jacobian_inverse", self.split_tangent(xi))
+        parts = self.split_tangent(xi)
+        blocks = [group.left_jacobian_inverse(part) for group, part in zip(self.groups, parts, strict=True)]
+        return self._block_diagonal(blocks)
 
-    def _block_diagonal(self, name: str, parts: list[Array]) -> Array:
-        out = np.zeros((*parts[0].shape[:-1], self.dim, self.dim))
-        for group, block, part in zip(self.groups, self._tangent, parts, strict=True):
-            out[..., block, block] = getattr(group, name)(part)
+    def _block_diagonal(self, blocks: list[Array]) -> Array:
+        """Matrices (…, d, d) of the factors' own, in their order."""
+        out = np.zeros((*blocks[0].shape[:-2], self.dim, self.dim))
+        for rows, block in zip(self._tangent, blocks, strict=True):
+            out[..., rows, rows] = block
         return out
 
 

@@ -96,7 +96,9 @@ class SE3Group(LieGroup):
     def from_matrix(self, m: Like[ArrayLike, "*batch row 4"]) -> Float[np.ndarray, "*batch 7"]:
         """Element of a homogeneous (or 3 x 4) matrix, (..., 4, 4) -> (..., 7), with qw >= 0."""
         m = np.asarray(m, dtype=float)
-        return _one(kernels.from_matrix, m[..., :3, :].reshape(*m.shape[:-2], 12), 12, (7,))
+        # An IndexError where there is no column of the translation, as in a 3 x 3 matrix of rotation.
+        rows = np.concatenate([m[..., :3, :3], m[..., :3, 3][..., None]], axis=-1)
+        return _one(kernels.from_matrix, rows.reshape(*m.shape[:-2], 12), 12, (7,))
 
     def from_ypr(
         self,
