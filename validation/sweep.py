@@ -24,7 +24,7 @@ from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -50,12 +50,19 @@ Row = dict[str, Any]
 Named = tuple[tuple[str, str], ...]
 
 
-#: By their names what opens a sequence, and its fields, each a path that this takes; the first is the recording itself.
-SYSTEMS: dict[str, tuple[Callable[..., recordings.Recording], tuple[str, ...]]] = {
-    "range-bearing": (recordings.RobotRecording, ("recording",)),
-    "laser": (recordings.LaserRecording, ("recording",)),
-    "mono": (recordings.MonoRecording, ("recording", "known_points", "calibration")),
-    "stereo": (recordings.StereoRecording, ("recording", "calibration")),
+class SweepSystem(NamedTuple):
+    """A system that a sweep can run."""
+
+    recording: Callable[..., recordings.Recording]  #: opens a sequence, from the paths of its fields.
+    fields: tuple[str, ...] = ("recording",)  #: of a sequence, each a path; the first is the recording itself.
+
+
+#: By their names.
+SYSTEMS = {
+    "range-bearing": SweepSystem(recordings.RobotRecording),
+    "laser": SweepSystem(recordings.LaserRecording),
+    "mono": SweepSystem(recordings.MonoRecording, ("recording", "known_points", "calibration")),
+    "stereo": SweepSystem(recordings.StereoRecording, ("recording", "calibration")),
 }
 
 
@@ -126,7 +133,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     """All runs of a sweep; paths are taken from a folder. Errors as `read_plan`."""
     if file.system not in SYSTEMS:
         raise InputError(f"a sweep runs one of the systems {', '.join(SYSTEMS)}, not {file.system!r}")
-    sequences = [_sequence(given, SYSTEMS[file.system][1], folder, where) for given in file.sequences]
+    sequences = [_sequence(given, SYSTEMS[file.system].fields, folder, where) for given in file.sequences]
     seeds: Sequence[int] = range(file.seeds) if isinstance(file.seeds, int) else file.seeds  # a range takes no room
     for what, values in (("sequences", sequences), ("seeds", seeds), ("options", list(file.options))):
         if not values:
@@ -229,11 +236,11 @@ def run_job(job: Job) -> Row:
     """One run, with one thread: the processes keep the machine busy."""
     import numba
 
-    (recording, names), paths = SYSTEMS[job.system], {name: Path(path) for name, path in job.sequence}
+    system, paths = SYSTEMS[job.system], {name: Path(path) for name, path in job.sequence}
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        figures = _figures(recordings.filter_recording(recording(*map(paths.get, names)), job.config()))
+        figures = _figures(recordings.filter_recording(system.recording(*map(paths.get, system.fields)), job.config()))
     except InputError as error:
         figures = {"failure": str(error)}
     finally:

@@ -21,14 +21,17 @@ VERSION = 1  #: Of trajectory.npz.
 OnDone = Callable[[int, int], None]  #: Called with how many parts of some work are done, and of how many.
 
 
-def prepare_folder(out: Path) -> None:
-    """Makes a run's folder. Raises InputError: there is a file of that name, or the folder cannot be made."""
+def prepare_folder(out: Path, what: str = "results") -> None:
+    """Makes a folder for `what`, the word of it in messages.
+
+    Raises InputError: there is a file of that name, or the folder cannot be made.
+    """
     if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file: name a folder for the results")
+        raise InputError(f"{out} is a file: name a folder for the {what}")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot make the folder {out} for the results: {error.strerror}") from error
+        raise InputError(f"cannot make the folder {out} for the {what}: {error.strerror}") from error
 
 
 def holds_run(out: Path) -> bool:

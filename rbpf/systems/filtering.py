@@ -66,13 +66,13 @@ class ResamplingConfig(Ranged):
 
 @dataclass(frozen=True)
 class RunConfig(Ranged):
-    """A run of any system; what a frame is the system says: an image, a pair that updates the filter, a step, a scan."""
+    """A run of any system; what a frame is the system says: an image, a pair, a step of a robot's log, a scan."""
 
     particles: Count = 100  #: number of particles.
     seed: Seed = 0  #: of all random generators.
     _: KW_ONLY  # a system's own settings follow by their places, as dof of a stereo camera
-    #: frames of the particles' paths that are kept; None keeps all of a recording, and the last 150 where no end is known.
-    #: With a joint map one.
+    #: frames of the particles' paths that are kept, of pairs only those that update the filter; None keeps all of a
+    #: recording, and the last 150 where no end is known. Where landmarks are a joint map one is kept.
     lag: Count | None = None
-    checkpoint_every: Count = 500  #: frames between checkpoints.
+    checkpoint_every: Count = 500  #: frames taken (images, pairs, steps, scans) between checkpoints.
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.

@@ -22,9 +22,20 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs import plots
 from rbpf.runs.files import GRID, write_text
-from rbpf.runs.plots import COLOURS, FIGURES, SIGMAS, VECTORS, Views, World
+from rbpf.runs.plots import (
+    COLOURS,
+    FIGURES,
+    SIGMAS,
+    VECTORS,
+    Views,
+    World,
+    lost_frames,
+    moved_map,
+    near_box,
+    other_paths,
+    outline,
+)
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import CONFIGS
@@ -236,19 +247,19 @@ def scene(found: RunFolder, world: World) -> str:
     """Path, cameras, map, truth, odometry and batch optimum of a run in one world, as JSON with `data` and `layout`."""
     path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
     at, views = path.positions, Views.of(found.system, path)
-    landmarks = plots.moved_map(found.map, motion)
+    landmarks = moved_map(found.map, motion)
     mean, cov = landmarks.points().in_space()
     has_grid = (found.folder / GRID).is_file()
     if has_grid:
         rows, columns = np.nonzero(found.grid.log_odds > 0.0)
         cells = found.grid.corner + found.grid.cell_m * (np.column_stack([columns, rows]) + 0.5)
         mean = motion.transform(np.pad(_some(cells, CELLS), ((0, 0), (0, 1))))
-    near, low, high = plots.near_box(mean, at)
+    near, low, high = near_box(mean, at)
     size = max(float((high - low).max()), 1e-3)
     traces = [_line(at, "path", "filter", 4)]
-    for name, label, positions in plots.other_paths(found, world):
+    for name, label, positions in other_paths(found, world):
         traces.append(_line(positions, label, name, 2))
-    if (lost := plots.lost_frames(found)).any():
+    if (lost := lost_frames(found)).any():
         traces.append(_points(at[lost], "lost", "map", 3))
     traces.append(_line(_frustums(path.world_from_body, found.system, _SIZE * size), "poses", "filter", 1))
     if has_grid:
@@ -257,7 +268,7 @@ def scene(found: RunFolder, world: World) -> str:
         traces.append(_points(_some(mean[near], LANDMARKS), "landmarks", "truth", 2))
         name = f"{SIGMAS:g}σ"
         if landmarks.mean.shape[1] == 2:
-            rings = np.pad(plots.outline(mean[near][:, :2], cov[near][:, :2, :2]), ((0, 0), (0, 0), (0, 1)))
+            rings = np.pad(outline(mean[near][:, :2], cov[near][:, :2, :2]), ((0, 0), (0, 0), (0, 1)))
             traces.append(_line(_strips(_some(rings, ELLIPSOIDS)), name, "truth", 1))
         else:
             traces.append(_ellipsoids(_some(mean[near], ELLIPSOIDS), _some(cov[near], ELLIPSOIDS), name))

@@ -216,7 +216,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         raise InputError(f"{folder} exists already: delete it or choose another folder for the images")
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
-    prepare_folder(partial)
+    prepare_folder(partial, "images")
     try:
         yield partial
         partial.replace(folder)

@@ -359,7 +359,8 @@ class RosBag(ImageFormat):
                 used = infos[0].calibration
             else:
                 infos, used = [], read_calibration(options.calibration)
-            stamps, shapes, frames = zip(*(_gone_through(bag, name) for name in names), strict=True)
+            read = [_stamps_and_first(bag, name) for name in names]
+            stamps, shapes, frames = zip(*read, strict=True)
             shape, where = shapes[0], f"{path}, {' and '.join(names)}"
             sizes = [f"{width}x{height}" for height, width in shapes]
             if sizes[0] != sizes[-1]:
@@ -404,7 +405,7 @@ class RosBag(ImageFormat):
         return rectified(sequence, right.calibration.camera, left_from_right, where, note)
 
 
-def _gone_through(bag: Bag, topic: str) -> tuple[np.ndarray, tuple[int, int], str]:
+def _stamps_and_first(bag: Bag, topic: str) -> tuple[np.ndarray, tuple[int, int], str]:
     """Of a topic of images the times (T,) of its messages' headers, not decreasing, and what the first image says.
 
     That is the first that can be read: height and width, and the name of the camera's frame.

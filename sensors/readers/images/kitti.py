@@ -88,7 +88,7 @@ class Kitti(ImageFormat):
         )
         folder, truth = path.resolve(), None
         for file in (path / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
-            if truth is not None or not file.exists():
+            if not file.exists():
                 continue
             table = read_columns(file, _POSE)
             if len(table.lines) != count:
@@ -99,6 +99,7 @@ class Kitti(ImageFormat):
                 if (wrong := rigid_motion_error(matrix)) is not None:
                     raise table.error(row, wrong)
             truth = Truth(rows.stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
+            break
         source = FileImages(rows.stamps_ns, shape, *files)
         return ImageSequence(folder.name, used.camera, rows.stamps_ns, truth, baseline_m, source, notes)
 
