@@ -205,6 +205,8 @@ def test_a_folder_with_files_is_not_touched(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exists already"):
         simulate_images(DESK, Imaging(), CAMERA, tmp_path, 0)
     assert contents(tmp_path) == {"notes.txt": b"mine"}
+    with pytest.raises(InputError, match=r"cannot make the folder .* for the images"):
+        simulate_images(DESK, Imaging(), CAMERA, tmp_path / "notes.txt" / "run", 0)
 
 
 class GreyWall:
