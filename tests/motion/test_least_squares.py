@@ -24,12 +24,6 @@ def rosenbrock(x):
     return np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]]), np.array([[-20.0 * x[0], 10.0], [-1.0, 0.0]])
 
 
-def linear(seed=0):
-    rng = np.random.default_rng(seed)
-    jac, b = rng.normal(size=(12, 4)), rng.normal(size=12)
-    return jac, b, lambda x: (jac @ x - b, jac)
-
-
 @pytest.mark.parametrize(("function", "start"), [(decay, [1.0, 0.1, 0.0]), (rosenbrock, [-1.2, 1.0])])
 def test_the_minimum_is_scipys(function, start):
     ours = minimise(function, np.array(start), np.add, STRICT)
@@ -41,8 +35,9 @@ def test_the_minimum_is_scipys(function, start):
 
 
 def test_a_linear_problem_takes_one_step_without_damping():
-    jac, b, function = linear(1)
-    found = minimise(function, np.zeros(4), np.add, Rule(damping=0.0))
+    rng = np.random.default_rng(1)
+    jac, b = rng.normal(size=(12, 4)), rng.normal(size=12)
+    found = minimise(lambda x: (jac @ x - b, jac), np.zeros(4), np.add, Rule(damping=0.0))
     assert (found.iterations, found.converged) == (1, True)
     np.testing.assert_allclose(found.x, np.linalg.lstsq(jac, b, rcond=None)[0], rtol=1e-9)
     np.testing.assert_allclose(found.cov, np.linalg.inv(jac.T @ jac), rtol=1e-9)

@@ -10,7 +10,7 @@ from rbpf.sensors.calibration import Board
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_scene import ImageWorld, Rectangle, TexturedScene, cast
+from rbpf.validation.simulation.textured_scene import Rectangle, cast
 from rbpf.validation.simulation.textures import clouds, grey_levels
 
 CAMERA = Pinhole(160, 120, 110.0, 108.0, 78.0, 61.5)
@@ -18,10 +18,6 @@ DISTORTED = replace(CAMERA, distortion=(-0.28, 0.07, 1e-3, -5e-4, 0.01))
 FISHEYE = Pinhole(160, 120, 66.0, 66.0, 78.0, 61.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
 AXES = np.eye(3)
 DESK = TexturedDesk(frames=12, texel_m=0.008, board=(7, 5), square_m=0.1)
-
-
-def drawn(world: ImageWorld) -> TexturedScene:
-    return world.build(np.random.default_rng(5))
 
 
 def facing(distance: float, size: float, texture: np.ndarray) -> Rectangle:
@@ -51,7 +47,7 @@ def squares(
 def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
     """A window about each corner is registered (least squares) to the mean of 9 × 9 exact rays per pixel."""
     cv2 = pytest.importorskip("cv2")
-    scene = drawn(DESK)
+    scene = DESK.build(np.random.default_rng(5))
     board, lies = scene.boards[0]
     renderer = Renderer(scene.rectangles, camera)
     around = np.stack(np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0)), axis=-1)
