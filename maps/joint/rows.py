@@ -109,10 +109,10 @@ class Rows(NamedTuple):
                 count = int((log_odds >= 0.0).sum())
                 log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
                 is_density[own] = likelihood.normalised
-        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, len(chol) - self._untold()
+        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, len(chol) - self._uninformative()
         return Information(info, vector, quad, *np.full((n, 3), of_all).T)
 
-    def _untold(self) -> float:
+    def _uninformative(self) -> float:
         """How many of the rows say nothing, of those that are set apart."""
         total = 0.0
         for group in self.groups:
@@ -281,12 +281,15 @@ class Reading:
             noise = np.maximum(np.einsum("kp,kpq,kq->k", along, diagonal_blocks(self._noise, own), along), TINY)
             # Of the information 1/r along the line 1/(r + w²) has been used.
             ratio = np.where(seen.log_odds >= 0.0, np.square(wide) / noise, 0.0)
-            told = ratio / (1.0 + ratio) / noise
+            information = ratio / (1.0 + ratio) / noise
             slope = np.einsum("kp,kpq->kq", along, rows.slope[own])
             carried = np.einsum("kp,kpn->kn", along, rows.carried[own])
             within = np.einsum("klq,lq->kl", carried[:, rows.at[own[:, 0]]], slope)
-            spread, reached = 1.0 + told * np.diagonal(within), np.take_along_axis(carried, column[:, None], 1)[:, 0]
-            gain = told * reached / spread
+            spread, reached = (
+                1.0 + information * np.diagonal(within),
+                np.take_along_axis(carried, column[:, None], 1)[:, 0],
+            )
+            gain = information * reached / spread
             nu = np.einsum("kp,nkp->nk", along, rows.nu[:, own]) + (at - mean)[:, column] * slope[:, alone]
             moved = mean.copy()
             moved[:, column] += gain * nu
@@ -302,8 +305,8 @@ class Reading:
         block = self._cov[mine] - taken - taken.T + gain[:, None] * within * gain
         block[np.diag_indices(column.size)] = self._cov[column, column] - gain * reached
         after[mine] = block
-        spread += told * np.diagonal(spread_of(nu, np.full(len(nu), 1.0 / len(nu))))
-        total = 0.5 * (np.log1p(ratio) - np.log(spread) - told * np.square(nu.mean(axis=0)) / spread).sum()
+        spread += information * np.diagonal(spread_of(nu, np.full(len(nu), 1.0 / len(nu))))
+        total = 0.5 * (np.log1p(ratio) - np.log(spread) - information * np.square(nu.mean(axis=0)) / spread).sum()
         return float(total), moved, after
 
 
