@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import Kept, integers, numbers, read
-from rbpf.core.models import NULL, Belief, Landmark, Map, NewLandmarks, Observations, Sensor
+from rbpf.core.checkpoint import Kept, integers, read
+from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Particles, Prior
 from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
@@ -38,15 +38,14 @@ from rbpf.sensors.landmark_management import LandmarkManager
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.learnt_noise import LearntNoise
-from rbpf.systems.stereo.config import MapConfig, StereoConfig
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.places import Places, make_room, places_of
 from rbpf.systems.system import MAP_IDS
 
 SEEN_AGAIN = 2
 """Observations of a landmark that stands still: one that moves is not where it was seen first."""
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
-SIGMAS = 3.0
-"""The image is widened by so many standard deviations of the camera's direction."""
 
 
 class FeatureKind(IntEnum):
@@ -282,75 +281,6 @@ class MahalanobisGate(AssociationGate):
     def pairs(self, features: StereoFeatures, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
         cov = expected.cov + self.slack_px**2 * np.eye(3)
         return gate_pairs(features.z, features.cov, expected.mean, cov, self.gate)
-
-
-class Places(Kept):
-    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
-
-    Landmarks go by their rows in the store of descriptors.
-    """
-
-    place: np.ndarray  #: (M, 3) in the world of the heaviest particle.
-    kept: ClassVar = {"place": numbers("landmarks", 3), "_seen_from": numbers("landmarks", 3)}
-    prefix = "places/"
-
-    def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
-        self.rig, self.config = rig, config
-        self.place, self._seen_from = np.zeros((2, 0, 3))
-
-    def put(self, rows: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
-        """Landmarks (k,), held or new, are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,)."""
-        room = np.zeros((int((rows >= len(self.place)).sum()), 3))
-        self.place, self._seen_from = (np.concatenate([one, room]) for one in (self.place, self._seen_from))
-        self.place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
-
-    def move(self, rows: np.ndarray, place: np.ndarray) -> None:
-        """Landmarks (k,) are at places (k, 3) as the map is bent now, and were seen from as far."""
-        self._seen_from[rows] += place - self.place[rows]
-        self.place[rows] = place
-
-    def remove(self, rows: np.ndarray) -> None:
-        self.place, self._seen_from = (np.delete(one, rows, axis=0) for one in (self.place, self._seen_from))
-
-    def in_view(self, world_from_camera: np.ndarray, std_direction_rad: float = 0.0) -> np.ndarray:
-        """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""
-        camera = self.rig.camera
-        margin = self.config.margin_px + min(SIGMAS * camera.fx * std_direction_rad, 0.5 * camera.width)
-        # In both images, or nearly; most are far from it.
-        local = SE3.inverse_transform(world_from_camera, self.place)
-        across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
-        down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
-        x, y, z = local.T
-        rows = np.flatnonzero((z > 0.0) & (np.abs(x) <= across * z) & (np.abs(y) <= down * z))
-        rows = rows[self.rig.visible(local[rows], -margin)]
-        then = self.place[rows] - self._seen_from[rows]
-        now = self.place[rows] - SE3.translation(world_from_camera)
-        lengths = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
-        cosine = (then * now).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
-        ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
-        alike = cosine >= np.cos(np.deg2rad(self.config.max_turn_deg))
-        return np.asarray(rows[alike & (ratio <= np.log(self.config.max_scale_change))])
-
-
-def places_of(belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks (k,) as the heaviest particle has them (k, 3), with covariances (k, 3, 3), none of those that are put away."""
-    held, place, cov = belief.map.holds(ids), np.empty((ids.size, 3)), np.zeros((ids.size, 3, 3))
-    if held.any():
-        records = belief.read_mode(ids[held])
-        place[held], cov[held] = records.mean[0], records.cov[0]
-    if isinstance(belief.map, JointMap) and not held.all():
-        world = dict(zip(*(each.tolist() for each in belief.map.old.places()), strict=True))
-        frame = belief.map.world(SE3.identity((1,)), np.array([belief.mode]))
-        place[~held] = SE3.inverse_transform(frame, np.array([world[name] for name in ids[~held].tolist()]))
-    return place, cov
-
-
-def make_room(held: Map, landmarks: np.ndarray, unseen_for: np.ndarray) -> None:
-    """Where a joint map is full, puts landmarks (M,) away that were not seen for longest, (M,) pairs; none of this one."""
-    if isinstance(held, JointMap) and held.is_full:
-        unseen_for = np.where(held.holds(landmarks) & ~np.isin(landmarks, held.leaving), unseen_for, 0)
-        order = np.argsort(-unseen_for, kind="stable")
-        held.make_room(landmarks[order[: np.count_nonzero(unseen_for)]])
 
 
 class DescriptorLandmarks(Landmarks[StereoFeatures]):
