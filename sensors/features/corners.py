@@ -33,33 +33,35 @@ class CornerDetector(Detector):
     def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         import cv2
 
-        eigenvalues = _least_eigenvalues(image)
+        from rbpf.sensors.features.kernels import highest
+
         # All of FAST's corners: of equal neighbours, which ideal and saturated images have, its own suppression keeps none.
         first = margin_px - _FAST_RADIUS_PX
         inner = image[first : image.shape[0] - first, first : image.shape[1] - first]
         found = cv2.FastFeatureDetector.create(self.fast_threshold, False).detect(inner)
-        px = np.rint(cv2.KeyPoint.convert(found)).astype(np.int64).reshape(-1, 2) + first
+        px = np.asarray(cv2.KeyPoint.convert(found), dtype=np.int64).reshape(-1, 2) + first
         if mask is not None:
             px = px[mask[px[:, 1], px[:, 0]]]
         # A corner's score is good enough, and the highest among its neighbours that FAST found.
-        rated, score = np.full(image.shape, -np.inf, np.float32), eigenvalues[px[:, 1], px[:, 0]]
-        rated[px[:, 1], px[:, 0]] = np.where(score >= float(self.min_score) ** 2, score, -np.inf)
-        highest = cv2.dilate(rated, np.ones((3, 3), np.uint8))[px[:, 1], px[:, 0]]
-        px = px[(rated[px[:, 1], px[:, 0]] == highest) & np.isfinite(highest)]
-        return px, np.sqrt(eigenvalues[px[:, 1], px[:, 0]].astype(float))
+        squared, is_best = _squared_scores(image, px), np.empty(len(px), dtype=bool)
+        highest(px, squared, np.full(image.shape, -np.inf), is_best)
+        is_best &= squared >= self.min_score**2
+        return px[is_best], np.sqrt(squared[is_best])
 
 
 def corner_score(image: np.ndarray, px: np.ndarray) -> np.ndarray:
     """The score of `CornerDetector` at pixels (K, 2) inside the image, rounded to whole ones: (K,) grey levels per pixel."""
-    column, row = np.rint(px).astype(int).T
-    return np.sqrt(np.maximum(_least_eigenvalues(checked_image(image))[row, column], 0.0)).astype(float)
+    reach, px = CornerDetector.margin_px, np.rint(px).astype(np.int64)
+    order = np.argsort(px[:, 1], kind="stable")
+    squared = np.empty(len(px))
+    squared[order] = _squared_scores(np.pad(checked_image(image), reach, mode="reflect"), px[order] + reach)
+    return np.sqrt(np.maximum(squared, 0.0))
 
 
-def _least_eigenvalues(image: np.ndarray) -> np.ndarray:
-    """Of the mean of ∇I ∇Iᵀ over the window around each pixel, with Sobel's derivatives: (H, W) float32."""
-    import cv2
+def _squared_scores(image: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """(K,) of pixels (K, 2) that come row by row, none of them near the border."""
+    from rbpf.sensors.features.kernels import least_eigenvalues
 
-    # OpenCV sums squares of Sobel's sums / (4 · window · 255), which are twice the derivative.
-    squares = cv2.cornerMinEigenVal(image, WINDOW_PX)
-    squares *= np.float32(127.5**2)
-    return np.asarray(squares)
+    squared = np.empty(len(px))
+    least_eigenvalues(image, np.ascontiguousarray(px), WINDOW_PX, squared)
+    return squared

@@ -102,6 +102,8 @@ class Detector(ABC):
 
         Raises InputError: the image is not (H, W) uint8, or the occupied pixels are not (M, 2).
         """
+        from rbpf.sensors.features.kernels import choose_apart
+
         image = checked_image(image)
         taken = np.zeros((0, 2)) if occupied is None else np.asarray(occupied, float)
         if taken.ndim != 2 or taken.shape[1] != 2:
@@ -111,14 +113,10 @@ class Detector(ABC):
             return Keypoints.at(np.zeros((0, 2)))
         px, score = self.candidates(image, margin, mask)
         # The best one that is free is taken, and what is too near to it is free no more.
-        taken, free = taken[np.isfinite(taken).all(axis=1)], np.argsort(-score, kind="stable")
-        for place in taken:
-            free = _apart(px, free, place, spacing_px)
-        chosen = list[int]()
-        while free.size and len(chosen) < count:
-            chosen.append(int(free[0]))
-            free = _apart(px, free[1:], px[chosen[-1]], spacing_px)
-        return Keypoints.at(px[chosen], score=score[chosen])
+        order, chosen = np.argsort(-score, kind="stable"), np.empty(count, dtype=np.int64)
+        px, taken = px[order].astype(float), np.ascontiguousarray(taken[np.isfinite(taken).all(axis=1)])
+        chosen = chosen[: choose_apart(px, taken, spacing_px, chosen)]
+        return Keypoints.at(px[chosen], score=score[order[chosen]])
 
 
 class Descriptor(ABC):
@@ -191,8 +189,3 @@ def checked_image(image: np.ndarray) -> np.ndarray:
         found = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
         raise InputError(f"an image must be grey, (H, W) uint8, got {found}: convert it first")
     return np.ascontiguousarray(image)
-
-
-def _apart(px: np.ndarray, rows: np.ndarray, place: np.ndarray, spacing_px: float) -> np.ndarray:
-    """Those rows of px (M, 2) that are at least so far from a place (2,)."""
-    return rows[np.square(px[rows] - place).sum(axis=1) >= spacing_px**2]

@@ -54,17 +54,27 @@ def _step(width, index, count):
 
 
 @njit(cache=True, error_model="numpy")
-def cubic(image, x, y):
-    """Catmull-Rom interpolation at column x and row y inside the image; its border is repeated."""
+def surroundings(image, left, top, side):
+    """Grey levels (side, side) from a column and a row on, the image's border repeated."""
     height, width = image.shape
-    u, v = min(int(x), width - 1), min(int(y), height - 1)
+    area = np.empty((side, side), np.float32)
+    for j in range(side):
+        row = image[min(max(top + j, 0), height - 1)]
+        for i in range(side):
+            area[j, i] = row[min(max(left + i, 0), width - 1)]
+    return area
+
+
+@njit(cache=True, error_model="numpy")
+def cubic(area, x, y):
+    """Catmull-Rom interpolation in `surroundings` from (−1, −1) on, at column x and row y of those."""
+    u, v = int(x), int(y)
     across, down = weights(x - u), weights(y - v)
     total = 0.0
     for j in range(4):
-        row = min(max(v + j - 1, 0), height - 1)
         line = 0.0
         for i in range(4):
-            line += across[i] * image[row, min(max(u + i - 1, 0), width - 1)]
+            line += across[i] * area[v + j, u + i]
         total += down[j] * line
     return total
 
@@ -82,16 +92,16 @@ def warp_all(sources, affines, templates):
     size, middle = templates.shape[1], 0.5 * (sources.shape[1] - 1)
     templates[:] = np.nan
     for k in range(templates.shape[0]):
-        source = sources[k]
         a, b, c, d = affines[k, 0, 0], affines[k, 0, 1], affines[k, 1, 0], affines[k, 1, 1]
         if not math.isfinite(a * a + b * b + c * c + d * d):
             continue
-        samples = footprint(a, b, c, d, source.shape[0])
+        samples = footprint(a, b, c, d, sources.shape[1])
         reach = 0.0
         for s in range(samples.shape[0]):
             reach = max(reach, abs(samples[s, 0]), abs(samples[s, 1]))
         if max(abs(a) + abs(b), abs(c) + abs(d)) * (size // 2) + reach > middle:
             continue
+        source = surroundings(sources[k], -1, -1, sources.shape[1] + 3)
         for j in range(size):
             for i in range(size):
                 dx, dy, total = float(i - size // 2), float(j - size // 2), 0.0
@@ -105,13 +115,16 @@ def warp_all(sources, affines, templates):
 def cut_window(image, x, y, window):
     """Fills window (S, S) uint8 around column x and row y."""
     half = window.shape[0] // 2
+    left, top = int(x) - half, int(y) - half
+    area = surroundings(image, left - 1, top - 1, window.shape[0] + 3)
     for j in range(window.shape[0]):
         for i in range(window.shape[0]):
-            grey = cubic(image, x + (i - half), y + (j - half))
+            grey = cubic(area, x + (i - half) - left, y + (j - half) - top)
             window[j, i] = np.uint8(min(max(math.floor(grey + 0.5), 0.0), 255.0))
 
 
 _LANES = 4  #: Columns of a template taken together, so that a sum is loaded and stored once for all of them.
+_BETWEEN = 40  #: Pixels that take as long as the beginning of a line.
 _HALF_DIAGONAL_SQUARED = 0.51  #: A little over ½ px²: the nearest whole pixel is never further.
 
 
@@ -153,35 +166,55 @@ def ellipse(cov, sigmas):
 @njit(cache=True, error_model="numpy")
 def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores):
     """Correlation of the unit template at the whole pixels of the ellipse; −1 where the image is flat."""
-    uu, uv, vv = ellipse(cov, sigmas)
-    slope = uv / vv
-    narrow = max(uu - uv * slope, 0.0)
     half, (height, width) = size // 2, scores.shape
     left, top = columns[0] - half, rows[0] - half
     grey = levels(image[top : top + height + size - 1, left : left + width + size - 1], unit.shape[1] - size)
+    lines = lines_inside(centre, cov, sigmas, columns, rows, grey.shape[1])
+    cross = np.empty(lines[-1, 1], np.float32)
+    y = 0
+    while y < height:
+        # Lines are correlated together with what is between them, where that is less than what each of them costs.
+        start, end = lines[y]
+        y += 1
+        while y < height and lines[y, 0] - end <= _BETWEEN:
+            end = max(end, lines[y, 1])
+            y += 1
+        _correlate(grey, unit, start, end - start, cross[start:])
     sums, squares = np.zeros(width + size - 1, np.int32), np.zeros(width + size - 1, np.int32)
     window, window_squares = np.empty(width, np.int32), np.empty(width, np.int32)
-    cross = np.empty(width, np.float32)
     for y in range(size - 1):
         _slide(image[top + y, left:], 1, sums, squares)
     for y in range(height):
         _slide(image[top + y + size - 1, left:], 1, sums, squares)
+        first, count = lines[y, 0] - y * grey.shape[1], lines[y, 1] - lines[y, 0]
+        if count > 0:
+            _window_sums(sums[first:], size, count, window)
+            _window_sums(squares[first:], size, count, window_squares)
+            # Scores from Σ unit · grey and the windows' sums, whose variance is exact.
+            n, products = size * size, cross[lines[y, 0] :]
+            for x in range(count):
+                spread = float(n) * window_squares[x] - float(window[x]) * float(window[x])
+                score = products[x] * math.sqrt(n / max(spread, 1.0))
+                scores[y, first + x] = np.float32(min(score, 1.0)) if spread > 0.0 else np.float32(-1.0)
+        _slide(image[top + y, left:], -1, sums, squares)
+
+
+@njit(cache=True, error_model="numpy")
+def lines_inside(centre, cov, sigmas, columns, rows, stride):
+    """Of each row the first pixel of the ellipse and one beyond the last, counted along rows of this length (height, 2)."""
+    uu, uv, vv = ellipse(cov, sigmas)
+    slope = uv / vv
+    narrow, height = max(uu - uv * slope, 0.0), rows[1] - rows[0] + 1
+    lines = np.empty((height, 2), np.int64)
+    for y in range(height):
         dy = rows[0] + y - centre[1]
         reach = math.sqrt(max(narrow * (sigmas * sigmas - dy * dy / vv), 0.0))
         low = max(np.ceil(centre[0] + slope * dy - reach), float(columns[0]))
         high = min(np.floor(centre[0] + slope * dy + reach), float(columns[1]))
-        if high >= low and dy * dy <= sigmas * sigmas * vv:
-            start, count = int(low) - columns[0], int(high) - int(low) + 1
-            _correlate(grey[y : y + size], unit, start, count, cross)
-            _window_sums(sums[start:], size, count, window)
-            _window_sums(squares[start:], size, count, window_squares)
-            # Scores from Σ unit · grey and the windows' sums, whose variance is exact.
-            n = size * size
-            for x in range(count):
-                spread = float(n) * window_squares[x] - float(window[x]) * float(window[x])
-                score = cross[x] * math.sqrt(n / max(spread, 1.0))
-                scores[y, start + x] = np.float32(min(score, 1.0)) if spread > 0.0 else np.float32(-1.0)
-        _slide(image[top + y, left:], -1, sums, squares)
+        is_inside = high >= low and dy * dy <= sigmas * sigmas * vv
+        lines[y, 0] = y * stride + (int(low) - columns[0] if is_inside else 0)
+        lines[y, 1] = y * stride + (int(high) - columns[0] + 1 if is_inside else 0)
+    return lines
 
 
 @njit(cache=True, error_model="numpy")
@@ -225,13 +258,15 @@ def _window_sums(columns, size, count, out):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _correlate(grey, unit, start, count, cross):
-    """Σ unit · grey at `count` columns from `start` on."""
+    """Σ unit · grey at `count` pixels from the one numbered `start` on, counted along the rows."""
+    along, stride = grey.reshape(grey.size), grey.shape[1]
     for x in range(count):
         cross[x] = 0.0
     for j in range(unit.shape[0]):
         for i in range(0, unit.shape[1], _LANES):
             a, b, c, d = unit[j, i], unit[j, i + 1], unit[j, i + 2], unit[j, i + 3]
-            row = grey[j, start + i : start + i + count + _LANES]
+            first = start + j * stride + i
+            row = along[first : first + count + _LANES]
             for x in range(count):
                 cross[x] += a * row[x] + b * row[x + 1] + c * row[x + 2] + d * row[x + 3]
 
@@ -242,26 +277,21 @@ _SINGULAR = 1e-9
 #: Error of the place, per axis, that remains without noise: measured on random textures blurred by 0.5 px.
 _INTERPOLATION_PX = 0.02
 _SETTLED_PX = 0.01
+_OF_SECOND = 1e-3  #: To which the score of a second peak is good: its place does not count.
 _REACH_PX = 1.0  #: A maximum further from the best whole pixel along rows or columns is none of this peak.
 _MARGIN = 4  #: What a window needs around it to be moved by `_REACH_PX`, interpolated and differentiated.
 
 
 @njit(cache=True, error_model="numpy")
-def refine(image, unit, size, column, row, found):
+def refine(image, unit, size, column, row, found, enough):
     """Writes place, score and covariance, found[0:2], [2] and [4:7].
 
-    A step after which ρ is lower is taken back by half. Where no maximum is near, the whole pixel and the score
-    that the caller wrote stay, and the covariance is NaN.
+    A step after which ρ is lower is taken back by half; it ends where ρ would rise by less than `enough`, too. Where no
+    maximum is near, the whole pixel and the score that the caller wrote stay, and the covariance is NaN.
     """
     found[0], found[1], found[4:] = float(column), float(row), np.nan
-    # Grey levels around the window, the image's border repeated.
-    side = size + 2 * _MARGIN
-    area = np.empty((side, side), np.float32)
-    top, left = row - size // 2 - _MARGIN, column - size // 2 - _MARGIN
-    for j in range(side):
-        v = min(max(top + j, 0), image.shape[0] - 1)
-        for i in range(side):
-            area[j, i] = image[v, min(max(left + i, 0), image.shape[1] - 1)]
+    reach = size // 2 + _MARGIN
+    area = surroundings(image, column - reach, row - reach, size + 2 * _MARGIN)
     window, w = np.empty((size + 2, size + 2), np.float32), np.empty((size, size), np.float32)
     x, y, du, dv, highest = 0.0, 0.0, 0.0, 0.0, -1.0
     uu, uv, vv = 0.0, 0.0, 0.0
@@ -276,6 +306,8 @@ def refine(image, unit, size, column, row, found):
                 return
             x, y, highest, uu, uv, vv = x + du, y + dv, rho, a, b, c
             du, dv = (c * gu - b * gv) / (determinant * rho), (a * gv - b * gu) / (determinant * rho)
+            if 0.5 * (gu * du + gv * dv) < enough:
+                break
         if not (abs(x + du) <= _REACH_PX and abs(y + dv) <= _REACH_PX):
             return
         if max(abs(du), abs(dv)) < _SETTLED_PX:
@@ -417,14 +449,15 @@ def _search_one(k, image, templates, centres, covs, limits, places):
     if scores[v, u] <= -1.0:
         return
     found[2] = scores[v, u]
-    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found)
+    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found, 0.0)
     p, q = second(scores, v, u)
     if p >= 0:
         other = np.full(found.shape[0], float(scores[p, q]))
-        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
+        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other, _OF_SECOND)
         # The better of two peaks, with the other one's score as the second.
         found[3] = other[2]
         if other[2] > found[2]:
+            refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other, 0.0)
             other[3] = found[2]
             for i in range(found.shape[0]):
                 found[i] = other[i]

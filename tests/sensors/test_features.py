@@ -125,11 +125,22 @@ def texture(image, place):
     return np.sqrt(np.linalg.eigvalsh(slopes @ slopes.T / WINDOW_PX**2)[0])
 
 
-def test_scores_equal_numpys():
-    image = textured()
-    found = CornerDetector().detect(image, 100, None, 8.0, 5.0)
-    assert len(found) == 100
-    np.testing.assert_allclose(found.score, [texture(image, place) for place in found.px], rtol=1e-4)
+def test_scores_and_choice_equal_numpys():
+    image, detector = textured(), CornerDetector()
+    px, score = detector.candidates(image, 16, None)
+    np.testing.assert_allclose(score, [texture(image, place) for place in px], rtol=1e-9)
+    # Of FAST's corners those that no neighbour among them exceeds; of these the best first that are apart.
+    fast = (
+        np.array([point.pt for point in cv2.FastFeatureDetector.create(10, False).detect(image[13:-13, 13:-13])]) + 13.0
+    )
+    rated = np.array([texture(image, place) for place in fast])
+    highest = [rated[np.abs(fast - place).max(axis=1) <= 1.0].max() for place in fast]
+    assert np.array_equal(px, fast[(rated >= highest) & (rated >= detector.min_score)])
+    kept = list[int]()
+    for row in np.argsort(-score, kind="stable").tolist():
+        if all(np.linalg.norm(px[row] - px[other]) >= 8.0 for other in kept):
+            kept.append(row)
+    assert len(kept) > 40 and np.array_equal(detector.detect(image, 40, None, 8.0).px, px[kept[:40]])
 
 
 def test_corners_of_squares_and_not_their_edges():
