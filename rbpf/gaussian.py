@@ -25,7 +25,7 @@ _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
 _UNROLLED, _MANY = 8, 200  #: Up to this size and from so many matrices on, loops take less time than LAPACK.
-_KEPT = 64  #: Entries of what is small enough for its factor to be looked up.
+_KEPT = 512  #: Entries of what is small enough for its factor to be looked up.
 
 
 def symmetrise(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
@@ -101,9 +101,7 @@ def _triangle(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Lower Cholesky factor, upper triangle not read. Raises InputError: not positive definite, or NaN."""
-    chol, definite = _factored(np.asarray(cov, dtype=float), 0.0)
-    _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
-    return chol
+    return _looked_up(_definite_factor, cov)
 
 
 def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
@@ -112,20 +110,7 @@ def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch 
     A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors; each matrix is treated alike
     whatever else is in the batch. Raises InputError: NaN, not symmetric, or an eigenvalue below -1e-9 times the largest.
     """
-    cov = np.asarray(cov, dtype=float)
-    finite, swapped = np.isfinite(cov), np.swapaxes(cov, -1, -2)
-    # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
-    if not (finite.all() and (cov == swapped).all()):
-        _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
-        skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
-        _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
-    factor, definite = _factored(cov, _SINGULAR)
-    if not definite.all():
-        singular = ~definite
-        negative = np.zeros_like(singular)
-        factor[singular], negative[singular] = _eigen_factor(cov[singular])
-        _require(~negative, "has a negative eigenvalue: check how it was computed")
-    return factor
+    return _looked_up(_semidefinite_factor, cov)
 
 
 def solve_lower(chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n"]) -> Float[np.ndarray, "*batch n"]:
@@ -157,8 +142,7 @@ def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n
 
 def log_det(chol: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
     """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...)."""
-    diagonal = np.diagonal(np.asarray(chol, dtype=float), axis1=-2, axis2=-1)
-    return 2.0 * np.log(diagonal).sum(-1)
+    return 2.0 * np.log(np.asarray(chol, dtype=float).diagonal(axis1=-2, axis2=-1)).sum(-1)
 
 
 def log_density(
@@ -199,17 +183,37 @@ def unscented_transform(
     return mean_y, gram(np.moveaxis(values - mean_y, 0, -1) * np.sqrt(weights))
 
 
-def _factored(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
-    if cov.size > _KEPT:
-        return _factors(cov, floor)
-    chol, definite = _kept_factors(cov.tobytes(), cov.shape, floor)
-    return chol.copy(), definite.copy()
+def _looked_up(factor: Callable[[Array], Array], cov: Like[ArrayLike, "*batch n n"]) -> Array:
+    cov = np.asarray(cov, dtype=float)
+    return factor(cov) if cov.size > _KEPT else _kept_factor(factor, cov.tobytes(), cov.shape).copy()
 
 
 @lru_cache(maxsize=64)
-def _kept_factors(cov: bytes, shape: tuple[int, ...], floor: float) -> tuple[Array, NDArray[np.bool_]]:
+def _kept_factor(factor: Callable[[Array], Array], cov: bytes, shape: tuple[int, ...]) -> Array:
     # A sensor's noise is the same at every step.
-    return _factors(np.frombuffer(cov).reshape(shape), floor)
+    return factor(np.frombuffer(cov).reshape(shape))
+
+
+def _definite_factor(cov: Array) -> Array:
+    chol, definite = _factors(cov, 0.0)
+    _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
+    return chol
+
+
+def _semidefinite_factor(cov: Array) -> Array:
+    finite, swapped = np.isfinite(cov), np.swapaxes(cov, -1, -2)
+    # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
+    if not (finite.all() and (cov == swapped).all()):
+        _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
+        skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
+        _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
+    factor, definite = _factors(cov, _SINGULAR)
+    if not definite.all():
+        singular = ~definite
+        negative = np.zeros_like(singular)
+        factor[singular], negative[singular] = _eigen_factor(cov[singular])
+        _require(~negative, "has a negative eigenvalue: check how it was computed")
+    return factor
 
 
 def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:

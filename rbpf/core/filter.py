@@ -220,7 +220,7 @@ class Filter:
             self.marginals.resample(ancestors)
             if self._draws and proposed.nis is None:
                 # Nothing has looked at what was drawn: each descendant draws anew.
-                self.particles = Particles(self.particles.state[ancestors], log_weights)
+                self.particles = Particles(take(self.particles.state, ancestors), log_weights)
                 prior = self._predict(control, dt)
             else:
                 prior = prior.take(ancestors)
@@ -235,7 +235,7 @@ class Filter:
         if self.consolidation is not None:
             balance = weights, self.space.local(prior.base[0], prior.base)
         whitened, log_ratio = proposed.sample(parents, self.rng, balance)
-        increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
+        increment = prior.moved(whitened)
         state = prior.at(increment)
         densities = self.marginals.correct(state, increment, groups)
 
@@ -244,13 +244,16 @@ class Filter:
         if proposal.exact:
             # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
             log_w1 = take(proposed.log_w1, parents)
-            log_w2 = densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
+            log_w2 = densities.all + log_ratio
+            np.subtract(log_w2, log_w1, out=log_w2, where=log_w1 != -np.inf)
         log_before = log_weights
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
-        second: SecondWeight | None = SecondWeight(state, log_before, log_weights)
+        second = None
         if proposed.nis is None:
-            mixture, second = (Prior.exactly(self.space, state), None, log_weights), None
+            mixture = Prior.exactly(self.space, state), None, log_weights
+        else:
+            second = SecondWeight(state, log_before, log_weights)
 
         # Start landmarks, look for signs of failure, and report.
         new_landmarks = self._start_landmarks(frame, groups)
@@ -446,8 +449,10 @@ class Filter:
         self.history.record(stamp_ns, self.particles.state, self.particles.log_weights)
 
     def _start_landmarks(self, frame: object, groups: list[Observations]) -> np.ndarray:
-        belief = self.belief()
         ids, first = [np.zeros(0, dtype=np.int64)], 0
+        if all(type(sensor).new_landmarks is Sensor.new_landmarks for sensor in self.sensors):
+            return ids[0]
+        belief = self.belief()
         for sensor, end in zip(self.sensors, self._ends, strict=True):
             its = told(belief, sensor)
             for new_landmarks in sensor.new_landmarks(frame, its, groups[first:end]):
@@ -485,7 +490,9 @@ def told(belief: Belief, sensor: Sensor) -> Belief:
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
     """A transition as the kernels take it. Raises InputError: mean or noise factor has the wrong shape, or is not finite."""
     given = {name: array for name, array in vars(transition).items() if array is not None}
-    transition = Transition(**{name: numbers(array, f"{what}: {name}") for name, array in given.items()})
+    checked = {name: numbers(array, f"{what}: {name}") for name, array in given.items()}
+    if any(checked[name] is not array for name, array in given.items()):
+        transition = Transition(**checked)
     mean, factor, n = transition.mean, transition.noise_factor, state.shape[0]
     rows = space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
     fits = factor.ndim == 3 and factor.shape[0] in (1, n) and factor.shape[1] == rows

@@ -19,6 +19,7 @@ from rbpf.ranges import require_memory
 #: Age in generations at which what is stored is first looked through for dead rows, and least time until the next look.
 _FIRST_CHECK = 4
 _MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
+_PENDING = 8  #: Generations at most whose ancestors wait to be taken into the forest.
 
 _COLUMNS = "parent", "children", "generation", "row"
 _NO_NODE = np.array([-1, 0, -1, 0])
@@ -45,39 +46,39 @@ class Lineage:
         self.generation = 0
         self._retained: Counter[int] = Counter()
         self._mark = 0
-        self._oldest = 0
         self._allocate(4 * n)
-        self._leaves = np.arange(n)
-        self._nodes[:n, CHILDREN], self._nodes[:n, GENERATION], self._nodes[:n, ROW] = 1, 0, np.arange(n)
-        self._free = np.arange(4 * n - 1, n - 1, -1)
-        self._n_free = self._free.size
-        self._free = np.concatenate([self._free, np.zeros(n, dtype=np.int64)])
         self._identity = np.arange(n)
+        #: Ancestors of the newest generations, which the forest does not hold before somebody asks for it.
+        self._pending: list[np.ndarray] = []
         self._cache: dict[int, np.ndarray] = {}
         #: Of each retained generation, its nodes as they were last looked through, by row.
         self._members: dict[int, np.ndarray] = {}
         #: Generations of which one row has all descendants: it always will, and the trunk need not be climbed again.
         self._settled: dict[int, int] = {}
+        self._oldest = 0
+        self._plant()
 
     @property
     def nodes(self) -> int:
+        self._grow()
         return len(self._nodes) - self._n_free
 
     def advance(self, ancestors: Int[np.ndarray, " N"]) -> None:
         """Starts a generation in which particle i descends from particle ancestors[i] (N,)."""
-        if self._n_free < self.n:
-            self._make_room()
         self.generation += 1
-        ancestors = np.ascontiguousarray(ancestors, dtype=np.int64)
-        begun = self._leaves, ancestors, self.generation
-        self._n_free = forest.advance(self._nodes, self._free, self._n_free, *begun)
+        self._pending.append(np.array(ancestors, dtype=np.int64))
         self._cache.clear()
+        if len(self._pending) == _PENDING:
+            self._forget()
+        if len(self._pending) == _PENDING:
+            self._grow()
 
     def rows(self, generation: int) -> Int[np.ndarray, " N"]:
         """Row in a retained generation of each particle's ancestor, (N,) int."""
         if generation == self.generation:
             return self._identity
         if generation not in self._cache:
+            self._grow()
             if generation in self._settled:
                 rows = np.full(self.n, self._settled[generation])
             else:
@@ -97,6 +98,7 @@ class Lineage:
         """
         if generation == self.generation:
             return self._identity.copy()
+        self._grow()
         nodes = self._members.get(generation)
         if nodes is None:
             nodes = np.flatnonzero(self._nodes[:, GENERATION] == generation)
@@ -127,8 +129,8 @@ class Lineage:
         if not self._oldest <= generation <= self.generation:
             raise InputError(f"the ancestry does not hold generation {generation}")
         self._retained[generation] += 1
-        if generation == self.generation:
-            self._members[generation] = self._leaves.copy()
+        if generation == self.generation and not self._pending and self._is_planted:
+            self._remember(generation)
 
     def release(self, generation: int) -> None:
         self._retained[generation] -= 1
@@ -138,6 +140,7 @@ class Lineage:
             self._members.pop(generation, None)
 
     def arrays(self) -> dict[str, np.ndarray]:
+        self._grow()
         arrays = {f"lineage/{name}": self._nodes[:, column].copy() for column, name in enumerate(_COLUMNS)}
         arrays |= {"lineage/leaves": self._leaves, "lineage/free": self._free}
         arrays["lineage/now"] = np.array([self.generation, self._n_free])
@@ -155,6 +158,8 @@ class Lineage:
         self._leaves, self._free = found["leaves"], found["free"]
         self.generation, self._n_free = now, n_free
         self._require_forest()
+        self._pending.clear()
+        self._is_planted = True
         self._retained.clear()
         self._cache.clear()
         self._members.clear()
@@ -187,6 +192,43 @@ class Lineage:
     def _allocate(self, size: int) -> None:
         self._nodes = np.tile(_NO_NODE, (size, 1))
         self._found, self._stamp = np.zeros((2, size), dtype=np.int64)
+
+    def _plant(self) -> None:
+        """A forest of n roots, the particles of the oldest generation."""
+        size, n = len(self._nodes), self.n
+        self._nodes[:] = _NO_NODE
+        self._nodes[:n, CHILDREN], self._nodes[:n, GENERATION], self._nodes[:n, ROW] = 1, self._oldest, self._identity
+        self._leaves = self._identity.copy()
+        self._free = np.concatenate([np.arange(size - 1, n - 1, -1), np.zeros(n, dtype=np.int64)])
+        self._n_free = size - n
+        self._is_planted = True
+        self._remember(self._oldest)
+
+    def _remember(self, generation: int) -> None:
+        """Whose nodes are the leaves now."""
+        if generation in self._retained:
+            self._members[generation] = self._leaves.copy()
+
+    def _forget(self) -> None:
+        """Where nobody needs what the forest holds, another one is to be planted by who asks, at the oldest that is needed."""
+        newest = self.generation - len(self._pending)
+        if self._pending and not any(generation <= newest for generation in self._retained):
+            self._oldest = min(self._retained, default=self.generation)
+            del self._pending[: self._oldest - newest]
+            self._is_planted = False
+
+    def _grow(self) -> None:
+        """Takes the ancestors that are pending into the forest."""
+        self._forget()
+        if not self._is_planted:
+            self._plant()
+        first = self.generation - len(self._pending) + 1
+        for generation, ancestors in enumerate(self._pending, start=first):
+            if self._n_free < self.n:
+                self._make_room()
+            self._n_free = forest.advance(self._nodes, self._free, self._n_free, self._leaves, ancestors, generation)
+            self._remember(generation)
+        self._pending.clear()
 
     def _make_room(self) -> None:
         """Splices chains that nobody needs out of the forest, and doubles it where that is not enough."""
@@ -245,7 +287,7 @@ class History:
             block = self._blocks[now] = PathBlock(now, np.arange(state.shape[0]), [], [], [])
             self.lineage.retain(now)
             # Blocks whose lineages have coalesced shrink to the rows that still have descendants.
-            for generation in [] if self.clouds else self.lineage.due():
+            for generation in [] if self.clouds or len(self._blocks) == 1 else self.lineage.due():
                 past = self._blocks.get(generation)
                 if past is None or past.kept.size == 1:
                     continue

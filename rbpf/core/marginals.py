@@ -15,6 +15,7 @@ from rbpf.core.linearisation import EVERYTHING, information, linearise, stacked
 from rbpf.core.models import NEW, NULL, Belief, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
 from rbpf.core.particles import Information, Particles, Prior, mixture_estimate, take
 from rbpf.errors import InputError
+from rbpf.kernels.dense import log_densities
 from rbpf.lie import Array, LieGroup
 
 GAUSSIAN = Gaussian()
@@ -60,9 +61,19 @@ class StateOnly(Conditional):
             if group.data is not None:
                 raw += log_likelihoods(group, state)
                 continue
-            nu = group.model.innovation(group.z, state[:, None, :])
+            nu = numbers(
+                group.model.innovation(group.z, state[:, None, :]), f"what {type(group.model).__name__} predicts"
+            )
+            if nu.shape != (state.shape[0], *group.z.shape):
+                raise InputError(
+                    f"{type(group.model).__name__}.predict returned {nu.shape} for {state.shape[0]} states"
+                )
+            if group.likelihood is None or group.likelihood.kernel_id == GAUSSIAN.kernel_id:
+                chol = gaussian.cholesky(group.cov)
+                log_densities(nu, chol, gaussian.log_det(chol), total)
+                continue
             cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
-            total += (group.likelihood or GAUSSIAN).log_density(nu, cov).sum(axis=1)
+            total += group.likelihood.log_density(nu, cov).sum(axis=1)
         return LogDensities(total + raw, np.zeros_like(raw) if self._ahead else raw)
 
     def resample(self, ancestors: np.ndarray) -> None:
@@ -351,21 +362,17 @@ class Marginals(Conditional):
     def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
         routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
         for group in groups:
-            name = type(group.model).__name__
-            if group.part is not None:
-                holders, wanted = {self._holder.get(group.part)}, str(group.part)
-            else:
-                reads = group.model.reads - {Part.STATE} or {Part.STATE}
-                holders, wanted = {self._holder.get(part) for part in reads}, str(next(iter(reads)))
+            wanted = {group.part} if group.part is not None else group.model.reads - {Part.STATE} or {Part.STATE}
+            holders = {self._holder.get(part) for part in wanted}
             if len(holders) > 1:
                 raise InputError(
-                    f"{name} reads a landmark and the substate, which couples them: "
+                    f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
                     "sample that part of the substate instead, or hold both in a JointMap"
                 )
             holder = holders.pop()
             if holder is None:
-                what = "raw data are for" if group.data is not None else f"{name} reads"
-                raise InputError(f"{what} a {wanted}, which this filter does not hold")
+                what = "raw data are for" if group.data is not None else f"{type(group.model).__name__} reads"
+                raise InputError(f"{what} a {next(iter(wanted))}, which this filter does not hold")
             if group.data is not None and not holder.takes_raw:
                 raise InputError(f"{type(holder).__name__} takes no raw data, but rows with an observation model")
             routed[holder.supplies].append(group)

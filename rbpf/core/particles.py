@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.arrays import Float, Int
+from rbpf.arrays import Float, Int, numbers
 from rbpf.errors import InputError
-from rbpf.kernels.dense import chart
+from rbpf.kernels.dense import chart, increments
 from rbpf.lie import LieGroup
 
 #: Fields of `Information` that add up over independent observations.
@@ -73,7 +73,9 @@ def weighted_mean(values: Float[np.ndarray, "N k"], weights: Float[np.ndarray, "
 
 def take(array: np.ndarray, ancestors: np.ndarray | slice) -> np.ndarray:
     """Rows of the ancestors; an array shared by all particles (first axis 1) stays as it is."""
-    return array if array.shape[0] == 1 else array[ancestors]
+    if array.shape[0] == 1:
+        return array
+    return array[ancestors] if isinstance(ancestors, slice) else array.take(ancestors, axis=0)
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,13 @@ class Prior:
         """States (N, E) at the mean."""
         return self._predicted
 
+    def moved(self, u: Float[np.ndarray, "#N r"]) -> Float[np.ndarray, "#N d"]:
+        """Increments (N, d) at whitened coordinates u (N or 1, r), ε = μ + L u."""
+        mean, factor, u = (numbers(array, "increments") for array in (self.mean, self.factor, u))
+        out = np.empty((max(len(mean), len(factor), len(u)), mean.shape[1]))
+        increments(mean, factor, u, out)
+        return out
+
     def spread(self, increment: Float[np.ndarray, "#N d"]) -> Float[np.ndarray, "#N d r"]:
         """The factor (N, d, r) in the charts at the states at increments (N or 1, d), to first order."""
         if self.centred:
@@ -116,7 +125,7 @@ class Prior:
 
     def take(self, ancestors: Int[np.ndarray, " N"] | slice) -> "Prior":
         mean, factor = take(self.mean, ancestors), take(self.factor, ancestors)
-        return Prior(self.space, self.base[ancestors], mean, factor, self.centred)
+        return Prior(self.space, take(self.base, ancestors), mean, factor, self.centred)
 
 
 @dataclass
@@ -167,6 +176,10 @@ class Proposed:
     #: (N,) number of scalar measurements behind it, those that took part in each particle.
     rows: Float[np.ndarray, " N"] | None = None
 
+    @cached_property
+    def _is_prior(self) -> bool:
+        return len(self.root) == 1 and not self.mean.any() and np.array_equal(self.root[0], np.eye(self.root.shape[2]))
+
     def sample(
         self,
         ancestors: Int[np.ndarray, " M"],
@@ -177,8 +190,8 @@ class Proposed:
         noise = rng.standard_normal((ancestors.size, self.mean.shape[1]))
         if balance is not None:
             noise = balanced(noise, *balance)
-        if self.root.shape[0] == 1 and not self.mean.any() and np.array_equal(self.root[0], np.eye(noise.shape[1])):
-            return noise, np.zeros(1)  # from the prior
+        if self._is_prior:
+            return noise, np.zeros(1)
         root = take(self.root, ancestors)
         u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
@@ -249,7 +262,7 @@ def mixture_estimate(
     """
     weights, factor, centres = np.exp(log_weights), prior.factor, prior.predicted()
     if proposed is not None:
-        increment = prior.mean + np.einsum("nar,nr->na", factor, proposed.mean)
+        increment = prior.moved(proposed.mean)
         centres = prior.at(increment)
         factor = prior.spread(increment) @ proposed.root
     n, trust = weights.size, 0.0 if second is None else second.trust

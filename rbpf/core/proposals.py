@@ -8,6 +8,7 @@ Mathematics (look-ahead): E06 (10) for all observations together, with their cor
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import final
 
 import numpy as np
@@ -23,8 +24,12 @@ class PriorProposal(Proposal):
     """The bootstrap filter's: q is the motion model, w₁ = 1, w₂ = p(z | x) (S05 §II-A)."""
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
-        rank = prior.factor.shape[2]
-        return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1))
+        return _as_before(prior.factor.shape[2])
+
+
+@lru_cache
+def _as_before(rank: int) -> Proposed:
+    return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1))
 
 
 @final
@@ -50,7 +55,7 @@ class EkfProposal(Ranged, Proposal):
         proposed = refined(prior, linearise(at))
         for _ in range(self.iterations - 1):
             before = proposed
-            at = prior.mean + np.einsum("nar,nr->na", prior.factor, before.mean)
+            at = prior.moved(before.mean)
             proposed = refined(prior, linearise(at))
             if self.settled:
                 moved = np.linalg.solve(proposed.root, (proposed.mean - before.mean)[..., None])

@@ -8,8 +8,10 @@ from typing import final
 
 import numpy as np
 
+from rbpf.arrays import numbers
 from rbpf.core.models import Resampler
 from rbpf.core.particles import effective_sample_size
+from rbpf.kernels.dense import comb
 from rbpf.ranges import Count, Fraction, Ranged
 
 _ROUNDING = 1e-12  #: Relative error within which weights count as equal, and N W as whole.
@@ -27,12 +29,9 @@ class Systematic(Resampler):
     """One uniform number, a comb of N teeth."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        # How many teeth, at k + u, lie before the end of each weight: counted, where other schemes have to search.
-        n, cdf = weights.size, np.cumsum(weights)
-        teeth = np.ceil(cdf * (n / cdf[-1]) - rng.random()).astype(np.int64)
-        teeth[np.flatnonzero(weights)[-1] :] = n
-        teeth[1:] -= teeth[:-1].copy()
-        return np.repeat(np.arange(n), teeth)
+        ancestors = np.empty(weights.size, dtype=np.int64)
+        comb(numbers(weights, "weights"), rng.random(), ancestors)
+        return ancestors
 
 
 @final

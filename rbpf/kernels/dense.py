@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import float64, int64, njit, void
 
-from rbpf.kernels.signature import CUBE, INDEX_MATRIX, MATRIX, VECTOR
+from rbpf.kernels.signature import CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR
 
 
 @njit(cache=True, error_model="numpy")
@@ -75,6 +75,59 @@ def fit_robustly(white, slope, rounds, scale, u, info):
         factor(chol)
         solve(chol, total)
         u[:] = total
+
+
+@njit(void(MATRIX, CUBE, MATRIX, MATRIX), cache=True, error_model="numpy")
+def increments(mean, factor, u, out):
+    """Fills ε = μ + L u (N, d), of μ (N or 1, d), L (N or 1, d, r) and u (N or 1, r).
+
+    Terms of even and of odd number are added up apart, as `numpy.einsum` does.
+    """
+    rank = u.shape[1]
+    for i in range(len(out)):
+        own_mean, own_factor, own = i if len(mean) > 1 else 0, i if len(factor) > 1 else 0, i if len(u) > 1 else 0
+        for a in range(out.shape[1]):
+            even = odd = 0.0
+            for r in range(0, rank - 1, 2):
+                even += factor[own_factor, a, r] * u[own, r]
+                odd += factor[own_factor, a, r + 1] * u[own, r + 1]
+            if rank % 2:
+                even += factor[own_factor, a, rank - 1] * u[own, rank - 1]
+            out[i, a] = mean[own_mean, a] + (even + odd)
+
+
+@njit(void(CUBE, CUBE, VECTOR, VECTOR), cache=True, error_model="numpy")
+def log_densities(nu, chol, log_det, out):
+    """Adds Σ log N(ν; 0, S) to `out` (N,), of innovations (N, K, p) with L (K, p, p) of S = L Lᵀ and log|S| (K,)."""
+    white, constant = np.empty(nu.shape[2]), nu.shape[2] * math.log(2.0 * math.pi)
+    for i in range(len(nu)):
+        for k in range(len(chol)):
+            squared = 0.0
+            for a in range(white.size):
+                rest = nu[i, k, a]
+                for b in range(a):
+                    rest -= chol[k, a, b] * white[b]
+                white[a] = rest / chol[k, a, a]
+                squared += white[a] * white[a]
+            out[i] -= 0.5 * (squared + log_det[k] + constant)
+
+
+@njit(void(VECTOR, float64, INDICES), cache=True, error_model="numpy")
+def comb(weights, offset, ancestors):
+    """Fills the ancestors (N,), ascending, that the teeth at k + `offset` of a comb fall on, see `rbpf.core.resampling`."""
+    n, last, total = weights.size, 0, 0.0
+    for i in range(n):
+        total += weights[i]
+        if weights[i] != 0.0:
+            last = i
+    tooth, scale, total = 0, n / total, 0.0
+    for i in range(last):
+        total += weights[i]
+        end = min(math.ceil(total * scale - offset), n)
+        while tooth < end:
+            ancestors[tooth] = i
+            tooth += 1
+    ancestors[tooth:] = last
 
 
 @njit(void(CUBE, MATRIX, CUBE, MATRIX, CUBE, VECTOR, VECTOR), cache=True, error_model="numpy")

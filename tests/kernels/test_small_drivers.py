@@ -6,7 +6,19 @@ import pytest
 from rbpf import gaussian
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.kernels import forest
-from rbpf.kernels.dense import add_gram, add_inner, add_turned, chart, gather, grams, product, refine
+from rbpf.kernels.dense import (
+    add_gram,
+    add_inner,
+    add_turned,
+    chart,
+    comb,
+    gather,
+    grams,
+    increments,
+    log_densities,
+    product,
+    refine,
+)
 from rbpf.kernels.gate import is_inlier, log_likelihood
 
 
@@ -103,6 +115,27 @@ def test_a_refined_gaussian_is_numpys(rank, shared, rng):
         info[1] = np.nan
         refine(info, vector, root, mean, half, squared, log_det)
         np.testing.assert_array_equal(np.isnan(log_det), [False, True, False, False])
+
+
+@pytest.mark.parametrize(("means", "factors", "draws"), [(1, 1, 5), (5, 5, 5), (5, 1, 1), (1, 5, 1)])
+def test_increments_and_their_densities_are_numpys(means, factors, draws, rng):
+    mean, factor, u = rng.normal(size=(means, 3)), rng.normal(size=(factors, 3, 2)), rng.normal(size=(draws, 2))
+    out, cov = np.empty((5, 3)), covariances(rng, 2, 3)
+    increments(mean, factor, u, out)
+    np.testing.assert_allclose(out, mean + np.einsum("nar,nr->na", factor, u), rtol=1e-12, atol=1e-14)
+    nu, chol, total = rng.normal(size=(5, 2, 3)), gaussian.cholesky(cov), np.ones(5)
+    log_densities(nu, chol, gaussian.log_det(chol), total)
+    np.testing.assert_allclose(total, 1.0 + gaussian.log_density(nu, cov).sum(axis=1), rtol=1e-13)
+
+
+def test_a_comb_counts_its_teeth(rng):
+    """As many as lie before the end of each weight; none falls on a weight of zero."""
+    weights, found = rng.exponential(size=50) * (rng.random(50) < 0.5), np.empty(50, dtype=np.int64)
+    for weights[-1], offset in ((0.0, 0.0), (0.0, 0.7), (3.0, 0.3)):
+        comb(weights, offset, found)
+        end = np.cumsum(weights) * (50 / weights.sum())
+        np.testing.assert_array_equal(found, np.searchsorted(end, np.arange(50) + offset, side="right"))
+        assert weights[found].all()
 
 
 def test_the_forest_is_compiled_as_it_is_loaded():
