@@ -17,7 +17,7 @@ says which m̂: by default that of least Mathematics (vo-profile).
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -200,8 +200,11 @@ def residuals(matches: Matches, delta: Array, points: Points) -> tuple[Array, Ar
 
 def squared_distances(matches: Matches, delta: Array, points: Points) -> Array:
     """Squared Mahalanobis distances (K,) from a motion, infinite for points behind the camera (compiled)."""
-    rows, front, _ = white_rows(matches, delta, points)
-    return np.where(front, np.square(rows[..., 0]).sum(axis=-1), np.inf)
+    from rbpf.motion import stereo_kernels
+
+    squared = np.empty(len(matches))
+    stereo_kernels.distances(*_arguments(matches, delta, points), squared)
+    return squared
 
 
 def white_rows(matches: Matches, delta: Array, points: Points) -> tuple[Array, np.ndarray, Array]:
@@ -214,16 +217,16 @@ def white_rows(matches: Matches, delta: Array, points: Points) -> tuple[Array, n
 
     count = len(matches)
     found = np.empty((count, 3, 7)), np.empty(count, dtype=bool), np.empty((count, 3))
-    stereo_kernels.white_rows(
-        homography(matches.camera, delta),
-        intrinsics(matches.camera),
-        *(matches.z_prev, matches.z_now, matches.cov_prev, matches.cov_now),
-        points != "exact",
-        SWEEPS if points == "adjusted" else 0,
-        SWEPT_PX,
-        *found,
-    )
+    matrix, *others = _arguments(matches, delta, points)
+    stereo_kernels.white_rows(matrix, intrinsics(matches.camera), *others, *found)
     return found
+
+
+def _arguments(matches: Matches, delta: Array, points: Points) -> tuple[Any, ...]:
+    """What the compiled functions take, the camera apart."""
+    given = matches.z_prev, matches.z_now, matches.cov_prev, matches.cov_now
+    sweeps = SWEEPS if points == "adjusted" else 0
+    return homography(matches.camera, delta), *given, points != "exact", sweeps, SWEPT_PX
 
 
 def linearised(matches: Matches, delta: Array, pixels: Array, points: Points) -> tuple[Array, Reprojection]:

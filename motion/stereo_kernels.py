@@ -1,4 +1,4 @@
-"""Compiled: the innovations of matches, and the score and the proposals of the consensus search; one match at a time.
+"""Compiled: the innovations of matches, many at a time, and the score and the proposals of the consensus search.
 
 In the proposals of triples vectors are tuples, and a pose is a quaternion (x, y, z, w) and a translation.
 """
@@ -16,6 +16,159 @@ STIFFNESS = 1e-9
 FLAT = 1e-12  #: Shortest length that is divided by: points that coincide have no direction.
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _minus(a, factor, b):
+    return a[0] - factor * b[0], a[1] - factor * b[1], a[2] - factor * b[2]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _over(v, depth):
+    return v[0] / depth, v[1] / depth, v[2] / depth
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _plus(start, a, b):
+    return start + a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _by_rows(v, p, q, r):
+    return _dot(v, p), _dot(v, q), _dot(v, r)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _factored(cov, p, q, r, gain):
+    # L of R, by its lower triangle's rows, + A R⁻ Aᵀ, A by its rows.
+    first = gain[0][0], gain[1][0], gain[2][0]
+    second = gain[0][1], gain[1][1], gain[2][1]
+    third = gain[0][2], gain[1][2], gain[2][2]
+    a = math.sqrt(_plus(cov[0], p, first))
+    b, d = _plus(cov[1], q, first) / a, _plus(cov[3], r, first) / a
+    c = math.sqrt(_plus(cov[2], q, second) - b * b)
+    e = (_plus(cov[4], r, second) - d * b) / c
+    return a, b, c, d, e, math.sqrt(_plus(cov[5], r, third) - d * d - e * e)
+
+
+# As in `rbpf.kernels.dense`, of three rows that are held in registers: L is (l₀₀, l₁₀, l₁₁, l₂₀, l₂₁, l₂₂).
+@njit(cache=True, error_model="numpy", inline="always")
+def _solved_lower(chol, v):
+    x = v[0] / chol[0]
+    y = (v[1] - chol[1] * x) / chol[2]
+    return x, y, (v[2] - chol[3] * x - chol[4] * y) / chol[5]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _solved(chol, v):
+    x, y, z = _solved_lower(chol, v)
+    z = z / chol[5]
+    y = (y - chol[4] * z) / chol[2]
+    return (x - chol[1] * y - chol[3] * z) / chol[0], y, z
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _raised(row, pixels):
+    return row[0] * pixels[0] + row[1] * pixels[1] + row[2] * pixels[2] + row[3]
+
+
+# Matches side by side, a number of each in one lane: places of z⁻, z, R⁻ by rows, R's lower triangle by rows, m̂, what it last
+# changed by, the depth relative to that before the motion, g, ν, and L with L Lᵀ = S.
+_LANES = 64
+_BEFORE, _NOW, _COV_BEFORE, _COV_NOW, _PIXELS = 0, 3 * _LANES, 6 * _LANES, 15 * _LANES, 21 * _LANES
+_CHANGE, _DEPTH, _SEEN, _NU, _CHOL, _ALL = (n * _LANES for n in (24, 25, 26, 29, 32, 38))
+_WHITE, _SQUARED = _COV_BEFORE, _DEPTH  #: For the search, which adjusts nothing: W by rows, and d².
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _three(lanes, place, i):
+    return lanes[place + i], lanes[place + _LANES + i], lanes[place + 2 * _LANES + i]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _six(lanes, place, i):
+    return (*_three(lanes, place, i), *_three(lanes, place + 3 * _LANES, i))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _put(lanes, place, i, v):
+    lanes[place + i], lanes[place + _LANES + i], lanes[place + 2 * _LANES + i] = v
+
+
+@njit(cache=True, error_model="numpy")
+def _sweep(matrix, n, swept, lanes):
+    # One loop over one array, without a branch: vector instructions take eight matches at once.
+    across, down, other, last = matrix
+    for i in range(n):
+        before, now, pixels = _three(lanes, _BEFORE, i), _three(lanes, _NOW, i), _three(lanes, _PIXELS, i)
+        depth = _raised(last, pixels)
+        seen = _raised(across, pixels) / depth, _raised(down, pixels) / depth, _raised(other, pixels) / depth
+        # A = ∂g/∂m by its rows, and R⁻ Aᵀ by its rows.
+        p = _over(_minus(across, seen[0], last), depth)
+        q = _over(_minus(down, seen[1], last), depth)
+        r = _over(_minus(other, seen[2], last), depth)
+        gain = (
+            _by_rows(_three(lanes, _COV_BEFORE, i), p, q, r),
+            _by_rows(_three(lanes, _COV_BEFORE + 3 * _LANES, i), p, q, r),
+            _by_rows(_three(lanes, _COV_BEFORE + 6 * _LANES, i), p, q, r),
+        )
+        apart = before[0] - pixels[0], before[1] - pixels[1], before[2] - pixels[2]
+        nu = (
+            now[0] - seen[0] - p[0] * apart[0] - p[1] * apart[1] - p[2] * apart[2],
+            now[1] - seen[1] - q[0] * apart[0] - q[1] * apart[1] - q[2] * apart[2],
+            now[2] - seen[2] - r[0] * apart[0] - r[1] * apart[1] - r[2] * apart[2],
+        )
+        chol = _factored(_six(lanes, _COV_NOW, i), p, q, r, gain)
+        solved = _solved(chol, nu)
+        moved = _plus(before[0], gain[0], solved), _plus(before[1], gain[1], solved), _plus(before[2], gain[2], solved)
+        change = max(abs(moved[0] - pixels[0]), abs(moved[1] - pixels[1]), abs(moved[2] - pixels[2]))
+        # What has come to rest, or lies behind the camera, stays.
+        goes_on = (lanes[_CHANGE + i] > swept) & (depth > 0.0)
+        lanes[_CHANGE + i] = change if goes_on else 0.0
+        lanes[_PIXELS + i] = moved[0] if goes_on else pixels[0]
+        lanes[_PIXELS + _LANES + i] = moved[1] if goes_on else pixels[1]
+        lanes[_PIXELS + 2 * _LANES + i] = moved[2] if goes_on else pixels[2]
+        lanes[_DEPTH + i] = depth
+        _put(lanes, _SEEN, i, seen)
+        _put(lanes, _NU, i, nu)
+        _put(lanes, _CHOL, i, (chol[0], chol[1], chol[2]))
+        _put(lanes, _CHOL + 3 * _LANES, i, (chol[3], chol[4], chol[5]))
+
+
+@njit(cache=True, error_model="numpy")
+def _rows(matrix):
+    # Of H (4, 4), in registers.
+    return (
+        (matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]),
+        (matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]),
+        (matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]),
+        (matrix[3, 0], matrix[3, 1], matrix[3, 2], matrix[3, 3]),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _adjust(matrix, first, n, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, lanes):
+    # Fills the lanes with n matches from the first on, m̂ adjusted.
+    for i in range(n):
+        k = first + i
+        for a in range(3):
+            lanes[_BEFORE + a * _LANES + i], lanes[_NOW + a * _LANES + i] = z_prev[k, a], z_now[k, a]
+            lanes[_PIXELS + a * _LANES + i] = z_prev[k, a]
+            for b in range(3):
+                lanes[_COV_BEFORE + (3 * a + b) * _LANES + i] = cov_prev[k, a, b] if noisy else 0.0
+            for b in range(a + 1):
+                lanes[_COV_NOW + (a * (a + 1) // 2 + b) * _LANES + i] = cov_now[k, a, b]
+        lanes[_CHANGE + i] = np.inf if sweeps > 0 else 0.0
+    rows = _rows(matrix)
+    for sweep in range(sweeps + 1):
+        _sweep(rows, n, np.inf if sweep == sweeps else swept, lanes)
+        if not lanes[_CHANGE : _CHANGE + n].any():
+            break
+
+
 @njit(cache=True, error_model="numpy")
 def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, rows, front, best):
     """Fills rows (K, 3, 7) with L⁻¹ [ν, −∂g/∂ξ], front (K,) and best (K, 3) with m̂; zeros for a point behind.
@@ -23,40 +176,54 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
     Of pixels z (K, 3) with covariances (K, 3, 3), the matrix H (4, 4) and the `camera` (fx, fy, cx, cy, fx · baseline).
     `noisy`: the earlier pixels' noise is in S. m̂ is adjusted in `sweeps`, until it changes by less than `swept`.
     """
-    pixels, seen, slope = np.empty(3), np.empty(3), np.empty((3, 3))
-    chol, gain, gained = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    for k in range(z_prev.shape[0]):
-        for i in range(3):
-            pixels[i] = z_prev[k, i]
-        change = np.inf
-        for sweep in range(sweeps + 1):
-            depth = _see(matrix, pixels, seen, slope)
+    lanes, by_motion, count = np.empty(_ALL), np.empty((3, 6)), z_prev.shape[0]
+    for first in range(0, count, _LANES):
+        n = min(_LANES, count - first)
+        _adjust(matrix, first, n, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, lanes)
+        for i in range(n):
+            k, depth, pixels, seen = first + i, lanes[_DEPTH + i], _three(lanes, _PIXELS, i), _three(lanes, _SEEN, i)
             front[k] = depth > 0.0
-            if not front[k]:
-                break
-            _innovate(k, pixels, seen, slope, z_prev, z_now, cov_prev, cov_now, noisy, rows, gain, chol)
-            if sweep == sweeps or change <= swept:
-                break
-            for i in range(3):
-                gained[i] = rows[k, i, 0]
-            _solve(chol, gained)
-            change = 0.0
-            for i in range(3):
-                moved = z_prev[k, i]
-                for j in range(3):
-                    moved += gain[i, j] * gained[j]
-                change = max(change, abs(moved - pixels[i]))
-                pixels[i] = moved
-        for i in range(3):
-            best[k, i] = pixels[i]
-        if front[k]:
-            x, y = (seen[0] - camera[2]) * depth / camera[0], (seen[1] - camera[3]) * depth / camera[1]
-            _pixel_jacobian((x, y, depth), (pixels[0] - pixels[2]) / camera[4], seen, camera, rows[k, :, 1:])
-            rows[k, :, 1:] *= -1.0
-            for n in range(7):
-                _solve_lower(chol, rows[k, :, n])
-        else:
-            rows[k] = 0.0
+            best[k, 0], best[k, 1], best[k, 2] = pixels
+            if front[k]:
+                x, y = (seen[0] - camera[2]) * depth / camera[0], (seen[1] - camera[3]) * depth / camera[1]
+                _pixel_jacobian((x, y, depth), (pixels[0] - pixels[2]) / camera[4], seen, camera, by_motion)
+                chol = _six(lanes, _CHOL, i)
+                rows[k, 0, 0], rows[k, 1, 0], rows[k, 2, 0] = _solved_lower(chol, _three(lanes, _NU, i))
+                for m in range(6):
+                    column = -by_motion[0, m], -by_motion[1, m], -by_motion[2, m]
+                    rows[k, 0, m + 1], rows[k, 1, m + 1], rows[k, 2, m + 1] = _solved_lower(chol, column)
+            else:
+                rows[k] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def distances(matrix, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, squared):
+    """Fills squared (K,) with νᵀS⁻¹ν, infinite for a point behind the camera; arguments as above."""
+    lanes, count = np.empty(_ALL), z_prev.shape[0]
+    for first in range(0, count, _LANES):
+        n = min(_LANES, count - first)
+        _adjust(matrix, first, n, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, lanes)
+        for i in range(n):
+            white = _solved_lower(_six(lanes, _CHOL, i), _three(lanes, _NU, i))
+            squared[first + i] = _dot(white, white) if lanes[_DEPTH + i] > 0.0 else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _miss(matrix, n, lanes):
+    # d² of the lanes, as `_sweep` without a branch.
+    across, down, other, last = matrix
+    for i in range(n):
+        before, now = _three(lanes, _BEFORE, i), _three(lanes, _NOW, i)
+        depth = _raised(last, before)
+        miss = (
+            now[0] - _raised(across, before) / depth,
+            now[1] - _raised(down, before) / depth,
+            now[2] - _raised(other, before) / depth,
+        )
+        p = _dot(_three(lanes, _WHITE, i), miss)
+        q = _dot(_three(lanes, _WHITE + 3 * _LANES, i), miss)
+        r = _dot(_three(lanes, _WHITE + 6 * _LANES, i), miss)
+        lanes[_SQUARED + i] = p * p + q * q + r * r if depth > 0.0 else np.inf
 
 
 @njit(cache=True, error_model="numpy")
@@ -65,92 +232,26 @@ def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
 
     Of matrices H (C, 4, 4), pixels z (K, 3) and `white` W (K, 3, 3), with d² = ‖W (z − g)‖².
     """
-    miss = np.empty(3)
-    for c in range(matrices.shape[0]):
-        matrix, total, count = matrices[c], 0.0, 0
-        for k in range(z_prev.shape[0]):
-            squared = np.inf
-            depth = _raised(matrix, 3, z_prev[k])
-            if depth > 0.0:
-                for i in range(3):
-                    miss[i] = z_now[k, i] - _raised(matrix, i, z_prev[k]) / depth
-                squared = 0.0
-                for i in range(3):
-                    part = _whitened(white[k], miss, i)
-                    squared += part * part
-            if squared <= gate:
-                count += 1
-                total += squared
-            else:
-                total += gate
-        score[c], agreeing[c] = total, count
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _raised(matrix, i, pixels):
-    return matrix[i, 0] * pixels[0] + matrix[i, 1] * pixels[1] + matrix[i, 2] * pixels[2] + matrix[i, 3]
-
-
-@njit(cache=True, error_model="numpy")
-def _see(matrix, pixels, seen, slope):
-    # g and A at the pixels; returns the depth, relative to that before the motion.
-    depth = _raised(matrix, 3, pixels)
-    for i in range(3):
-        seen[i] = _raised(matrix, i, pixels) / depth
-        for j in range(3):
-            slope[i, j] = (matrix[i, j] - seen[i] * matrix[3, j]) / depth
-    return depth
-
-
-@njit(cache=True, error_model="numpy")
-def _innovate(k, pixels, seen, slope, z_prev, z_now, cov_prev, cov_now, noisy, rows, gain, chol):
-    # ν into rows[k, :, 0], R⁻ Aᵀ into gain, the Cholesky factor of S into chol.
-    for i in range(3):
-        nu = z_now[k, i] - seen[i]
-        for j in range(3):
-            nu -= slope[i, j] * (z_prev[k, j] - pixels[j])
-            gain[i, j] = 0.0
-            for m in range(3):
-                gain[i, j] += cov_prev[k, i, m] * slope[j, m]
-        rows[k, i, 0] = nu
-    for i in range(3):
-        for j in range(i + 1):
-            entry = cov_now[k, i, j]
-            if noisy:
-                for m in range(3):
-                    entry += slope[i, m] * gain[m, j]
-            chol[i, j] = entry
-    _factor(chol)
-
-
-# As in `rbpf.kernels.dense`, of three rows: what runs over a length that is known takes half the time.
-@njit(cache=True, error_model="numpy", inline="always")
-def _factor(chol):
-    for a in range(3):
-        for b in range(a):
-            for c in range(b):
-                chol[a, b] -= chol[a, c] * chol[b, c]
-            chol[a, b] /= chol[b, b]
-        for c in range(a):
-            chol[a, a] -= chol[a, c] * chol[a, c]
-        chol[a, a] = math.sqrt(chol[a, a])
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _solve_lower(chol, vector):
-    for a in range(3):
-        for b in range(a):
-            vector[a] -= chol[a, b] * vector[b]
-        vector[a] /= chol[a, a]
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _solve(chol, vector):
-    _solve_lower(chol, vector)
-    for a in range(2, -1, -1):
-        for b in range(a + 1, 3):
-            vector[a] -= chol[b, a] * vector[b]
-        vector[a] /= chol[a, a]
+    lanes, count = np.empty(_ALL), z_prev.shape[0]
+    score[:], agreeing[:] = 0.0, 0.0
+    for first in range(0, count, _LANES):
+        n = min(_LANES, count - first)
+        for i in range(n):
+            for a in range(3):
+                lanes[_BEFORE + a * _LANES + i], lanes[_NOW + a * _LANES + i] = (
+                    z_prev[first + i, a],
+                    z_now[first + i, a],
+                )
+                for b in range(3):
+                    lanes[_WHITE + (3 * a + b) * _LANES + i] = white[first + i, a, b]
+        for c in range(matrices.shape[0]):
+            _miss(_rows(matrices[c]), n, lanes)
+            total, inside = score[c], agreeing[c]
+            for i in range(n):
+                squared = lanes[_SQUARED + i]
+                inside += 1.0 if squared <= gate else 0.0
+                total += min(squared, gate)
+            score[c], agreeing[c] = total, inside
 
 
 @njit(cache=True, error_model="numpy")

@@ -40,7 +40,7 @@ every_kind = pytest.mark.parametrize("points", ["adjusted", "propagated", "exact
 
 @every_kind
 def test_points_behind_the_camera(points):
-    matches, _ = correlated(LEAP, 30, np.random.default_rng(1))
+    matches, _ = correlated(LEAP, 150, np.random.default_rng(1))
     past = SE3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
     behind = LEAP.camera.triangulate(matches.z_prev)[:, 2] < 2.9
     rows, front, _ = white_rows(matches, past, points)
@@ -48,6 +48,7 @@ def test_points_behind_the_camera(points):
     assert behind.any() and not front[behind].any()
     np.testing.assert_array_equal(rows[~front], 0.0)
     np.testing.assert_array_equal(np.isinf(distances), ~front)
+    np.testing.assert_array_equal(distances[front], np.square(rows[front, :, 0]).sum(axis=1))
     assert np.isinf(residuals(matches, past, points)[0]).all()
 
 
