@@ -277,17 +277,16 @@ _SINGULAR = 1e-9
 #: Error of the place, per axis, that remains without noise: measured on random textures blurred by 0.5 px.
 _INTERPOLATION_PX = 0.02
 _SETTLED_PX = 0.01
-_OF_SECOND = 1e-3  #: To which the score of a second peak is good: its place does not count.
 _REACH_PX = 1.0  #: A maximum further from the best whole pixel along rows or columns is none of this peak.
 _MARGIN = 4  #: What a window needs around it to be moved by `_REACH_PX`, interpolated and differentiated.
 
 
 @njit(cache=True, error_model="numpy")
-def refine(image, unit, size, column, row, found, enough):
+def refine(image, unit, size, column, row, found):
     """Writes place, score and covariance, found[0:2], [2] and [4:7].
 
-    A step after which ρ is lower is taken back by half; it ends where ρ would rise by less than `enough`, too. Where no
-    maximum is near, the whole pixel and the score that the caller wrote stay, and the covariance is NaN.
+    A step after which ρ is lower is taken back by half. Where no maximum is near, the whole pixel and the score
+    that the caller wrote stay, and the covariance is NaN.
     """
     found[0], found[1], found[4:] = float(column), float(row), np.nan
     reach = size // 2 + _MARGIN
@@ -306,8 +305,6 @@ def refine(image, unit, size, column, row, found, enough):
                 return
             x, y, highest, uu, uv, vv = x + du, y + dv, rho, a, b, c
             du, dv = (c * gu - b * gv) / (determinant * rho), (a * gv - b * gu) / (determinant * rho)
-            if 0.5 * (gu * du + gv * dv) < enough:
-                break
         if not (abs(x + du) <= _REACH_PX and abs(y + dv) <= _REACH_PX):
             return
         if max(abs(du), abs(dv)) < _SETTLED_PX:
@@ -449,15 +446,14 @@ def _search_one(k, image, templates, centres, covs, limits, places):
     if scores[v, u] <= -1.0:
         return
     found[2] = scores[v, u]
-    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found, 0.0)
+    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found)
     p, q = second(scores, v, u)
     if p >= 0:
         other = np.full(found.shape[0], float(scores[p, q]))
-        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other, _OF_SECOND)
+        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
         # The better of two peaks, with the other one's score as the second.
         found[3] = other[2]
         if other[2] > found[2]:
-            refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other, 0.0)
             other[3] = found[2]
             for i in range(found.shape[0]):
                 found[i] = other[i]
