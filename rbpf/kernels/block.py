@@ -119,24 +119,25 @@ def whiten_vector(factor, count, vector):
 
 @njit(cache=True, error_model="numpy")
 def whiten_matrix(factor, count, matrix):
-    """Solves L Y = matrix in place, for a factor made by `cholesky`; two terms at a time."""
-    p, size = matrix.shape[0], matrix.shape[1]
-    chol, out = flat(factor), flat(matrix)
-    for e in range(size):
-        for a in range(p):
-            o, odd = (a * size + e) * BLOCK, a % 2
-            for c in range(0, a - odd, 2):
-                j, k, m = (a * p + c) * BLOCK, (c * size + e) * BLOCK, ((c + 1) * size + e) * BLOCK
-                for i in range(count):
-                    first = out[o + i] - chol[j + i] * out[k + i]
-                    out[o + i] = first - chol[j + BLOCK + i] * out[m + i]
-            j, k = (a * p + a - 1) * BLOCK, ((a - 1) * size + e) * BLOCK
-            if odd:
-                for i in range(count):
-                    out[o + i] -= chol[j + i] * out[k + i]
-            j = (a * p + a) * BLOCK
+    """Solves L Y = matrix in place, for a factor made by `cholesky`; up to three rows in one pass each."""
+    p = matrix.shape[0]
+    for e in range(matrix.shape[1]):
+        for i in range(count):
+            matrix[0, e, i] *= factor[0, 0, i]
+        if p > 1:
             for i in range(count):
-                out[o + i] *= chol[j + i]
+                rest = matrix[1, e, i] - factor[1, 0, i] * matrix[0, e, i]
+                matrix[1, e, i] = rest * factor[1, 1, i]
+        if p > 2:
+            for i in range(count):
+                rest = matrix[2, e, i] - factor[2, 0, i] * matrix[0, e, i] - factor[2, 1, i] * matrix[1, e, i]
+                matrix[2, e, i] = rest * factor[2, 2, i]
+        for a in range(3, p):
+            for c in range(a):
+                for i in range(count):
+                    matrix[a, e, i] -= factor[a, c, i] * matrix[c, e, i]
+            for i in range(count):
+                matrix[a, e, i] *= factor[a, a, i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -149,18 +150,27 @@ def add_squares(vector, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_gram(matrix, sign, count, total):
-    """Total += sign · matrixᵀ matrix, packed; two rows in one pass: a sum is loaded and stored once for them."""
+    """Total += sign · matrixᵀ matrix, packed; up to three rows in one pass: a sum is loaded and stored once for them."""
     p = matrix.shape[0]
+    done = min(p, 3)
     for e in range(matrix.shape[1]):
         for f in range(e + 1):
             m = packed(e, f)
-            for a in range(0, p - 1, 2):
+            if p == 1:
                 for i in range(count):
-                    first = total[m, i] + sign * matrix[a, e, i] * matrix[a, f, i]
-                    total[m, i] = first + sign * matrix[a + 1, e, i] * matrix[a + 1, f, i]
-            if p % 2:
+                    total[m, i] += sign * matrix[0, e, i] * matrix[0, f, i]
+            elif p == 2:
                 for i in range(count):
-                    total[m, i] += sign * matrix[p - 1, e, i] * matrix[p - 1, f, i]
+                    first = total[m, i] + sign * matrix[0, e, i] * matrix[0, f, i]
+                    total[m, i] = first + sign * matrix[1, e, i] * matrix[1, f, i]
+            elif p > 2:
+                for i in range(count):
+                    first = total[m, i] + sign * matrix[0, e, i] * matrix[0, f, i]
+                    second = first + sign * matrix[1, e, i] * matrix[1, f, i]
+                    total[m, i] = second + sign * matrix[2, e, i] * matrix[2, f, i]
+            for a in range(done, p):
+                for i in range(count):
+                    total[m, i] += sign * matrix[a, e, i] * matrix[a, f, i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -194,10 +204,48 @@ def _is_zero(lanes, count):
 
 @njit(cache=True, error_model="numpy")
 def innovation_covariance(jac, cov, noise, count, cross, total):
-    """Cross = J P and the lower triangle of total = J P Jᵀ + R.
+    """Cross = J P and the lower triangle of total = J P Jᵀ + R, of landmarks of two and three numbers in one pass for each."""
+    dim = jac.shape[1]
+    if dim == 2:
+        _innovation_covariance_of_two(jac, cov, noise, count, cross, total)
+    elif dim == 3:
+        _innovation_covariance_of_three(jac, cov, noise, count, cross, total)
+    else:
+        _innovation_covariance_of_many(jac, cov, noise, count, cross, total)
 
-    Three terms at a time: a sum is loaded and stored once for them. Columns of zeros at both ends are left out: a
-    measurement of several points of one record has rows that read one point each.
+
+@njit(cache=True, error_model="numpy")
+def _innovation_covariance_of_two(jac, cov, noise, count, cross, total):
+    for a in range(len(jac)):
+        for c in range(2):
+            for i in range(count):
+                cross[a, c, i] = jac[a, 0, i] * cov[c, i] + jac[a, 1, i] * cov[1 + c, i]
+        for b in range(a + 1):
+            r = noise[a, b]
+            for i in range(count):
+                total[a, b, i] = r + cross[a, 0, i] * jac[b, 0, i] + cross[a, 1, i] * jac[b, 1, i]
+
+
+@njit(cache=True, error_model="numpy")
+def _innovation_covariance_of_three(jac, cov, noise, count, cross, total):
+    for a in range(len(jac)):
+        for c in range(3):
+            k, m, n = packed(0, c), packed(1, c), packed(2, c)
+            for i in range(count):
+                first = jac[a, 0, i] * cov[k, i] + jac[a, 1, i] * cov[m, i]
+                cross[a, c, i] = first + jac[a, 2, i] * cov[n, i]
+        for b in range(a + 1):
+            r = noise[a, b]
+            for i in range(count):
+                first = r + cross[a, 0, i] * jac[b, 0, i] + cross[a, 1, i] * jac[b, 1, i]
+                total[a, b, i] = first + cross[a, 2, i] * jac[b, 2, i]
+
+
+@njit(cache=True, error_model="numpy")
+def _innovation_covariance_of_many(jac, cov, noise, count, cross, total):
+    """Three terms at a time: a sum is loaded and stored once for them.
+
+    Columns of zeros at both ends are left out: a measurement of several points of one record has rows that read one each.
     """
     p, dim = jac.shape[0], jac.shape[1]
     for a in range(p):

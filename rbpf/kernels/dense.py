@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import float64, int64, njit, void
 
-from rbpf.kernels.signature import CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR
+from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR
 
 
 @njit(cache=True, error_model="numpy")
@@ -135,43 +135,76 @@ def refine(info, vector, root_prior, mean, root, squared, log_det):
     """Fills mean (N, r) and root (N, r, r) of u, |C⁻¹Lᵀη|² and log |M| (N,), see `rbpf.core.proposals`.
 
     Of N particles with Λ (N, d, d) and η (N, d), and L (N or 1, d, r). Where M is not definite, all of these are NaN.
+    The innermost loops run along a block of particles.
     """
     dim, rank = root_prior.shape[1], root_prior.shape[2]
-    half, chol, white = np.empty((dim, rank)), np.empty((rank, rank)), np.empty(rank)
-    for i in range(len(info)):
-        spread = root_prior[i if len(root_prior) > 1 else 0]
-        half[:] = 0.0
+    spread, half = np.empty((dim, rank, BLOCK)), np.empty((rank, BLOCK))
+    chol, inverse = np.empty((rank, rank, BLOCK)), np.empty((rank, rank, BLOCK))
+    white, lane = np.empty((rank, BLOCK)), np.empty(BLOCK)
+    for start in range(0, len(info), BLOCK):
+        count = min(BLOCK, len(info) - start)
         for a in range(dim):
-            for b in range(dim):
-                for r in range(rank):
-                    half[a, r] += info[i, a, b] * spread[b, r]
+            for r in range(rank):
+                for i in range(count):
+                    spread[a, r, i] = root_prior[start + i if len(root_prior) > 1 else 0, a, r]
         for r in range(rank):
+            white[r] = 0.0
             for s in range(r + 1):
                 chol[r, s] = 1.0 if r == s else 0.0
-                for a in range(dim):
-                    chol[r, s] += spread[a, r] * half[a, s]
-            white[r] = 0.0
-            for a in range(dim):
-                white[r] += spread[a, r] * vector[i, a]
-        factor(chol)
-        solve_lower(chol, white)
+        # C of M = I + Lᵀ Λ L, row of Λ by row, and Lᵀη.
+        for a in range(dim):
+            half[:] = 0.0
+            for b in range(dim):
+                for i in range(count):
+                    lane[i] = info[start + i, a, b]
+                for r in range(rank):
+                    for i in range(count):
+                        half[r, i] += lane[i] * spread[b, r, i]
+            for i in range(count):
+                lane[i] = vector[start + i, a]
+            for r in range(rank):
+                for i in range(count):
+                    white[r, i] += spread[a, r, i] * lane[i]
+                for s in range(r + 1):
+                    for i in range(count):
+                        chol[r, s, i] += spread[a, r, i] * half[s, i]
+        for r in range(rank):
+            for s in range(r + 1):
+                for c in range(s):
+                    for i in range(count):
+                        chol[r, s, i] -= chol[r, c, i] * chol[s, c, i]
+                for i in range(count):
+                    chol[r, s, i] = math.sqrt(chol[r, s, i]) if r == s else chol[r, s, i] / chol[s, s, i]
+        for r in range(rank):
+            for c in range(r):
+                for i in range(count):
+                    white[r, i] -= chol[r, c, i] * white[c, i]
+            for i in range(count):
+                white[r, i] /= chol[r, r, i]
         # Columns of C⁻¹, which are the rows of its transposed: zero before the diagonal.
         for r in range(rank):
-            row = root[i, r]
-            row[:r] = 0.0
-            row[r] = 1.0 / chol[r, r]
+            for a in range(rank):
+                inverse[r, a] = 0.0
+            for i in range(count):
+                inverse[r, r, i] = 1.0 / chol[r, r, i]
             for a in range(r + 1, rank):
-                row[a] = 0.0
-                for b in range(r, a):
-                    row[a] -= chol[a, b] * row[b]
-                row[a] /= chol[a, a]
-        squared[i] = log_det[i] = 0.0
+                for c in range(r, a):
+                    for i in range(count):
+                        inverse[r, a, i] -= chol[a, c, i] * inverse[r, c, i]
+                for i in range(count):
+                    inverse[r, a, i] /= chol[a, a, i]
+        squared[start : start + count] = log_det[start : start + count] = 0.0
         for r in range(rank):
-            squared[i] += white[r] * white[r]
-            log_det[i] += 2.0 * math.log(chol[r, r])
-            mean[i, r] = 0.0
-            for s in range(r, rank):
-                mean[i, r] += root[i, r, s] * white[s]
+            lane[:] = 0.0
+            for c in range(r, rank):
+                for i in range(count):
+                    lane[i] += inverse[r, c, i] * white[c, i]
+            for i in range(count):
+                mean[start + i, r] = lane[i]
+                squared[start + i] += white[r, i] * white[r, i]
+                log_det[start + i] += 2.0 * math.log(chol[r, r, i])
+                for c in range(rank):
+                    root[start + i, r, c] = inverse[r, c, i]
 
 
 @njit(void(CUBE, MATRIX, CUBE, MATRIX, VECTOR), cache=True, error_model="numpy")
