@@ -31,7 +31,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import linearise_group, refine, update
+from rbpf.kernels.landmarks import linearise_group, refine, refine_alone, update, update_alone
 from rbpf.kernels.signature import run_driver
 from rbpf.lie import Array, LieGroup
 from rbpf.maps.store import Layout, SharedStore
@@ -182,7 +182,8 @@ class RowEngine:
                 fused, measured, sizes = self._observed(kernel, batch, group, state)
                 out = total.info, total.vector, total.quad, total.log_det, total.rows
                 access, factor = tuple(self.store.access(batch.ids)), np.ascontiguousarray(prior.factor)
-                run_driver(refine, state.shape[0] * batch.ks.size, fused, access, measured, factor, sizes, out)
+                pairs = state.shape[0] * batch.ks.size
+                run_driver(refine, pairs, fused, access, measured, factor, sizes, out, alone=refine_alone)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
@@ -216,7 +217,8 @@ class RowEngine:
                 access, targets = self.store.rewrite(batch.ids)
                 fused, measured, sizes = self._observed(kernel, batch, group, state)
                 pairs = state.shape[0] * batch.ks.size
-                run_driver(update, pairs, fused, tuple(access), targets, measured, sizes, log_density)
+                what = fused, tuple(access), targets, measured, sizes, log_density
+                run_driver(update, pairs, *what, alone=update_alone)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
         after_sampling = np.zeros(state.shape[0])

@@ -373,11 +373,16 @@ class SharedStore:
             alive = self.lineage.survivors(generation)
             if alive.size <= COLD_FRACTION * before:
                 self._survivors[generation] = alive.size
-                for column in members:
-                    row, cold = self.columns.row(column), self._cold.get(column)
+                # Columns that were compacted together share one array of writers.
+                found: dict[int, np.ndarray] = {}
+                columns = list(members)
+                for column, row in zip(columns, self.columns.rows(np.array(columns)).tolist(), strict=True):
+                    cold = self._cold.get(column)
                     if cold is not None and alive.size <= COLD_FRACTION * cold.kept.size:
-                        rows = np.searchsorted(cold.kept, alive)
-                        self._cold[column] = Cold(alive, cold.data.take(rows, axis=1))
+                        where = found.get(id(cold.kept))
+                        if where is None:
+                            where = found[id(cold.kept)] = np.searchsorted(cold.kept, alive)
+                        self._cold[column] = Cold(alive, cold.data.take(where, axis=1))
                     elif cold is None and alive.size <= HOT_FRACTION * self.n:
                         pool = self._pool(row)
                         self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))

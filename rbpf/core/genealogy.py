@@ -50,7 +50,9 @@ class Lineage:
         self._identity = np.arange(n)
         #: Ancestors of the newest generations, which the forest does not hold before somebody asks for it.
         self._pending: list[np.ndarray] = []
+        #: Of the generations that were asked for since the last resampling, what `rows` and `survivors` are.
         self._cache: dict[int, np.ndarray] = {}
+        self._alive: dict[int, np.ndarray] = {}
         #: Of each retained generation, its nodes as they were last looked through, by row.
         self._members: dict[int, np.ndarray] = {}
         #: Generations of which one row has all descendants: it always will, and the trunk need not be climbed again.
@@ -68,6 +70,7 @@ class Lineage:
         self.generation += 1
         self._pending.append(np.array(ancestors, dtype=np.int64))
         self._cache.clear()
+        self._alive.clear()
         if len(self._pending) == _PENDING:
             self._forget()
         if len(self._pending) == _PENDING:
@@ -98,6 +101,8 @@ class Lineage:
         """
         if generation == self.generation:
             return self._identity.copy()
+        if generation in self._alive:
+            return self._alive[generation]
         self._grow()
         nodes = self._members.get(generation)
         if nodes is None:
@@ -105,7 +110,8 @@ class Lineage:
             nodes = nodes[np.argsort(self._nodes[nodes, ROW])]
         # A node that died is free, or serves a later generation.
         nodes = self._members[generation] = nodes[self._nodes[nodes, GENERATION] == generation]
-        return np.asarray(self._nodes[nodes, ROW])
+        alive = self._alive[generation] = self._nodes[nodes, ROW]
+        return alive
 
     def due(self) -> list[int]:
         """Past generations, ascending, whose rows are worth compacting now: at ages growing by a quarter.
@@ -162,6 +168,7 @@ class Lineage:
         self._is_planted = True
         self._retained.clear()
         self._cache.clear()
+        self._alive.clear()
         self._members.clear()
         self._settled.clear()
 

@@ -13,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf.arrays import numbers
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Information, Prior, Proposed
 from rbpf.kernels.dense import refine
@@ -69,7 +70,7 @@ def refined(prior: Prior, information: Information) -> Proposed:
     n, rank = len(information.quad), prior.factor.shape[2]
     mean, root, squared, log_det = np.empty((n, rank)), np.empty((n, rank, rank)), np.empty(n), np.empty(n)
     # With M = C Cᵀ the covariance of u is C⁻ᵀC⁻¹, and its mean C⁻ᵀ of C⁻¹Lᵀη. What a model spoils makes the weight NaN.
-    given = (np.require(each, np.float64, ["C", "W"]) for each in (information.info, information.vector, prior.factor))
+    given = (numbers(each, "information") for each in (information.info, information.vector, prior.factor))
     refine(*given, mean, root, squared, log_det)
     nis = information.quad - squared
     log_w1 = information.log_factor - 0.5 * (nis + information.log_det + log_det)

@@ -115,7 +115,14 @@ def _refine_blocks(one, fused, records, observed, factor, sizes, sums):
         _refine_at(one)(int64(block), fused, records, observed, factor, sizes, sums)
 
 
+@njit(void(int64, *_REFINE), cache=True, error_model="numpy")
+def _refine_in_turn(one, fused, records, observed, factor, sizes, sums):
+    for block in range((fused[2].shape[0] + BLOCK - 1) // BLOCK):
+        _refine_at(one)(block, fused, records, observed, factor, sizes, sums)
+
+
 refine = partial(_refine_blocks, _refine_block.address)
+refine_alone = partial(_refine_in_turn, _refine_block.address)
 
 
 @njit(cache=True, error_model="numpy")
@@ -214,7 +221,14 @@ def _update_blocks(one, fused, records, targets, observed, sizes, log_density):
         _update_at(one)(int64(block), fused, records, targets, observed, sizes, log_density)
 
 
+@njit(void(int64, *_UPDATE), cache=True, error_model="numpy")
+def _update_in_turn(one, fused, records, targets, observed, sizes, log_density):
+    for block in range((fused[2].shape[0] + BLOCK - 1) // BLOCK):
+        _update_at(one)(block, fused, records, targets, observed, sizes, log_density)
+
+
 update = partial(_update_blocks, _update_block.address)
+update_alone = partial(_update_in_turn, _update_block.address)
 
 
 @njit(cache=True, error_model="numpy")

@@ -83,8 +83,16 @@ def observation_kernel(function: Callable[..., None]) -> ObservationKernel:
     return ObservationKernel(cfunc(_SIGNATURE, cache=True, error_model="numpy")(function))
 
 
-def run_driver(driver: Callable[..., None], pairs: int, *arguments: Any) -> None:
-    """Calls a driver on as many threads as `pairs` of particle and observation keep busy."""
+def run_driver(
+    driver: Callable[..., None], pairs: int, *arguments: Any, alone: Callable[..., None] | None = None
+) -> None:
+    """Calls a driver on as many threads as `pairs` of particle and observation keep busy.
+
+    For one thread it may have a twin, `alone`: what threads cost to be asked for is a twentieth of a small update.
+    """
+    if alone is not None and pairs < 2 * PAIRS_PER_THREAD:
+        alone(*arguments)
+        return
     allowed = numba.get_num_threads()
     wanted = max(1, min(allowed, pairs // PAIRS_PER_THREAD))
     if wanted == allowed:
