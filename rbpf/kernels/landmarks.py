@@ -410,30 +410,42 @@ def expect_group(address, params, state, mean, columns, clones, origins, cov, ro
     by_state = np.zeros((p, size, BLOCK))
     by_landmark = np.empty((p, dim, BLOCK))
     zero = np.zeros(p)
-    carried = np.empty((p, dim))
-    moved = np.empty((p, rank))
+    carried = np.empty((p, dim, BLOCK))
+    moved = np.empty((p, rank, BLOCK))
+    total = np.empty(BLOCK)
     for start in range(0, particles, BLOCK):
         n = min(BLOCK, particles - start)
         lanes.load_states(state, start, n, x)
         for k in range(count):
             _load(mean, columns[k], clones[k], origins[k], start, n, landmark, anchor)
             kernel(x, landmark, anchor, zero, params, n, nu, by_state, by_landmark)
-            for i in range(n):
-                spread = root[start + i if len(root) > 1 else 0]
-                for a in range(p):
+            moved[:, :, :n] = 0.0
+            for a in range(p):
+                for i in range(n):
                     predicted[start + i, k, a] = -nu[a, i]
+                for j in range(dim):
+                    for i in range(n):
+                        carried[a, j, i] = 0.0
+                    for b in range(dim):
+                        shared = cov[columns[k, b], columns[k, j]]
+                        for i in range(n):
+                            carried[a, j, i] += by_landmark[a, b, i] * shared
+                for r in range(rank):
+                    for e in range(size):
+                        if len(root) > 1:
+                            for i in range(n):
+                                moved[a, r, i] += by_state[a, e, i] * root[start + i, e, r]
+                        else:
+                            shared = root[0, e, r]
+                            for i in range(n):
+                                moved[a, r, i] += by_state[a, e, i] * shared
+                for b in range(a + 1):
+                    total[:n] = 0.0
                     for j in range(dim):
-                        carried[a, j] = 0.0
-                        for b in range(dim):
-                            carried[a, j] += by_landmark[a, b, i] * cov[columns[k, b], columns[k, j]]
+                        for i in range(n):
+                            total[i] += carried[a, j, i] * by_landmark[b, j, i]
                     for r in range(rank):
-                        moved[a, r] = 0.0
-                        for e in range(size):
-                            moved[a, r] += by_state[a, e, i] * spread[e, r]
-                    for b in range(a + 1):
-                        total = 0.0
-                        for j in range(dim):
-                            total += carried[a, j] * by_landmark[b, j, i]
-                        for r in range(rank):
-                            total += moved[a, r] * moved[b, r]
-                        within[start + i, k, a, b] = within[start + i, k, b, a] = total
+                        for i in range(n):
+                            total[i] += moved[a, r, i] * moved[b, r, i]
+                    for i in range(n):
+                        within[start + i, k, a, b] = within[start + i, k, b, a] = total[i]
