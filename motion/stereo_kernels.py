@@ -8,7 +8,6 @@ import math
 import numpy as np
 from numba import njit
 
-from rbpf.kernels.dense import factor, solve
 from rbpf.kernels.se3 import cross, exp_pair, multiply, quaternion, turned
 
 #: Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open.
@@ -169,6 +168,15 @@ def _adjust(matrix, first, n, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, s
             break
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _pixel_row(down, point, nearness, seen, camera):
+    """A row of ∂g/∂ξ, of v or of u: with the slope a of a pixel by the point p, a × p and −ρ a with the sign of T Exp(ξ)."""
+    a, b = (0.0, camera[1] / point[2]) if down else (camera[0] / point[2], 0.0)
+    c = ((camera[3] if down else camera[2]) - seen) / point[2]
+    x, y, z = b * point[2] - c * point[1], c * point[0] - a * point[2], a * point[1] - b * point[0]
+    return x, y, z, -nearness * a, -nearness * b, -nearness * c
+
+
 @njit(cache=True, error_model="numpy")
 def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, rows, front, best):
     """Fills rows (K, 3, 7) with L⁻¹ [ν, −∂g/∂ξ], front (K,) and best (K, 3) with m̂; zeros for a point behind.
@@ -186,7 +194,11 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
             best[k, 0], best[k, 1], best[k, 2] = pixels
             if front[k]:
                 x, y = (seen[0] - camera[2]) * depth / camera[0], (seen[1] - camera[3]) * depth / camera[1]
-                _pixel_jacobian((x, y, depth), (pixels[0] - pixels[2]) / camera[4], seen, camera, by_motion)
+                point, nearness = (x, y, depth), (pixels[0] - pixels[2]) / camera[4]
+                for a in range(3):
+                    row = _pixel_row(a == 1, point, nearness, seen[a], camera)
+                    for m in range(6):
+                        by_motion[a, m] = row[m]
                 chol = _six(lanes, _CHOL, i)
                 rows[k, 0, 0], rows[k, 1, 0], rows[k, 2, 0] = _solved_lower(chol, _three(lanes, _NU, i))
                 for m in range(6):
@@ -255,32 +267,6 @@ def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
 
 
 @njit(cache=True, error_model="numpy")
-def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motions):
-    """Fills motions (C, 7) with what triples of matches, `rows` (C, 3), propose.
-
-    A triple's points, of those `before` and `now` (K, 3), are aligned; the better of this and `start` (7,) on the triple's
-    pixels z (K, 3) is refined by some `steps` of Gauss-Newton. `white` and `camera` as above.
-    """
-    row, vector, info = np.empty((3, 6)), np.empty(6), np.empty((6, 6))
-    guess = ((start[0], start[1], start[2], start[3]), (start[4], start[5], start[6]))
-    for c in range(rows.shape[0]):
-        triple = rows[c]
-        quat, shift = _align(before, now, triple)
-        aligned = _squared_distance(quat, shift, triple, z_prev, z_now, white, camera)
-        if _squared_distance(guess[0], guess[1], triple, z_prev, z_now, white, camera) < aligned:
-            quat, shift = guess
-        for _ in range(steps):
-            _normal_equations(quat, shift, triple, z_prev, z_now, white, camera, row, vector, info)
-            factor(info)
-            solve(info, vector)
-            turn, way = exp_pair((vector[0], vector[1], vector[2]), (vector[3], vector[4], vector[5]))
-            way = turned(quat, way)
-            quat, shift = multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2])
-        motions[c, 0], motions[c, 1], motions[c, 2], motions[c, 3] = quat
-        motions[c, 4], motions[c, 5], motions[c, 6] = shift
-
-
-@njit(cache=True, error_model="numpy")
 def _difference(a, b):
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
@@ -331,61 +317,163 @@ def _projected(point, nearness, camera):
     return left, down, left - camera[4] * nearness / point[2]
 
 
-@njit(cache=True, error_model="numpy")
-def _whitened(white, v, i):
-    return white[i, 0] * v[0] + white[i, 1] * v[1] + white[i, 2] * v[2]
+# Triples side by side: of each of three points z⁻, z and W by rows, the motion T, and of the points' nine pixels, whitened,
+# the derivatives (6) and the error; then products of these seven columns, Σ aᵢ bᵢ for b ≤ a, by rows.
+_POINT, _POSE, _SLOPE, _PRODUCTS = 15 * _LANES, 45 * _LANES, 52 * _LANES, 115 * _LANES
+_GUESSED, _ALIGNED, _OF_TRIPLES = _SLOPE, _SLOPE + _LANES, 143 * _LANES
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _at(a, b):
+    return _PRODUCTS + (a * (a + 1) // 2 + b) * _LANES
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _motion(lanes, i):
+    quat = (*_three(lanes, _POSE, i), lanes[_POSE + 3 * _LANES + i])
+    return quat, _three(lanes, _POSE + 4 * _LANES, i)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _put_motion(lanes, i, quat, shift):
+    _put(lanes, _POSE, i, (quat[0], quat[1], quat[2]))
+    lanes[_POSE + 3 * _LANES + i] = quat[3]
+    _put(lanes, _POSE + 4 * _LANES, i, shift)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _white(lanes, place, i, v):
+    # W v of a point.
+    first = _dot(_three(lanes, place + 6 * _LANES, i), v)
+    return first, _dot(_three(lanes, place + 9 * _LANES, i), v), _dot(_three(lanes, place + 12 * _LANES, i), v)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _add_squared(lanes, n, place, camera, total):
+    # Adds a point's squared distance from the motion, infinite behind the camera.
+    for i in range(n):
+        quat, shift = _motion(lanes, i)
+        point, nearness = _transformed(quat, shift, _three(lanes, place, i), camera)
+        miss = _difference(_three(lanes, place + 3 * _LANES, i), _projected(point, nearness, camera))
+        p, q, r = _white(lanes, place, i, miss)
+        squared = lanes[total + i] + p * p + q * q + r * r
+        lanes[total + i] = squared if point[2] > 0.0 else np.inf
 
 
 @njit(cache=True, error_model="numpy")
-def _squared_distance(quat, shift, triple, z_prev, z_now, white, camera):
-    """Squared distance of a triple from a motion; infinite behind the camera."""
-    total = 0.0
-    for k in triple:
-        point, nearness = _transformed(quat, shift, z_prev[k], camera)
-        if not point[2] > 0.0:
-            return np.inf
-        miss = _difference(z_now[k], _projected(point, nearness, camera))
-        for i in range(3):
-            part = _whitened(white[k], miss, i)
-            total += part * part
-    return total
+def _squared_distances(lanes, n, camera, total):
+    lanes[total : total + n] = 0.0
+    _add_squared(lanes, n, 0, camera, total)
+    _add_squared(lanes, n, _POINT, camera, total)
+    _add_squared(lanes, n, 2 * _POINT, camera, total)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _put_slopes(lanes, n, place, camera, slope):
+    # Of a point. One behind the camera counts as one at infinity that is seen at the pixels (0, 0, 0).
+    for i in range(n):
+        quat, shift = _motion(lanes, i)
+        point, nearness = _transformed(quat, shift, _three(lanes, place, i), camera)
+        seen, front = _projected(point, nearness, camera), point[2] > 0.0
+        seen = (seen[0] if front else 0.0, seen[1] if front else 0.0, seen[2] if front else 0.0)
+        x, y = point[0] if front else -camera[2] / camera[0], point[1] if front else -camera[3] / camera[1]
+        point, nearness = (x, y, point[2] if front else 1.0), nearness if front else 0.0
+        left = _pixel_row(False, point, nearness, seen[0], camera)
+        down = _pixel_row(True, point, nearness, seen[1], camera)
+        right = _pixel_row(False, point, nearness, seen[2], camera)
+        miss = _difference(_three(lanes, place + 3 * _LANES, i), seen)
+        _put_column(lanes, slope, i, _white(lanes, place, i, (left[0], down[0], right[0])))
+        _put_column(lanes, slope + _LANES, i, _white(lanes, place, i, (left[1], down[1], right[1])))
+        _put_column(lanes, slope + 2 * _LANES, i, _white(lanes, place, i, (left[2], down[2], right[2])))
+        _put_column(lanes, slope + 3 * _LANES, i, _white(lanes, place, i, (left[3], down[3], right[3])))
+        _put_column(lanes, slope + 4 * _LANES, i, _white(lanes, place, i, (left[4], down[4], right[4])))
+        _put_column(lanes, slope + 5 * _LANES, i, _white(lanes, place, i, (left[5], down[5], right[5])))
+        _put_column(lanes, slope + 6 * _LANES, i, _white(lanes, place, i, miss))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _put_column(lanes, place, i, v):
+    lanes[place + i], lanes[place + 7 * _LANES + i], lanes[place + 14 * _LANES + i] = v
 
 
 @njit(cache=True, error_model="numpy")
-def _normal_equations(quat, shift, triple, z_prev, z_now, white, camera, row, vector, info):
-    """Fills info (6, 6), its lower triangle, with JᵀJ and vector (6,) with Jᵀε of a triple's whitened pixels.
+def _solve_triples(lanes, n, camera):
+    """Puts a step of Gauss-Newton (6) into the last row of the products."""
+    _put_slopes(lanes, n, 0, camera, _SLOPE)
+    _put_slopes(lanes, n, _POINT, camera, _SLOPE + 21 * _LANES)
+    _put_slopes(lanes, n, 2 * _POINT, camera, _SLOPE + 42 * _LANES)
+    for a in range(7):
+        for b in range(min(a + 1, 6)):
+            out = _at(a, b)
+            lanes[out : out + n] = 0.0
+            for row in range(0, 9, 3):
+                p, q = _SLOPE + (7 * row + a) * _LANES, _SLOPE + (7 * row + b) * _LANES
+                for i in range(n):
+                    total = lanes[out + i] + lanes[p + i] * lanes[q + i]
+                    total = total + lanes[p + 7 * _LANES + i] * lanes[q + 7 * _LANES + i]
+                    lanes[out + i] = total + lanes[p + 14 * _LANES + i] * lanes[q + 14 * _LANES + i]
+    for i in range(n):
+        trace = lanes[_at(0, 0) + i] + lanes[_at(1, 1) + i] + lanes[_at(2, 2) + i]
+        trace = trace + lanes[_at(3, 3) + i] + lanes[_at(4, 4) + i] + lanes[_at(5, 5) + i]
+        for a in range(6):
+            lanes[_at(a, a) + i] += STIFFNESS * trace + np.finfo(np.float64).tiny
+    # Cholesky's factor, and what is solved by it, as in `rbpf.kernels.dense`.
+    for a in range(7):
+        for b in range(min(a + 1, 6)):
+            out, pivot = _at(a, b), _at(b, b)
+            for c in range(b):
+                _take_off(lanes, n, out, _at(a, c), _at(b, c))
+            for i in range(n):
+                lanes[out + i] = math.sqrt(lanes[out + i]) if a == b else lanes[out + i] / lanes[pivot + i]
+    for a in range(5, -1, -1):
+        for b in range(a + 1, 6):
+            _take_off(lanes, n, _at(6, a), _at(b, a), _at(6, b))
+        for i in range(n):
+            lanes[_at(6, a) + i] /= lanes[_at(a, a) + i]
 
-    A point behind the camera counts as one at infinity that is seen at the pixels (0, 0, 0).
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _take_off(lanes, n, out, p, q):
+    for i in range(n):
+        lanes[out + i] -= lanes[p + i] * lanes[q + i]
+
+
+@njit(cache=True, error_model="numpy")
+def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motions):
+    """Fills motions (C, 7) with what triples of matches, `rows` (C, 3), propose.
+
+    A triple's points, of those `before` and `now` (K, 3), are aligned; the better of this and `start` (7,) on the triple's
+    pixels z (K, 3) is refined by some `steps` of Gauss-Newton. `white` and `camera` as above.
     """
-    info[:], vector[:] = 0.0, 0.0
-    slope = np.empty(6)
-    for k in triple:
-        point, nearness = _transformed(quat, shift, z_prev[k], camera)
-        if point[2] > 0.0:
-            seen = _projected(point, nearness, camera)
-        else:
-            seen, nearness = (0.0, 0.0, 0.0), 0.0
-            point = (-camera[2] / camera[0], -camera[3] / camera[1], 1.0)
-        miss = _difference(z_now[k], seen)
-        _pixel_jacobian(point, nearness, seen, camera, row)
-        for i in range(3):
-            error = _whitened(white[k], miss, i)
-            for e in range(6):
-                slope[e] = _whitened(white[k], (row[0, e], row[1, e], row[2, e]), i)
-                vector[e] += slope[e] * error
-                for f in range(e + 1):
-                    info[e, f] += slope[e] * slope[f]
-    trace = info[0, 0] + info[1, 1] + info[2, 2] + info[3, 3] + info[4, 4] + info[5, 5]
-    for e in range(6):
-        info[e, e] += STIFFNESS * trace + np.finfo(np.float64).tiny
-
-
-@njit(cache=True, error_model="numpy")
-def _pixel_jacobian(point, nearness, seen, camera, row):
-    """∂g/∂ξ (3, 6): with the slope a of a pixel by the point p, a × p and −ρ a with the sign of T Exp(ξ)."""
-    for i in range(3):
-        a, b = (0.0, camera[1] / point[2]) if i == 1 else (camera[0] / point[2], 0.0)
-        c = ((camera[3] if i == 1 else camera[2]) - seen[i]) / point[2]
-        row[i, 0], row[i, 1] = b * point[2] - c * point[1], c * point[0] - a * point[2]
-        row[i, 2] = a * point[1] - b * point[0]
-        row[i, 3], row[i, 4], row[i, 5] = -nearness * a, -nearness * b, -nearness * c
+    lanes = np.empty(_OF_TRIPLES)
+    camera = (camera[0], camera[1], camera[2], camera[3], camera[4])
+    guess = ((start[0], start[1], start[2], start[3]), (start[4], start[5], start[6]))
+    for first in range(0, rows.shape[0], _LANES):
+        n = min(_LANES, rows.shape[0] - first)
+        for i in range(n):
+            for j in range(3):
+                k, place = rows[first + i, j], j * _POINT + i
+                for a in range(3):
+                    lanes[place + a * _LANES], lanes[place + (3 + a) * _LANES] = z_prev[k, a], z_now[k, a]
+                    for b in range(3):
+                        lanes[place + (6 + 3 * a + b) * _LANES] = white[k, a, b]
+            _put_motion(lanes, i, guess[0], guess[1])
+        _squared_distances(lanes, n, camera, _GUESSED)
+        for i in range(n):
+            quat, shift = _align(before, now, rows[first + i])
+            _put_motion(lanes, i, quat, shift)
+        _squared_distances(lanes, n, camera, _ALIGNED)
+        for i in range(n):
+            if lanes[_GUESSED + i] < lanes[_ALIGNED + i]:
+                _put_motion(lanes, i, guess[0], guess[1])
+        for _ in range(steps):
+            _solve_triples(lanes, n, camera)
+            for i in range(n):
+                quat, shift = _motion(lanes, i)
+                turn, way = exp_pair(_three(lanes, _at(6, 0), i), _three(lanes, _at(6, 3), i))
+                way = turned(quat, way)
+                _put_motion(lanes, i, multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2]))
+        for i in range(n):
+            quat, shift = _motion(lanes, i)
+            motions[first + i, 0], motions[first + i, 1], motions[first + i, 2], motions[first + i, 3] = quat
+            motions[first + i, 4], motions[first + i, 5], motions[first + i, 6] = shift

@@ -91,16 +91,16 @@ def estimate_motion(
             there = f"{negative}: are left and right swapped? {plausible.sum()} are left"
         return _failed(start, matches, f"{there}, {config.min_matches} are needed")
     motion = consensus(matches.rows(plausible), start, config.gate, rng, config.ransac)
-    found = _refined(matches, plausible, motion, start, config)
+    found, squared = _refined(matches, plausible, motion, start, config)
     others, left, last = list[MotionEstimate](), plausible, found
     while last.found:
         # Matches just outside a gate belong to the motion that was found first.
-        left = left & (_squared(matches, last.previous_camera_from_camera, config) > WIDE * config.gate)
+        left = left & (squared > WIDE * config.gate)
         if left.sum() < config.min_matches:
             break
         far, inliers = matches.rows(left), np.zeros(len(matches), dtype=bool)
         motion = consensus(far, SE3.identity(), config.gate, rng, config.ransac)
-        last = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
+        last, squared[left] = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
         inliers[np.flatnonzero(left)[last.inliers]] = True
         if last.found:
             last = replace(last, inliers=inliers)
@@ -144,28 +144,32 @@ def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Mini
     return minimise(lambda motion: residuals(matches, motion, points), start, SE3.retract, rule)
 
 
-def _refined(matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig) -> MotionEstimate:
-    """The motion of all matches that agree, from one that many agree with."""
-    agreeing, iterations = plausible & (_squared(matches, motion, config) <= WIDE * config.gate), 0
+def _refined(
+    matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig
+) -> tuple[MotionEstimate, Array]:
+    """The motion of all matches that agree, from one that many agree with, and squared distances (K,) of all from it."""
+    squared, iterations = _squared(matches, motion, config), 0
+    agreeing = plausible & (squared <= WIDE * config.gate)
     for _ in range(ROUNDS):
         if agreeing.sum() < config.min_matches:
             agree = f"{agreeing.sum()} of {len(matches)} matches agree on a motion"
-            return _failed(start, matches, f"{agree}, {config.min_matches} are needed")
+            return _failed(start, matches, f"{agree}, {config.min_matches} are needed"), squared
         inliers, part = agreeing, matches.rows(agreeing)
         found = fit(part, motion, config)
         motion, iterations = found.x, iterations + found.iterations
-        agreeing = plausible & (_squared(matches, motion, config) <= config.gate)
+        squared = _squared(matches, motion, config)
+        agreeing = plausible & (squared <= config.gate)
         if (agreeing == inliers).all():
             break
     if not found.converged:
-        return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations")
+        return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations"), squared
     rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
     cov = found.cov
     if config.points == "adjusted":
         cov = _consistent_covariance(part, motion, found.factor)
     if config.points != "exact":
         cov = trimming(config.gate) * cov
-    return MotionEstimate(motion, cov, inliers, float(rms))
+    return MotionEstimate(motion, cov, inliers, float(rms)), squared
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
