@@ -6,6 +6,7 @@ column is rewritten only when it is observed; one that is left alone is compacte
 descendants, whose number falls like 1/age as lineages coalesce. See `docs/adr` for the comparison with a tree.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
@@ -215,7 +216,11 @@ class Pool:
         while len(self._free) < count:
             held, old = self.data, self.data.shape[0]
             self.data = self._slabs(2 * old, *held.shape[1:])
-            self.data[:old] = held  # what is not used yet needs no memory
+            # What is not used yet needs no memory, and what has been copied is given back.
+            for first in range(old - _FIRST_SLABS, -1, -_FIRST_SLABS):
+                self.data[first : first + _FIRST_SLABS] = held[first : first + _FIRST_SLABS]
+                with suppress(ValueError):  # somebody is still reading it: then it goes as a whole
+                    held.resize((first, *held.shape[1:]))
             self._free = list(range(2 * old - 1, old - 1, -1)) + self._free
         taken = self._free[: -count - 1 : -1]
         del self._free[len(self._free) - count :]
