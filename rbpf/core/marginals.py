@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import final
 
 import numpy as np
@@ -154,20 +155,18 @@ class KalmanSubstate(Conditional):
                 f"the substate has {m} numbers: expected coupling (·, {d}, {m}), dynamics (·, {m}, {m}) and "
                 f"drift (·, {m}), the motion model gives (·, …) {sizes}"
             )
-        shared = max(len(transition.coupling), len(transition.dynamics))
+        count = max(len(transition.coupling), len(transition.dynamics))
         blocks = [
-            np.broadcast_to(part, (shared, *part.shape[1:])) for part in (transition.coupling, transition.dynamics)
+            np.broadcast_to(part, (count, *part.shape[1:])) for part in (transition.coupling, transition.dynamics)
         ]
         stack, noise = np.concatenate(blocks, axis=1), transition.noise_factor
         means = (stack @ self.mean[..., None])[..., 0]
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
-        # Joint covariance of (ε, s), then s | ε by its gain and rest, which rounding cannot make indefinite.
         joint = stack @ self.cov @ np.swapaxes(stack, -1, -2) + noise @ np.swapaxes(noise, -1, -2)
-        factor = gaussian.psd_factor(gaussian.symmetrise(joint[:, :d, :d]))
-        self._gain = joint[:, d:, :d] @ np.linalg.pinv(joint[:, :d, :d], hermitian=True)
-        closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(m), (len(joint), m, m))], axis=2)
-        self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+        shared = len(joint) == 1  # by all particles
+        parts = _kept_parts(joint.tobytes(), d, m) if shared else _split(joint, d)
+        factor, self._gain, self._rest = (part.copy() if shared else part for part in parts)
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
     def driving(self) -> np.ndarray | None:
@@ -242,6 +241,22 @@ class KalmanSubstate(Conditional):
             jacs += list(np.moveaxis(jac, 1, 0))
             noises += list(group.cov)
         return stacked(nus, jacs, noises, [None] * len(nus))
+
+
+def _split(joint: Array, d: int) -> tuple[Array, Array, Array]:
+    """Of the joint covariance (…, d + m, d + m) of (ε, s): a factor of that of ε, and s | ε by its gain and covariance."""
+    of_increment, m = joint[:, :d, :d], joint.shape[-1] - d
+    factor = gaussian.psd_factor(gaussian.symmetrise(of_increment))
+    gain = joint[:, d:, :d] @ np.linalg.pinv(of_increment, hermitian=True)
+    # In a form that rounding cannot make indefinite.
+    closed = np.concatenate([-gain, np.broadcast_to(np.eye(m), (len(joint), m, m))], axis=2)
+    return factor, gain, gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+
+
+@lru_cache(maxsize=64)
+def _kept_parts(joint: bytes, d: int, m: int) -> tuple[Array, Array, Array]:
+    # Where time steps are alike the recursion comes to rest, in every bit.
+    return _split(np.frombuffer(joint).reshape(1, d + m, d + m), d)
 
 
 @final

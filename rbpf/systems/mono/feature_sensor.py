@@ -240,14 +240,14 @@ class FeatureSensor(Sensor):
         cov_z = self.noise_factor * frame.cov_z
 
         # All members of the constellation that are seen are one measurement of it.
-        members, ids = self.members(frame.landmarks), self._ids(belief, frame.landmarks)
+        members = self.members(frame.landmarks)
+        ids = self._ids(belief, frame.landmarks, members)
         rows = np.flatnonzero((members >= 0) & inside)
         held = rows.size > 0
         if held:
             landmark, view = self._view(members[rows])
-            cov = np.zeros((1, view.dim, view.dim))
-            for k, row in enumerate(rows.tolist()):
-                cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = cov_z[row]
+            cov, each = np.zeros((1, view.dim, view.dim)), np.arange(rows.size)
+            cov.reshape(rows.size, 2, rows.size, 2)[each, :, each] = cov_z[rows]
             groups.append(Observations(frame.z[rows].reshape(1, -1), cov, view, ids=landmark))
 
         rows = np.flatnonzero((ids >= 0) & inside)
@@ -394,7 +394,7 @@ class FeatureSensor(Sensor):
         self, belief: Belief, names: np.ndarray, sigmas: float, min_weight: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of those features (K,) whose depth is not known: which, and where they may be (k, 2, 4): `UnknownDepth.extent`."""
-        ids = self._ids(belief, names)
+        ids = self._ids(belief, names, self.members(names))
         held = np.flatnonzero(ids >= 0)
         unknown = held[belief.map.are(ids[held], self.unknown_depth.landmark)]
         if not unknown.size:
@@ -406,7 +406,7 @@ class FeatureSensor(Sensor):
     def remove(self, belief: Belief, names: np.ndarray) -> None:
         """Drops features from all particles."""
         if names.size:
-            ids = self._ids(belief, names)
+            ids = self._ids(belief, names, self.members(names))
             belief.map.remove(ids[ids >= 0])
 
     def _in_world(self, belief: Belief, position: np.ndarray, particles: slice) -> np.ndarray:
@@ -426,15 +426,16 @@ class FeatureSensor(Sensor):
         rows = np.minimum(self._member_names.searchsorted(names), self._order.size - 1)
         return np.where(self._member_names[rows] == names, self._order[rows], -1)
 
-    def _ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
-        """Landmarks (K,) of features (K,), −1 where the map has none of their own."""
-        return np.where((self.members(names) < 0) & belief.map.holds(names), names, -1)
+    def _ids(self, belief: Belief, names: np.ndarray, members: np.ndarray) -> np.ndarray:
+        """Landmarks (K,) of features (K,), −1 where the map has none of their own; `members` are theirs."""
+        return np.where((members < 0) & belief.map.holds(names), names, -1)
 
     def by_model(
         self, belief: Belief, names: np.ndarray
     ) -> list[tuple[CameraModel | MembersView, np.ndarray, np.ndarray]]:
         """Features (K,) by how they are measured: the model, which of them, and the landmarks' ids."""
-        ids, member = self._ids(belief, names), self.members(names)
+        member = self.members(names)
+        ids = self._ids(belief, names, member)
         own = np.flatnonzero(ids >= 0)
         unknown = belief.map.are(ids[own], self.unknown_depth.landmark)
         out: list[tuple[CameraModel | MembersView, np.ndarray, np.ndarray]] = []
