@@ -23,6 +23,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import (
@@ -600,7 +601,7 @@ class JointMap(Map):
         predicted = np.empty((self.n, len(kind.rows), model.dim))
         within, held = np.empty((*predicted.shape, model.dim)), (kind.columns, kind.clones, kind.origins)
         arrays = belief.state, self.mean, self.cov, prior.spread(prior.mean)
-        state, mean, cov, root = (np.require(each, np.float64, ["C", "W"]) for each in arrays)
+        state, mean, cov, root = (numbers(each, "what a kernel takes") for each in arrays)
         expect_group(kernel.function.address, kernel.params, state, mean, *held, cov, root, predicted, within)
         return predicted, within
 

@@ -434,7 +434,7 @@ def innovations(
     said, slope = np.zeros((k * p, 1 + space.dim, 1)), np.zeros((k * p, dim))
     columns, none = np.arange(k * dim).reshape(k, dim), np.zeros((k, 0), dtype=np.int64)
     arrays = state[None], records.mean.reshape(1, -1), np.empty((k, 0)) if const is None else const[0], z
-    at, mean, origins, z = (np.require(array, np.float64, ["C", "W"]) for array in arrays)
+    at, mean, origins, z = (numbers(array, "what a kernel takes") for array in arrays)
     linearise_group(kernel.function.address, kernel.params, at, mean, columns, none, origins, z, 0, said, slope)
     nu, by_state = said[:, 0].reshape(k, p), said[:, 1:].reshape(k, p, space.dim)
     return nu, Jacobians(by_state, slope.reshape(k, p, dim)), records

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg.blas import dsyrk, dtrsm
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import NEW, NULL, FusedKernel, Likelihood, Observations, Part
 from rbpf.core.particles import Information, weighted_mean
@@ -188,7 +189,7 @@ class Reading:
         world.
         """
         held, space, (n, d) = self.held, self.held.space, (len(state), self.held.space.dim)
-        state, mean = (np.require(each, np.float64, ["C", "W"]) for each in (state, mean))
+        state, mean = numbers(state, "states"), numbers(mean, "the map's means")
         count, parts = len(self._at), list[Group]()
         said, by_held = np.zeros((count, 1 + d, n)), np.zeros(self._at.shape)
         for group, (seen, kind, rows, kernel) in zip(groups, self._parts, strict=True):
