@@ -54,12 +54,18 @@ def test_frames_of_mrclam_are_the_instants_with_a_landmark(tmp_path, caplog):
     assert (log.name, log.space, log.measurement) == (tmp_path.name, SE2, "range_bearing")
     assert [frame.stamp_ns for frame in log.frames] == [100_100_000_000, 101_900_000_000]
     assert [frame.landmarks.tolist() for frame in log.frames] == [[6, 7], [7]]
-    np.testing.assert_array_equal(log.frames[0].z, [[3, 0.1], [4, -0.2]])
-    np.testing.assert_allclose(log.frames[1].cov_z, [np.diag([0.12**2, 0.02**2])])
+    np.testing.assert_allclose(log.frames[0].z, [[3 / np.cos(0.1), 0.1], [4 / np.cos(0.2), -0.2]])
+    by_depth, by_bearing = 1.0 / np.cos(0.3), 5.0 * np.sin(0.3) / np.cos(0.3) ** 2
+    gain = np.array([[by_depth, by_bearing], [0.0, 1.0]])
+    np.testing.assert_allclose(log.frames[1].cov_z, [gain @ np.diag([0.06**2, 0.02**2]) @ gain.T])
     np.testing.assert_allclose(log.frames[1].delta, moved(), atol=1e-14)
     assert "left out 1 observations of robots and 1 of unknown barcodes" in caplog.text
     log = opened(tmp_path, {SEEN: "100.1 63 3 0.1\n"})
     assert len(log.frames) == 1 and log.frames[0].delta is None
+    # No camera looks so far to the side: this is a range.
+    log = opened(tmp_path, {SEEN: "100.1 63 3 1.5\n"})
+    np.testing.assert_array_equal(log.frames[0].z, [[3, 1.5]])
+    assert "ranges are taken as they are" in caplog.text
 
 
 def test_covariance_of_mrclam_is_that_of_white_noise(tmp_path):

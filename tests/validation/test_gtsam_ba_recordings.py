@@ -57,14 +57,14 @@ def test_simulated_recordings_give_the_errors_of_the_reference(data_dir, folder,
     assert 0.3 < np.mean(nees) / len(misses[0]) < 2.0
 
 
-def test_mrclam_is_solved_as_well_as_by_the_reference(data_dir):
+def test_mrclam_is_solved_better_than_by_a_reference_that_takes_depths_for_ranges(data_dir):
     log = open_log(data_dir / "mrclam6_robot1")
     m = from_log(log)
     assert Problem(m).null.any()
     plain, robust = (solve(m, threshold, marginals=False, incremental=True) for threshold in (None, 1.345))
     for found, reference in ((plain, (0.144, 0.089)), (robust, (0.118, 0.076))):
         errors = planar_errors(m, log, found.world_from_body, found.landmarks)
-        assert np.less(errors, np.multiply(1.1, reference)).all(), errors
+        assert np.less(errors, np.multiply((0.85, 1.0), reference)).all(), errors
 
 
 def test_victoria_park_needs_the_incremental_start(data_dir):
