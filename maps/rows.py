@@ -15,7 +15,7 @@ from rbpf import gaussian
 from rbpf.arrays import numbers
 from rbpf.core import linearisation
 from rbpf.core.likelihoods import Gaussian
-from rbpf.core.linearisation import linearise
+from rbpf.core.linearisation import EVERYTHING, linearise
 from rbpf.core.models import (
     NEW,
     NULL,
@@ -31,7 +31,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import SUMMED, Information, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import linearise_group, refine, refine_alone, update, update_alone
+from rbpf.kernels.landmarks import given_rows, linearise_group, refine, refine_alone, update, update_alone
 from rbpf.kernels.signature import run_driver
 from rbpf.lie import Array, LieGroup
 from rbpf.maps.store import Layout, SharedStore
@@ -61,6 +61,11 @@ class Batch:
     ks: np.ndarray
     ids: np.ndarray
     mask: np.ndarray | None = None
+
+    def some(self, rows: np.ndarray | slice) -> "Batch":
+        """A part of its rows."""
+        mask = None if self.mask is None else self.mask[:, rows]
+        return Batch(self.group, self.ks[rows], self.ids[rows], mask)
 
 
 @dataclass
@@ -173,16 +178,16 @@ class RowEngine:
         """Information of all rows but those of mixtures, about a right perturbation of the states (N, E)."""
         total = Information.zeros(state.shape[0], self.space.dim)
         total.log_factor += plan.log_factor
+        out = total.info, total.vector, total.quad, total.log_det, total.rows
         for batch in plan.batches:
             group = groups[batch.group]
-            kernel = self._kernel(group)
-            if kernel is None:
+            if not self._is_compiled(group):
                 total.add(self._information_numpy(batch, group, state, prior))
-            else:
-                fused, measured, sizes = self._observed(kernel, batch, group, state)
-                out = total.info, total.vector, total.quad, total.log_det, total.rows
-                access, factor = tuple(self.store.access(batch.ids)), np.ascontiguousarray(prior.factor)
-                pairs = state.shape[0] * batch.ks.size
+                continue
+            factor = np.ascontiguousarray(prior.factor)
+            for part in self._parts(batch, group):
+                fused, measured, sizes = self._observed(part, group, state, EVERYTHING)
+                access, pairs = tuple(self.store.access(part.ids)), state.shape[0] * part.ks.size
                 run_driver(refine, pairs, fused, access, measured, factor, sizes, out, alone=refine_alone)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
@@ -205,20 +210,15 @@ class RowEngine:
         log_density = plan.log_factor.copy()
         for batch in plan.batches:
             group = groups[batch.group]
-            kernel = self._kernel(group)
-            if kernel is None:
-                # A landmark that particles associate with several measurements is updated by one after the other.
-                pending = np.arange(batch.ids.size)
-                while pending.size:
-                    _, first = np.unique(batch.ids[pending], return_index=True)
-                    self._correct_once(batch, pending[first], group, state, log_density)
-                    pending = np.delete(pending, first)
-            else:
-                access, targets = self.store.rewrite(batch.ids)
-                fused, measured, sizes = self._observed(kernel, batch, group, state)
-                pairs = state.shape[0] * batch.ks.size
+            if not self._is_compiled(group):
+                for part in _one_after_the_other(batch):
+                    self._correct_once(part, group, state, log_density)
+                continue
+            for part in self._parts(batch, group):
+                fused, measured, sizes = self._observed(part, group, state, MAP)
+                access, targets = self.store.rewrite(part.ids)
                 what = fused, tuple(access), targets, measured, sizes, log_density
-                run_driver(update, pairs, *what, alone=update_alone)
+                run_driver(update, state.shape[0] * part.ks.size, *what, alone=update_alone)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
         after_sampling = np.zeros(state.shape[0])
@@ -226,21 +226,42 @@ class RowEngine:
             after_sampling += self._correct_mixture(row, groups[row.group], state)
         return LogDensities(log_density + after_sampling, after_sampling)
 
-    def _kernel(self, group: Observations) -> FusedKernel | None:
-        if not self.compiled or (group.likelihood is not None and group.likelihood.kernel_id < 0):
-            return None
-        return fused_kernel(group.model)
+    def _is_compiled(self, group: Observations) -> bool:
+        return self.compiled and _likelihood(group).kernel_id >= 0
+
+    def _parts(self, batch: Batch, group: Observations) -> list[Batch]:
+        """A batch as the drivers take it: whole, or so much of it at once as NumPy linearises in the cache."""
+        if group.model.kernel() is not None:
+            return [batch]
+        size = max(1, PAIRS_AT_ONCE // self.store.n)
+        return [
+            part.some(slice(first, first + size))
+            for part in _one_after_the_other(batch)
+            for first in range(0, part.ks.size, size)
+        ]
 
     def _observed(
-        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray
+        self, batch: Batch, group: Observations, state: np.ndarray, by: frozenset[Part]
     ) -> tuple[tuple[Any, ...], tuple[Any, ...], np.ndarray]:
-        """What both drivers take: the kernel and the states; the measurements and their likelihood; the sizes d, D, A."""
+        """What both drivers take: the kernel and the states; the measurements and their likelihood; the sizes d, D, A.
+
+        A model without a kernel is linearised in NumPy, and its rows are handed on.
+        """
         likelihood, landmark = _likelihood(group), self.layout_of(int(batch.ids[0])).landmark
+        z, kernel = group.z[batch.ks], fused_kernel(group.model)
+        if kernel is None:
+            _, records = self._read(batch.ids)
+            nu, jac = linearise(group.model, self.space, z, state[:, None], records.mean, records.const, by=by)
+            rows = np.concatenate([nu[..., None], *(block for block in jac if block is not None)], axis=-1)
+            z = np.zeros_like(z)
+            z[:, 0] = np.arange(len(z)) * rows[0, 0].size
+            by_state = 0 if jac.state is None else self.space.dim
+            kernel, state = FusedKernel(given_rows, np.array([by_state], dtype=float)), rows.reshape(len(state), -1)
         mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
         params = numbers(likelihood.params, "the params of a likelihood")
         return (
             (kernel.function.address, kernel.params, np.ascontiguousarray(state)),
-            (group.z[batch.ks], group.cov[batch.ks], mask, likelihood.kernel_id, params),
+            (z, group.cov[batch.ks], mask, likelihood.kernel_id, params),
             np.array([self.space.dim, landmark.dim, landmark.constants]),
         )
 
@@ -272,14 +293,12 @@ class RowEngine:
                 getattr(found, name)[part] = getattr(told, name)
         return found
 
-    def _correct_once(
-        self, batch: Batch, rows: np.ndarray, group: Observations, state: Array, log_density: Array
-    ) -> None:
-        ids, ks = batch.ids[rows], batch.ks[rows]
+    def _correct_once(self, batch: Batch, group: Observations, state: Array, log_density: Array) -> None:
+        ids, ks = batch.ids, batch.ks
         columns, records = self._read(ids)
         means, covs = [], []
         for part in _spans(state.shape[0], ks.size):
-            mask = None if batch.mask is None else batch.mask[part][:, rows]
+            mask = None if batch.mask is None else batch.mask[part]
             mean, cov, log_terms = self._updated(group, ks, state[part], *_taken(records, part), mask)
             log_density[part] += log_terms.sum(axis=1)
             means.append(mean)
@@ -324,7 +343,7 @@ class RowEngine:
             for row in sorted(rows, key=lambda row: groups[row.group].z[row.k].tolist()):
                 mask = None if row.mask is None else row.mask[:, None]
                 batch = Batch(row.group, np.array([row.k]), np.array([row.landmark]), mask)
-                self._correct_once(batch, np.zeros(1, dtype=np.int64), groups[row.group], state, log_density)
+                self._correct_once(batch, groups[row.group], state, log_density)
             return
         nu, jac, records, noise, _, _ = self._joint(rows, groups, state)
         jac_map = jac[:, None, :, self.space.dim :]
@@ -366,6 +385,16 @@ def fused_kernel(model: ObservationModel) -> FusedKernel | None:
     if kernel is None:
         return None
     return FusedKernel(kernel.function, numbers(kernel.params, f"the params of {type(model).__name__}'s kernel"))
+
+
+def _one_after_the_other(batch: Batch) -> list[Batch]:
+    """A landmark that particles associate with several measurements is updated by one after the other."""
+    parts, pending = [], np.arange(batch.ids.size)
+    while pending.size:
+        _, first = np.unique(batch.ids[pending], return_index=True)
+        parts.append(batch.some(pending[first]))
+        pending = np.delete(pending, first)
+    return parts
 
 
 def _spans(n: int, k: int) -> list[slice]:

@@ -175,10 +175,15 @@ def add_gram(matrix, sign, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_transposed_product(matrix, vector, count, total):
-    """Total += matrixᵀ vector."""
+    """Total += matrixᵀ vector; three rows in one pass, as in `add_gram`."""
     p = matrix.shape[0]
+    done = 3 if p > 2 else 0
     for e in range(matrix.shape[1]):
-        for a in range(p):
+        if p > 2:
+            for i in range(count):
+                first = total[e, i] + matrix[0, e, i] * vector[0, i]
+                total[e, i] = first + matrix[1, e, i] * vector[1, i] + matrix[2, e, i] * vector[2, i]
+        for a in range(done, p):
             for i in range(count):
                 total[e, i] += matrix[a, e, i] * vector[a, i]
 

@@ -1,11 +1,12 @@
 """Linear algebra: Cholesky's factor of a small matrix, what is solved by it, products, and what stays symmetric."""
 
 import math
+from functools import partial
 
 import numpy as np
-from numba import float64, int64, njit, void
+from numba import float64, int64, njit, prange, void
 
-from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR
+from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR, part_of
 
 
 @njit(cache=True, error_model="numpy")
@@ -130,8 +131,12 @@ def comb(weights, offset, ancestors):
     ancestors[tooth:] = last
 
 
-@njit(void(CUBE, MATRIX, CUBE, MATRIX, CUBE, VECTOR, VECTOR), cache=True, error_model="numpy")
-def refine(info, vector, root_prior, mean, root, squared, log_det):
+_REFINE = CUBE, MATRIX, CUBE, MATRIX, CUBE, VECTOR, VECTOR
+_refine_at, _refine_part = part_of(*_REFINE)
+
+
+@_refine_part
+def _refine_block(block, info, vector, root_prior, mean, root, squared, log_det):
     """Fills mean (N, r) and root (N, r, r) of u, |C⁻¹Lᵀη|² and log |M| (N,), see `rbpf.core.proposals`.
 
     Of N particles with Λ (N, d, d) and η (N, d), and L (N or 1, d, r). Where M is not definite, all of these are NaN.
@@ -141,70 +146,86 @@ def refine(info, vector, root_prior, mean, root, squared, log_det):
     spread, half = np.empty((dim, rank, BLOCK)), np.empty((rank, BLOCK))
     chol, inverse = np.empty((rank, rank, BLOCK)), np.empty((rank, rank, BLOCK))
     white, lane = np.empty((rank, BLOCK)), np.empty(BLOCK)
-    for start in range(0, len(info), BLOCK):
-        count = min(BLOCK, len(info) - start)
-        for a in range(dim):
+    start = block * BLOCK
+    count = min(BLOCK, len(info) - start)
+    for a in range(dim):
+        for r in range(rank):
+            for i in range(count):
+                spread[a, r, i] = root_prior[start + i if len(root_prior) > 1 else 0, a, r]
+    for r in range(rank):
+        white[r] = 0.0
+        for s in range(r + 1):
+            chol[r, s] = 1.0 if r == s else 0.0
+    # C of M = I + Lᵀ Λ L, row of Λ by row, and Lᵀη.
+    for a in range(dim):
+        half[:] = 0.0
+        for b in range(dim):
+            for i in range(count):
+                lane[i] = info[start + i, a, b]
             for r in range(rank):
                 for i in range(count):
-                    spread[a, r, i] = root_prior[start + i if len(root_prior) > 1 else 0, a, r]
+                    half[r, i] += lane[i] * spread[b, r, i]
+        for i in range(count):
+            lane[i] = vector[start + i, a]
         for r in range(rank):
-            white[r] = 0.0
+            for i in range(count):
+                white[r, i] += spread[a, r, i] * lane[i]
             for s in range(r + 1):
-                chol[r, s] = 1.0 if r == s else 0.0
-        # C of M = I + Lᵀ Λ L, row of Λ by row, and Lᵀη.
-        for a in range(dim):
-            half[:] = 0.0
-            for b in range(dim):
                 for i in range(count):
-                    lane[i] = info[start + i, a, b]
-                for r in range(rank):
-                    for i in range(count):
-                        half[r, i] += lane[i] * spread[b, r, i]
+                    chol[r, s, i] += spread[a, r, i] * half[s, i]
+    for r in range(rank):
+        for s in range(r + 1):
+            for c in range(s):
+                for i in range(count):
+                    chol[r, s, i] -= chol[r, c, i] * chol[s, c, i]
             for i in range(count):
-                lane[i] = vector[start + i, a]
-            for r in range(rank):
-                for i in range(count):
-                    white[r, i] += spread[a, r, i] * lane[i]
-                for s in range(r + 1):
-                    for i in range(count):
-                        chol[r, s, i] += spread[a, r, i] * half[s, i]
-        for r in range(rank):
-            for s in range(r + 1):
-                for c in range(s):
-                    for i in range(count):
-                        chol[r, s, i] -= chol[r, c, i] * chol[s, c, i]
-                for i in range(count):
-                    chol[r, s, i] = math.sqrt(chol[r, s, i]) if r == s else chol[r, s, i] / chol[s, s, i]
-        for r in range(rank):
-            for c in range(r):
-                for i in range(count):
-                    white[r, i] -= chol[r, c, i] * white[c, i]
+                chol[r, s, i] = math.sqrt(chol[r, s, i]) if r == s else chol[r, s, i] / chol[s, s, i]
+    for r in range(rank):
+        for c in range(r):
             for i in range(count):
-                white[r, i] /= chol[r, r, i]
-        # Columns of C⁻¹, which are the rows of its transposed: zero before the diagonal.
-        for r in range(rank):
-            for a in range(rank):
-                inverse[r, a] = 0.0
-            for i in range(count):
-                inverse[r, r, i] = 1.0 / chol[r, r, i]
-            for a in range(r + 1, rank):
-                for c in range(r, a):
-                    for i in range(count):
-                        inverse[r, a, i] -= chol[a, c, i] * inverse[r, c, i]
+                white[r, i] -= chol[r, c, i] * white[c, i]
+        for i in range(count):
+            white[r, i] /= chol[r, r, i]
+    # Columns of C⁻¹, which are the rows of its transposed: zero before the diagonal.
+    for r in range(rank):
+        for a in range(rank):
+            inverse[r, a] = 0.0
+        for i in range(count):
+            inverse[r, r, i] = 1.0 / chol[r, r, i]
+        for a in range(r + 1, rank):
+            for c in range(r, a):
                 for i in range(count):
-                    inverse[r, a, i] /= chol[a, a, i]
-        squared[start : start + count] = log_det[start : start + count] = 0.0
-        for r in range(rank):
-            lane[:] = 0.0
-            for c in range(r, rank):
-                for i in range(count):
-                    lane[i] += inverse[r, c, i] * white[c, i]
+                    inverse[r, a, i] -= chol[a, c, i] * inverse[r, c, i]
             for i in range(count):
-                mean[start + i, r] = lane[i]
-                squared[start + i] += white[r, i] * white[r, i]
-                log_det[start + i] += 2.0 * math.log(chol[r, r, i])
-                for c in range(rank):
-                    root[start + i, r, c] = inverse[r, c, i]
+                inverse[r, a, i] /= chol[a, a, i]
+    squared[start : start + count] = log_det[start : start + count] = 0.0
+    for r in range(rank):
+        lane[:] = 0.0
+        for c in range(r, rank):
+            for i in range(count):
+                lane[i] += inverse[r, c, i] * white[c, i]
+        for i in range(count):
+            mean[start + i, r] = lane[i]
+            squared[start + i] += white[r, i] * white[r, i]
+            log_det[start + i] += 2.0 * math.log(chol[r, r, i])
+            for c in range(rank):
+                root[start + i, r, c] = inverse[r, c, i]
+
+
+@njit(void(int64, *_REFINE), parallel=True, cache=True, error_model="numpy")
+def _refine_blocks(one, info, vector, root_prior, mean, root, squared, log_det):
+    for block in prange((len(info) + BLOCK - 1) // BLOCK):
+        _refine_at(one)(int64(block), info, vector, root_prior, mean, root, squared, log_det)
+
+
+@njit(void(int64, *_REFINE), cache=True, error_model="numpy")
+def _refine_in_turn(one, info, vector, root_prior, mean, root, squared, log_det):
+    for block in range((len(info) + BLOCK - 1) // BLOCK):
+        _refine_at(one)(block, info, vector, root_prior, mean, root, squared, log_det)
+
+
+refine = partial(_refine_blocks, _refine_block.address)
+refine_alone = partial(_refine_in_turn, _refine_block.address)
 
 
 @njit(void(CUBE, MATRIX, CUBE, MATRIX, VECTOR), cache=True, error_model="numpy")

@@ -25,6 +25,7 @@ from rbpf.kernels.signature import (
     MATRIX,
     VECTOR,
     kernel_at,
+    observation_kernel,
     part_of,
 )
 
@@ -229,6 +230,26 @@ def _update_in_turn(one, fused, records, targets, observed, sizes, log_density):
 
 update = partial(_update_blocks, _update_block.address)
 update_alone = partial(_update_in_turn, _update_block.address)
+
+
+@observation_kernel
+def given_rows(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """Hands on rows that were linearised before: of each observation p times (ν, ∂/∂state, ∂/∂landmark) in `state` (F, BLOCK).
+
+    The `z` of an observation says where its rows begin, params how many columns ∂/∂state has; the others are zero.
+    """
+    row, by_state = int(z[0]), int(params[0])
+    for a in range(nu.shape[0]):
+        for i in range(n):
+            nu[a, i] = state[row, i]
+        for e in range(by_state):
+            for i in range(n):
+                jac_state[a, e, i] = state[row + 1 + e, i]
+        row += 1 + by_state
+        for e in range(jac_landmark.shape[1]):
+            for i in range(n):
+                jac_landmark[a, e, i] = state[row + e, i]
+        row += jac_landmark.shape[1]
 
 
 @njit(cache=True, error_model="numpy")
