@@ -230,11 +230,11 @@ class Filter:
             ]
 
         # Sample one state for each descendant from its parent's Gaussian, and update what is marginalised.
-        parents = np.arange(self.n) if ancestors is None else ancestors
+        inherited = proposed if ancestors is None else proposed.take(ancestors)
         balance = None
         if self.consolidation is not None:
             balance = weights, self.space.local(prior.base[0], prior.base)
-        whitened, log_ratio = proposed.sample(parents, self.rng, balance)
+        whitened, log_ratio = inherited.sample(self.n, self.rng, balance)
         increment = prior.moved(whitened)
         state = prior.at(increment)
         densities = self.marginals.correct(state, increment, groups)
@@ -243,9 +243,8 @@ class Filter:
         log_w2 = densities.after_sampling
         if proposal.exact:
             # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
-            log_w1 = take(proposed.log_w1, parents)
             log_w2 = densities.all + log_ratio
-            np.subtract(log_w2, log_w1, out=log_w2, where=log_w1 != -np.inf)
+            np.subtract(log_w2, inherited.log_w1, out=log_w2, where=inherited.log_w1 != -np.inf)
         log_before = log_weights
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)

@@ -180,21 +180,29 @@ class Proposed:
     def _is_prior(self) -> bool:
         return len(self.root) == 1 and not self.mean.any() and np.array_equal(self.root[0], np.eye(self.root.shape[2]))
 
+    def take(self, ancestors: Int[np.ndarray, " N"]) -> "Proposed":
+        """What descendants are sampled from, that of their parents, with the weight of these."""
+        if len(self.root) == len(self.mean) == len(self.log_w1) == 1:
+            return self
+        return Proposed(take(self.mean, ancestors), take(self.root, ancestors), take(self.log_w1, ancestors))
+
     def sample(
         self,
-        ancestors: Int[np.ndarray, " M"],
+        n: int,
         rng: np.random.Generator,
         balance: tuple[Float[np.ndarray, " M"], Float[np.ndarray, "M d"]] | None = None,
     ) -> tuple[Float[np.ndarray, "M r"], Float[np.ndarray, " #M"]]:
-        """One u per descendant (N, r), and log p(u) − log q(u) (N or 1,); `balanced` by weights and what is apart already."""
-        noise = rng.standard_normal((ancestors.size, self.mean.shape[1]))
+        """One u for each of n particles (n, r), and log p(u) − log q(u) (n or 1,).
+
+        `balanced` by their weights and by what they differ by already, where that is given.
+        """
+        noise = rng.standard_normal((n, self.mean.shape[1]))
         if balance is not None:
             noise = balanced(noise, *balance)
         if self._is_prior:
             return noise, np.zeros(1)
-        root = take(self.root, ancestors)
-        u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
-        log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        u = self.mean + np.einsum("nab,nb->na", self.root, noise)
+        log_root = np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1)
         return u, 0.5 * (noise * noise - u * u).sum(axis=1) + log_root
 
 

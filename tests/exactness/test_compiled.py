@@ -9,6 +9,7 @@ from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahal
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import NEW, NULL, Observations
 from rbpf.core.proposals import refined
+from rbpf.kernels import signature
 from rbpf.kernels.signature import BLOCK
 from rbpf.lie import SE2, SE3
 from rbpf.maps import rows
@@ -90,7 +91,7 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
 @pytest.mark.parametrize("kind", ["shared", "per particle"])
 @every_sensor
 def test_particles_taken_in_parts_are_those_taken_together(space, which, kind, rng, monkeypatch):
-    """In NumPy, and where a model without a kernel hands its rows to the compiled drivers."""
+    """In NumPy, and where a model without a kernel hands its rows to the compiled drivers, on one thread and on several."""
     scene = Scene.random(space, rng, n=PARTICLES, k=6)
     group = with_outliers(
         scene.observe(sensors(space, rng)[which], associations(kind, rng), likelihood=GaussianWithOutliers(0.05, 300.0))
@@ -100,6 +101,7 @@ def test_particles_taken_in_parts_are_those_taken_together(space, which, kind, r
     found = []
     for pairs, compiled in ((10**9, False), (64, False), (10**9, True), (64, True)):
         monkeypatch.setattr(rows, "PAIRS_AT_ONCE", pairs)
+        monkeypatch.setattr(signature, "PAIRS_PER_THREAD", pairs // 64)
         held = scene.map(compiled)
         terms = held.information(scene.state, [group], prior)
         densities = held.correct(scene.state, np.zeros((PARTICLES, space.dim)), [group])
