@@ -109,8 +109,8 @@ class Lineage:
             nodes = np.flatnonzero(self._nodes[:, GENERATION] == generation)
             nodes = nodes[np.argsort(self._nodes[nodes, ROW])]
         # A node that died is free, or serves a later generation.
-        nodes = self._members[generation] = nodes[self._nodes[nodes, GENERATION] == generation]
-        alive = self._alive[generation] = self._nodes[nodes, ROW]
+        self._members[generation], alive = forest.survivors(self._nodes, nodes, generation)
+        self._alive[generation] = alive
         return alive
 
     def due(self) -> list[int]:

@@ -62,6 +62,17 @@ def rows_at(nodes, leaves, wanted, found, stamp, mark):
     return out
 
 
+@njit(types.UniTuple(INDICES, 2)(INDEX_MATRIX, INDICES, int64), cache=True)
+def survivors(nodes, members, wanted):
+    """Of the nodes that generation `wanted` had, those that serve it still, and the rows of these."""
+    held, rows, count = np.empty(members.size, np.int64), np.empty(members.size, np.int64), 0
+    for node in members:
+        if nodes[node, GENERATION] == wanted:
+            held[count], rows[count] = node, nodes[node, ROW]
+            count += 1
+    return held[:count].copy(), rows[:count].copy()
+
+
 @njit(int64(INDEX_MATRIX, INDICES, int64, INDICES, _FLAGS, INDICES, int64), cache=True)
 def splice(nodes, free, n_free, leaves, needed, stamp, mark):
     """Removes nodes with a single child that are not needed themselves; returns the free-list's length."""

@@ -127,4 +127,6 @@ def test_a_comb_counts_its_teeth(rng):
 
 def test_the_forest_is_compiled_as_it_is_loaded():
     """Setting up filters nothing for long enough to call it: a user's first run would be told of compiling again."""
-    assert not any(function._can_compile for function in (forest.advance, forest.rows_at, forest.splice))
+    assert not any(
+        function._can_compile for function in (forest.advance, forest.rows_at, forest.splice, forest.survivors)
+    )
