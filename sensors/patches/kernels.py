@@ -339,23 +339,26 @@ def interpolate(area, x, y, window):
             window[j, i] = e * lines[j, i] + f * lines[j + 1, i] + g * lines[j + 2, i] + h * lines[j + 3, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"reassoc"})
 def _centre(window, w):
-    """Fills w with the inside of the window without mean and with unit norm; the norm it had."""
-    size = w.shape[0]
+    """Fills w with the inside of the window without mean and with unit norm; the norm it had.
+
+    All pixels are one run, of which many are added at a time.
+    """
+    size, inside = w.shape[0], w.reshape(w.size)
+    for j in range(size):
+        for i in range(size):
+            w[j, i] = window[j + 1, i + 1]
     mean, square = 0.0, 0.0
-    for j in range(size):
-        for i in range(size):
-            mean += window[j + 1, i + 1]
-    mean /= size * size
-    for j in range(size):
-        for i in range(size):
-            w[j, i] = window[j + 1, i + 1] - mean
-            square += w[j, i] * w[j, i]
+    for k in range(inside.size):
+        mean += inside[k]
+    mean /= inside.size
+    for k in range(inside.size):
+        inside[k] = inside[k] - mean
+        square += inside[k] * inside[k]
     norm = math.sqrt(square)
-    for j in range(size):
-        for i in range(size):
-            w[j, i] /= norm
+    for k in range(inside.size):
+        inside[k] /= norm
     return norm
 
 
