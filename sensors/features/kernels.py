@@ -68,13 +68,15 @@ def least_eigenvalues(image, px, window, out):
 @njit(void(_PIXELS, VECTOR, MATRIX, types.Array(boolean, 1, "C")), cache=True)
 def highest(px, score, rated, out):
     """Whether none of the eight neighbours of pixels (K, 2) is one of them and scores higher; `rated` (H, W) is −∞."""
+    along, width = rated.reshape(rated.size), rated.shape[1]
     for k in range(px.shape[0]):
-        rated[px[k, 1], px[k, 0]] = score[k]
+        along[px[k, 1] * width + px[k, 0]] = score[k]
     for k in range(px.shape[0]):
-        u, v = px[k]
+        first = (px[k, 1] - 1) * width + px[k, 0] - 1
         best = score[k]
-        for row in range(v - 1, v + 2):
-            best = max(best, rated[row, u - 1], rated[row, u], rated[row, u + 1])
+        for row in range(3):
+            part = along[first + row * width : first + row * width + 3]
+            best = max(best, part[0], part[1], part[2])
         out[k] = score[k] == best
 
 
