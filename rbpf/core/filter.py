@@ -488,10 +488,12 @@ def told(belief: Belief, sensor: Sensor) -> Belief:
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
     """A transition as the kernels take it. Raises InputError: mean or noise factor has the wrong shape, or is not finite."""
-    given = {name: array for name, array in vars(transition).items() if array is not None}
-    checked = {name: numbers(array, f"{what}: {name}") for name, array in given.items()}
-    if any(checked[name] is not array for name, array in given.items()):
-        transition = Transition(**checked)
+    changed = {}
+    for name, array in vars(transition).items():
+        if array is not None and (checked := numbers(array, f"{what}: {name}")) is not array:
+            changed[name] = checked
+    if changed:
+        transition = replace(transition, **changed)
     mean, factor, n = transition.mean, transition.noise_factor, state.shape[0]
     rows = space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
     fits = factor.ndim == 3 and factor.shape[0] in (1, n) and factor.shape[1] == rows
