@@ -4,7 +4,9 @@
     1,517.426,320.498,-0.25433,0.12486,1.60044,0.0365
 
 sigma_m is the standard deviation of the place as a whole, the root of its covariance's trace: the root mean square
-distance from where the point truly is. The columns may come in any order, and others beside them are passed over.
+distance from where the point truly is. A further column across_m is the standard deviation of the place along each axis
+across the line of sight of the first image; who surveyed points to alike in all directions gives sigma_m / √3. The columns
+may come in any order, and others beside them are passed over.
 Pixel centres are at whole numbers.
 """
 
@@ -14,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, require
+from rbpf.errors import InputError
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted
 
 _SCHEMA = {
@@ -22,7 +25,8 @@ _SCHEMA = {
     "positions": numbers("M", 3),
     "std_m": numbers("M", least=0.0),
 }
-COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
+COLUMNS, ACROSS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m"), "across_m"
+ROUNDED = 0.01  #: Numbers are rounded in a table: a variance may be too large by this fraction.
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,17 @@ class KnownPixels:
     #: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground truth knows
     #: nothing.
     own_frame: bool = False
+    #: (M,) standard deviation along each axis across the line of sight, m; None: nothing but what the first image says.
+    across_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Checks what is given: the points may be made by hand."""
-        require("the known points", vars(self), _SCHEMA)
+        given = {} if self.across_m is None else {"across_m": numbers("M", least=0.0)}
+        require("the known points", vars(self), _SCHEMA | given)
+        if self.across_m is not None and (2.0 * self.across_m**2 > self.std_m**2 * (1.0 + ROUNDED)).any():
+            raise InputError(
+                "the known points: across_m, along two axes, is more than the standard deviation as a whole"
+            )
 
 
 def read_known_points(path: str | Path) -> KnownPixels:
@@ -54,15 +65,21 @@ def read_known_points(path: str | Path) -> KnownPixels:
     rows = numbered_lines(path, f"a table with the columns {', '.join(COLUMNS)}")
     line, header = rows[0] if rows else (1, "")
     names = [name.strip() for name in header.split(",")]
-    if any(names.count(column) != 1 for column in COLUMNS):
-        expected = f"expected a header with the columns {','.join(COLUMNS)}, each once"
+    columns = (*COLUMNS, ACROSS) if ACROSS in names else COLUMNS
+    if any(names.count(column) != 1 for column in columns):
+        expected = f"expected a header with the columns {','.join(columns)}, each once"
         raise line_error(path, line, f"{expected}, found {quoted(header)}")
     picked = []
     for i, row in rows[1:]:
         fields = row.split(",")
         if len(fields) != len(names):
             raise line_error(path, i, f"expected {len(names)} columns as in the header, found {len(fields)}")
-        picked.append((i, ",".join(fields[names.index(column)] for column in COLUMNS)))
-    table = parse_table(path, COLUMNS, picked, ",")
+        picked.append((i, ",".join(fields[names.index(column)] for column in columns)))
+    table = parse_table(path, columns, picked, ",")
     table.require(table["sigma_m"] >= 0.0, "sigma_m", "zero or positive")
-    return KnownPixels(table.names("id"), table.block("u_px", "v_px"), table.block("x_m", "z_m"), table["sigma_m"])
+    across = table[ACROSS] if ACROSS in columns else None
+    if across is not None:
+        fits = (across >= 0.0) & (2.0 * across**2 <= table["sigma_m"] ** 2 * (1.0 + ROUNDED))
+        table.require(fits, ACROSS, "from 0 to sigma_m / √2")
+    places = table.names("id"), table.block("u_px", "v_px"), table.block("x_m", "z_m"), table["sigma_m"]
+    return KnownPixels(*places, across_m=across)

@@ -270,7 +270,10 @@ def test_known_points(tmp_path):
     assert points.px.tolist() == [[1.5, 2.5], [4, 5]]
     assert points.positions.tolist() == [[1, 2, 3], [-1, -2, -3]]
     assert points.std_m.tolist() == [0.1, 0.0]
-    text = "# corners\r\nnote,sigma_m,v_px,u_px,z_m,y_m,x_m,id\r\n\r\n# first\r\ndoor,0.1,2,1,5,4,3,9\r\n"
+    assert points.across_m is None
+    text = "# corners\r\nnote,across_m,sigma_m,v_px,u_px,z_m,y_m,x_m,id\r\n\r\n# 1\r\ndoor,0.05,0.1,2,1,5,4,3,9\r\n"
     points = read_known_points(str(write(tmp_path, {"known_points.csv": text}) / "known_points.csv"))
     assert (points.names.tolist(), points.px.tolist(), points.std_m.tolist()) == ([9], [[1, 2]], [0.1])
-    assert points.positions.tolist() == [[3, 4, 5]]
+    assert points.positions.tolist() == [[3, 4, 5]] and points.across_m.tolist() == [0.05]
+    with pytest.raises(InputError, match=re.escape("expected across_m to be from 0 to sigma_m / √2, found 0.09")):
+        read_known_points(write(tmp_path, {"known_points.csv": text.replace("0.05", "0.09")}) / "known_points.csv")

@@ -72,6 +72,10 @@ def test_what_is_given_of_a_point_is_uncertain_along_the_line_of_sight():
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     along = np.sqrt(np.einsum("ma,mab,mb->m", line, located.cov, line))
     np.testing.assert_allclose(along, given.std_m * np.sqrt(1.0 - 2.0 * TRIANGULATED**2), rtol=1e-6)
+    # Or as uncertain across it as is given: here alike in all directions.
+    given = replace(given, across_m=given.std_m * ISOTROPIC)
+    cov = KnownStart.from_pixels(CAMERA, given, noise_px=1.0).points.cov
+    np.testing.assert_allclose(cov, (given.std_m**2 / 3.0)[:, None, None] * np.eye(3), atol=1e-12)
 
 
 def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sight_too():

@@ -26,6 +26,7 @@ from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_r
 from rbpf.runs.files import OnDone, prepare_folder, write_csv, write_text
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import camera_text
+from rbpf.sensors.readers.known_points import ACROSS, COLUMNS
 from rbpf.validation.simulation.paths import Wave
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
@@ -328,10 +329,11 @@ def simulate_images(
         write_csv(place / "data.csv", TRUTH_COLUMNS, ([stamp, *(f"{x:.12g}" for x in row)] for stamp, row in rows))
         if imaging.known:
             px, positions = known_corners(scene, renderer, left, imaging.known)
-            positions = positions + imaging.known_std_m / np.sqrt(3.0) * rng.standard_normal(positions.shape)
-            header, std = ["id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m"], f"{imaging.known_std_m:g}"
+            per_axis = imaging.known_std_m / np.sqrt(3.0)
+            positions = positions + per_axis * rng.standard_normal(positions.shape)
+            header, std = [*COLUMNS, ACROSS], (f"{imaging.known_std_m:g}", f"{per_axis:.4g}")
             texts = np.hstack([np.char.mod("%.4f", px), np.char.mod("%.6f", positions)]).tolist()
-            write_csv(partial / "known_points.csv", header, ([k, *row, std] for k, row in enumerate(texts, start=1)))
+            write_csv(partial / "known_points.csv", header, ([k, *row, *std] for k, row in enumerate(texts, start=1)))
         if scene.boards:
             # Poses as [qx, qy, qz, qw, x, y, z].
             boards = [vars(board) | {"world_from_board": pose.tolist()} for board, pose in scene.boards]

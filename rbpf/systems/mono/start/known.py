@@ -86,8 +86,8 @@ class KnownStart:
 
         What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
         standard deviation is taken. Across it the first image has the word: where even the best camera leaves residuals
-        beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Their
-        covariances have the traces std_m².
+        beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Where it is
+        given how uncertain they are across it, they are at least so. Their covariances have the traces std_m².
         """
         pose = resect_known(camera, known, noise_px)
         local = SE3.inverse_transform(pose, known.positions)
@@ -96,10 +96,12 @@ class KnownStart:
         is_noise = squared <= chi_square_quantile(NOISE_PROBABILITY, dof) * noise_px**2
         excess = 0.0 if is_noise else squared / dof - noise_px**2
         seen = excess * (local[:, 2] / camera.fx) ** 2
-        var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[:, None, None]
+        least = TRIANGULATED * known.std_m if known.across_m is None else known.across_m
+        most = np.maximum(ISOTROPIC * known.std_m, least)
+        var_across = np.clip(seen, least**2, most**2)[:, None, None]
         line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]
         along = line @ np.swapaxes(line, -1, -2)
-        var_along = known.std_m[:, None, None] ** 2 - 2.0 * var_across
+        var_along = np.maximum(known.std_m[:, None, None] ** 2 - 2.0 * var_across, 0.0)
         cov = var_along * along + var_across * (np.eye(3) - along)
         points = KnownPoints(np.arange(known.names.size), known.positions, cov)
         noise = np.tile(noise_px**2 * np.eye(2), (known.names.size, 1, 1))
