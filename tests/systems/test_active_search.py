@@ -12,9 +12,9 @@ from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.patches.search import cut
+from rbpf.sensors.patches.search import cut, warp
 from rbpf.sensors.readers import open_images, read_known_points
-from rbpf.systems.mono.active_search import CAUCHY_SCALE, ROUNDS, RobustMotionGate, SearchResult
+from rbpf.systems.mono.active_search import CAUCHY_SCALE, ROUNDS, ActiveSearch, RobustMotionGate, SearchResult
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -23,7 +23,7 @@ from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems.mono_logs import SMALL
-from tests.systems.plane_sequences import CAMERA, known_points, on_plane, sequence, shown_at, texture, view
+from tests.systems.plane_sequences import CAMERA, TILT, known_points, on_plane, sequence, shown_at, texture, view
 
 SEARCH = MonoConfig().search
 ALL = np.ones(20, dtype=bool)
@@ -91,6 +91,30 @@ def test_appearances_are_renewed_when_they_have_changed(wall):
         renewed.append(int(changed.sum()))
     assert renewed[0] == 0 and min(renewed[1], renewed[3]) > 10
     assert (sensor.table.first_pose == around(0.0)).all()
+
+
+def test_how_a_patch_lies_in_space_is_learnt_from_how_it_looks(wall):
+    """The wall's slope, beside a plane that faces the camera; a template that has it is found where the feature is."""
+    sensor, points = wall
+    search = ActiveSearch(sensor.features, sensor.table, replace(SEARCH, planes="learnt"))
+    table, rows = sensor.table, np.arange(len(points))
+    ray, normal = points / points[:, 2:], np.array([0.3, np.tan(TILT), -1.0])
+    expected = normal[:2] / (ray @ normal)[:, None] - ray[:, :2] / np.square(ray).sum(axis=1, keepdims=True)
+
+    def found(degrees: float, learn: bool) -> np.ndarray:
+        pose = around(degrees)
+        image, px = view(texture(), pose), CAMERA.project(SE3.inverse_transform(pose, points))
+        templates = warp(table.first_patch, search.first_affines(rows, pose), 11)
+        places, _, accepted, _ = search.match(image, templates, px, np.tile(np.eye(2), (len(px), 1, 1)))
+        if learn:
+            search._learn_planes(image, pose, rows[accepted], places[accepted])
+        return np.hypot(*(places - px).T)
+
+    facing = found(20.0, learn=False)
+    for degrees in np.arange(2.0, 20.0, 2.0):
+        found(degrees, learn=True)
+    assert np.median(np.abs(table.slopes(rows) - expected)) < 0.1 * np.median(np.abs(expected))
+    assert np.median(found(20.0, learn=False)) < 0.3 * np.median(facing)
 
 
 # The gate: the motion that most matches agree on.

@@ -15,10 +15,10 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.models import Belief
 from rbpf.kernels.dense import fit_robustly
-from rbpf.sensors.patches.search import search, warp
+from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.feature_table import FeatureTable, patch_affines
+from rbpf.systems.mono.feature_table import FeatureTable, parallax, patch_affines, tilted
 
 CELLS = 6
 """The image is divided into so many columns and rows, from which features are chosen in turn."""
@@ -31,6 +31,18 @@ MIN_AGREEING = 4
 
 WIDEST = 2.0
 """An ellipse larger than so many times what is searched of it is hardly searched at all."""
+
+PLANE_HALF_PX = 7
+"""From so far around a feature how its patch lies in space is learnt; what is half as far counts half."""
+
+SHOWN_PX = 0.1
+"""It is learnt as long as what is not known of it moves the patch's border by more, in standard deviations."""
+
+ROUNDING = 1.0 / 6.0
+"""Variance of the difference of two grey levels that were rounded."""
+
+_OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-PLANE_HALF_PX, PLANE_HALF_PX + 1.0)]), axis=-1)
+_WEIGHTS = 0.5 ** (np.square(2.0 * _OFFSETS / PLANE_HALF_PX).sum(axis=-1)).ravel()
 
 ROUNDS = 10
 CAUCHY_SCALE = 2.0
@@ -140,23 +152,30 @@ class ActiveSearch:
         # Each is looked for in the ellipse where all particles together expect it, as it looked at first.
         which, mean, cov = self.features.project(belief, rows)
         rows, cov = rows[which], cov + self.noise
-        templates = self.templates(rows, self.table.first_patch, self.table.first_pose, pose)
+        affines = self.first_affines(rows, pose)
+        templates = warp(self.table.first_patch[rows], affines, self.config.template_px)
         matches = self.match(image, templates, mean, cov)
         result = SearchResult(rows, mean, cov, *matches, in_view, seconds_choosing)
 
-        # What was not found is looked for as it looked last. How a patch lies in space is not known: taken to face the
-        # first camera it is known again up to about 25° from there.
+        # What was not found is looked for as it looked last. As long as it is not known how a patch lies in space it is taken
+        # to face the first camera, and known again up to about 25° from there.
         changed = (self.table.last_pose[rows] != self.table.first_pose[rows]).any(axis=1)
         missed = np.flatnonzero(~result.found & changed)
         if missed.size:
-            later = self.templates(rows[missed], self.table.last_patch, self.table.last_pose, pose)
+            table, again = self.table, rows[missed]
+            affines = patch_affines(self.features.camera, table.position[again], table.last_pose[again], pose)
+            later = warp(table.last_patch[again], affines, self.config.template_px)
             px, score, found, ambiguous = self.match(image, later, mean[missed], cov[missed])
             better = score > result.score[missed]
             chosen = missed[better]
             templates[chosen] = later[better]
             result.px[chosen], result.score[chosen] = px[better], score[better]
             result.found[chosen], result.ambiguous[chosen] = found[better], ambiguous[better]
-        return self._agreeing(image, belief, templates, result) if result.found.any() else result
+        if result.found.any():
+            result = self._agreeing(image, belief, templates, result)
+            if self.config.planes == "learnt":
+                self._learn_planes(image, pose, result.features[result.found], result.px[result.found])
+        return result
 
     def choose(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (K,) of features worth looking for from a pose, spread over the image; places (V, 2) of all in view."""
@@ -186,10 +205,14 @@ class ActiveSearch:
         count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
         return rows[:count], px[:count]
 
-    def templates(self, rows: np.ndarray, patches: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Templates of features (K,) as they look from a pose, of patches (F, S, S) that were seen from poses (F, 7)."""
-        affines = patch_affines(self.features.camera, self.table.position[rows], poses[rows], pose)
-        return warp(patches[rows], affines, self.config.template_px)
+    def first_affines(self, rows: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """∂(pixel in the first patch)/∂(pixel from a pose) (K, 2, 2) of features (K,)."""
+        table, camera = self.table, self.features.camera
+        places = (camera, table.position[rows], table.first_pose[rows], pose)
+        facing = patch_affines(*places)
+        if self.config.planes == "facing":
+            return facing
+        return tilted(facing, parallax(*places), table.slopes(rows) / camera.params[:2])
 
     def match(
         self, image: np.ndarray, templates: np.ndarray, mean: np.ndarray, cov: np.ndarray
@@ -224,6 +247,46 @@ class ActiveSearch:
             px, score, again, _ = self.match(image, templates[missed], mean, cov)
             result.px[missed], result.score[missed], found[missed] = px, score, again
         return result
+
+    def _learn_planes(self, image: np.ndarray, pose: np.ndarray, rows: np.ndarray, px: np.ndarray) -> None:
+        """How the patches of features (K,) that were found at px (K, 2) lie in space, from how they look there.
+
+        A step of Gauss and Newton for the plane's slope, with place, gain and offset of the patch, which are not kept
+        (N. Molton, A. Davison and I. Reid, Locally planar patch features, 2004).
+        """
+        table, focal = self.table, self.features.camera.params[:2]
+        affines = self.first_affines(rows, pose)
+        along = parallax(self.features.camera, table.position[rows], table.first_pose[rows], pose)
+        squared, slopes = np.square(along).sum(axis=1), table.slopes(rows)
+        least = np.linalg.eigvalsh(table.told[rows, :, :2])[:, 0] + 1.0
+        tells = PLANE_HALF_PX**2 * squared > SHOWN_PX**2 * focal.mean() ** 2 * least
+        windows = {k: cut(image, px[k], PLANE_HALF_PX) for k in np.flatnonzero(tells).tolist()}
+        chosen = [k for k, window in windows.items() if window is not None]
+        if not chosen:
+            return
+        rows, affines, along, squared, slopes = (part[chosen] for part in (rows, affines, along, squared, slopes))
+        wide = warp(table.first_patch[rows], affines, 2 * PLANE_HALF_PX + 3).astype(float)
+        inner = (slice(None), slice(1, -1), slice(1, -1))
+        expected, down, across = wide[inner], *(part[inner] for part in np.gradient(wide, axis=(1, 2)))
+        shift = across * along[:, 0, None, None] + down * along[:, 1, None, None]
+        by_slope = -shift[..., None] * (_OFFSETS @ np.swapaxes(affines, 1, 2)[:, None]) / focal
+        columns = [by_slope[..., 0], by_slope[..., 1], across, down, np.ones_like(expected), expected]
+        by_all = np.stack(columns, axis=-1).reshape(rows.size, -1, 6)
+        error = (np.array([windows[k] for k in chosen], dtype=float) - expected).reshape(rows.size, -1)
+        usable = np.isfinite(by_all).all(axis=(1, 2))
+        rows, by_all, error, squared, slopes = (part[usable] for part in (rows, by_all, error, squared, slopes))
+        weighted = np.swapaxes(_WEIGHTS[:, None] * by_all, 1, 2)
+        normal, right = weighted @ by_all, weighted @ error[..., None]
+        # Where grey levels change along one line only, the place along it is not told.
+        normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        left = (error[..., None] - by_all @ np.linalg.solve(normal, right))[..., 0]
+        variance = np.square(left) @ _WEIGHTS / _WEIGHTS.sum() + ROUNDING
+        others = normal[:, :2, 2:] @ np.linalg.inv(normal[:, 2:, 2:])
+        told = (normal[:, :2, :2] - others @ normal[:, 2:, :2]) / variance[:, None, None]
+        vector = (right[:, :2] - others @ right[:, 2:]) / variance[:, None, None] + told @ slopes[..., None]
+        table.told[rows] += np.concatenate([told, vector], axis=2)
+        total, greatest = table.parallax[rows].T
+        table.parallax[rows] = np.column_stack([total + squared, np.maximum(greatest, squared)])
 
     def _innovations(
         self, belief: Belief, rows: np.ndarray, px: np.ndarray

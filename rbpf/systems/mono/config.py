@@ -78,6 +78,8 @@ class SearchConfig(Ranged):
     measurements: Count = 25  #: features looked for in a frame at most.
     noise_px: Positive = 1.0  #: standard deviation of a found place, per axis.
     template_px: Annotated[int, Range(ge=3, le=21, odd=True)] = 11  #: side of the patch that is compared, odd.
+    #: how a patch lies in space: it faces the camera that saw it first; or whatever its looks in later views say (learnt).
+    planes: Literal["facing", "learnt"] = "facing"
     #: least normalised cross-correlation of a match.
     min_correlation: Annotated[float, Range(ge=-1.0, le=1.0), Formerly("accept")] = 0.8
     #: size of the ellipse that is searched, in standard deviations.

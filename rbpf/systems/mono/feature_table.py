@@ -31,6 +31,8 @@ _COLUMNS = {
     "first_pose": poses("features"),
     "last_pose": poses("features"),
     "position": numbers("features", 4),
+    "told": numbers("features", 2, 3),
+    "parallax": numbers("features", 2, least=0.0),
     "attempts": integers("features", least=0),
     "found": integers("features", least=0),
     "missed": integers("features", least=0),
@@ -49,6 +51,9 @@ class FeatureTable:
     first_pose: np.ndarray  #: (F, 7) world_from_camera of the first one, in the heaviest particle's world.
     last_pose: np.ndarray  #: (F, 7) likewise of the later one.
     position: np.ndarray  #: (F, 4) homogeneous point in the heaviest particle's world, when it was last observed.
+    #: (F, 2, 3) what views told of its first patch's `slopes`: the sums of their information, and of that times the slope.
+    told: np.ndarray
+    parallax: np.ndarray  #: (F, 2) of these views: the sum of the squares, and the greatest square, see `parallax`.
     attempts: np.ndarray  #: (F,) times looked for.
     found: np.ndarray  #: (F,) times found.
     missed: np.ndarray  #: (F,) times not found in a row.
@@ -109,13 +114,26 @@ class FeatureTable:
         patches = np.where(later[:, None, None], self.last_patch[rows], self.first_patch[rows])
         return patches, np.where(later[:, None], last, first)
 
+    def slopes(self, rows: np.ndarray) -> np.ndarray:
+        """How the first patches of features (k,) lie in space, beside ones that face their camera: slopes (k, 2).
+
+        Of the logarithm of the inverse depth by normalised coordinates, which is linear in a plane; 1 is a plane at 45°,
+        and the prior's standard deviation. Of the noise that views compare half is the first patch's, the same in all of
+        them: n views say 2 n / (1 + n) times what one does.
+        """
+        told, (total, greatest) = self.told[rows], self.parallax[rows].T
+        told = 2.0 / (1.0 + total / np.maximum(greatest, np.finfo(float).tiny))[:, None, None] * told
+        return np.asarray(np.linalg.solve(told[:, :, :2] + np.eye(2), told[:, :, 2:])[..., 0])
+
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         return {f"features/{name}": getattr(self, name) for name in _COLUMNS}
 
     def restore(self, arrays: dict[str, np.ndarray], members: int) -> None:
         """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.checkpoint.read`."""
-        self._room = read(arrays, _COLUMNS, "features/", members=members)
+        count = len(arrays.get("features/alive", ()))  # before planes were learnt nothing was known of them
+        given = {"features/told": np.zeros((count, 2, 3)), "features/parallax": np.zeros((count, 2))} | arrays
+        self._room = read(given, _COLUMNS, "features/", members=members)
         self._use(len(self._room["alive"]))
 
     def _use(self, count: int) -> None:
@@ -134,7 +152,8 @@ def patch_affines(
 ) -> np.ndarray:
     """∂(pixel in the patch's image)/∂(pixel now) (K, 2, 2) of patches that face the camera that saw them (E06 §4.1).
 
-    They are at homogeneous world points (K, 4), and were seen from poses (K, 7); now the camera is at (7,).
+    They are at homogeneous world points (K, 4), and were seen from poses (K, 7); now the camera is at (7,). `tilted` has
+    those of others.
     """
     point = position[:, :3] / np.maximum(position[:, 3:], MIN_WEIGHT)
     normal = SE3.translation(first_pose) - point
@@ -149,6 +168,26 @@ def patch_affines(
     on_patch = centre + depth[..., None] * world_rays
     first = camera.project(SE3.inverse_transform(first_pose[:, None], on_patch))
     return np.stack([first[:, 0] - first[:, 1], first[:, 2] - first[:, 3]], axis=-1) / 2.0
+
+
+def parallax(
+    camera: Pinhole, position: np.ndarray, first_pose: np.ndarray, world_from_camera: np.ndarray
+) -> np.ndarray:
+    """∂(pixel now)/∂(logarithm of the inverse depth) (K, 2) along the first lines of sight; arguments as `patch_affines`."""
+    point = position[:, :3] / np.maximum(position[:, 3:], MIN_WEIGHT)
+    line = (SE3.translation(first_pose) - point) @ SE3.rotation(world_from_camera)
+    return (camera.jacobian(SE3.inverse_transform(world_from_camera, point)) @ line[..., None])[..., 0]
+
+
+def tilted(affines: np.ndarray, along: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """`patch_affines` (K, 2, 2) of patches with slopes (K, 2), by the pixel of their images, whose parallax is (K, 2).
+
+    Of two planes through a point that is seen from two places one shifts the other's picture by the parallax times how
+    their inverse depths differ: A⁻¹ = A₀⁻¹ + e gᵀ, inverted by Sherman and Morrison.
+    """
+    back, ahead = affines @ along[..., None], slope[:, None] @ affines
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(affines - back @ ahead / (1.0 + slope[:, None] @ back))
 
 
 def view_change(position: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
