@@ -259,7 +259,7 @@ def mixed_up(rows):
 
 
 def in_line(rows):
-    return [[*row[:3], str(0.1 * k), str(0.2 * k), "0.0", row[6]] for k, row in enumerate(rows)]
+    return [[*row[:3], str(0.1 * k), str(0.2 * k), "0.0", *row[6:]] for k, row in enumerate(rows)]
 
 
 def grey_about_the_second(rows, folder):
