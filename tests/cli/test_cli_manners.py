@@ -27,18 +27,6 @@ def quick(log, out, *arguments):
     return ["run", "range-bearing", str(log), "--out", str(out), "--particles", "20", "--no-batch", *arguments]
 
 
-@pytest.mark.parametrize("arguments", ["nonsense", "nonsense --help", "run nonsense --help", "simulate nonsense -h"])
-def test_a_command_that_there_is_not_is_named_even_where_help_is_asked_for(arguments, capsys):
-    assert main(arguments.split()) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and "nonsense`: there are " in err
-
-
-def test_a_slip_of_the_pen_is_told_the_nearest_command(capsys):
-    assert main(["simulate", "dsek", "--out", "x"]) == 2
-    assert "no command `rbpf simulate dsek`: did you mean desk?" in capsys.readouterr().err
-
-
 def test_json_is_one_object_on_standard_output(log, tmp_path, capsys):
     assert main(quick(log, tmp_path / "run", "--json")) == 0
     out, _ = capsys.readouterr()

@@ -23,9 +23,13 @@ from rbpf.cli.simulating import SIMULATE
         ("run mono x --known_pints=a", "has no option --known-pints: did you mean --known-points?"),
         ("run stereo x --no-vdeo", "did you mean --no-video?"),
         ("export x --xyz", "`rbpf export` has no option --xyz: there are --help, --json, --format, --out"),
+        ("simulate dsek --out x", "no command `rbpf simulate dsek`: did you mean desk?"),
+        ("nonsense", "nonsense`: there are "),
+        *((f"{words} --help", "nonsense`: there are ") for words in ("nonsense", "run nonsense", "simulate nonsense")),
     ],
 )
-def test_an_option_that_there_is_not_is_named(words, said, capsys):
+def test_an_option_or_a_command_that_there_is_not_is_named(words, said, capsys):
+    """Even where help is asked for."""
     assert main(words.split()) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("rbpf: ") and said in err and err.count("\n") == 1

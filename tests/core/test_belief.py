@@ -1,5 +1,7 @@
 """What a sensor is told before it measures, against Monte Carlo over the whole mixture."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -61,20 +63,12 @@ AHEAD_3D = np.array([[3.0, 1.0, 0.5], [2.0, -2.0, -1.0], [4.0, 0.0, 0.3]])
 
 
 @pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
-@pytest.mark.parametrize("ahead", AHEAD_2D.values(), ids=AHEAD_2D.keys())
-@pytest.mark.parametrize("model", [RangeBearing(SE2), RelativePosition(SE2)], ids=["range-bearing", "position"])
-def test_projection_in_the_plane(model, ahead, centred, rng):
-    belief, records = belief_of(prior_of(SE2, rng, centred), 2, rng, np.array(ahead))
-    check_projection(model, belief, records, rng)
-
-
-@pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
-def test_projection_in_space(centred, rng):
-    belief, records = belief_of(prior_of(SE3, rng, centred), 3, rng, AHEAD_3D)
-    check_projection(RangeBearing(SE3), belief, records, rng)
-
-
-def check_projection(model, belief: Belief, records: Records, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    ("kind", "ahead"), [*product((RangeBearing, RelativePosition), AHEAD_2D.values()), (RangeBearing, AHEAD_3D)]
+)
+def test_projections_are_those_of_draws(kind, ahead, centred, rng):
+    space, dim = (SE2, 2) if len(ahead[0]) == 2 else (SE3, 3)
+    model, (belief, records) = kind(space), belief_of(prior_of(space, rng, centred), dim, rng, np.array(ahead))
     mean, cov = belief.project(model, np.arange(K))
     state, landmark = draw(belief, records, rng)
     offset = model.residual(model.predict(state[:, None], landmark), mean)

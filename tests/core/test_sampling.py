@@ -121,15 +121,13 @@ def group(model, z):
     return [Observations(np.array([[z]]), np.array([[[STD**2]]]), model)]
 
 
+OF_SUBSTATE, OF_STATE = ([group(model, z) for z in Z] for model in (READ, First(np.eye(1))))
 CASES = {
-    "marginal": lambda rng: [marginal(rng), [group(READ, z) for z in Z]],
-    "marginal, prior": lambda rng: [marginal(rng, PriorProposal()), [group(READ, z) for z in Z]],
-    "refined": lambda rng: [sampled(JumpsSampled(), Scripted(), rng), [group(First(np.eye(1)), z) for z in Z]],
-    "drawn": lambda rng: [sampled(Drawn(), Scripted(), rng), [group(First(np.eye(1)), z) for z in Z]],
-    "drawn, prior": lambda rng: [
-        sampled(Drawn(), Scripted(), rng, PriorProposal()),
-        [group(First(np.eye(1)), z) for z in Z],
-    ],
+    "marginal": lambda rng: [marginal(rng), OF_SUBSTATE],
+    "marginal, prior": lambda rng: [marginal(rng, PriorProposal()), OF_SUBSTATE],
+    "refined": lambda rng: [sampled(JumpsSampled(), Scripted(), rng), OF_STATE],
+    "drawn": lambda rng: [sampled(Drawn(), Scripted(), rng), OF_STATE],
+    "drawn, prior": lambda rng: [sampled(Drawn(), Scripted(), rng, PriorProposal()), OF_STATE],
     "weighed": lambda rng: [sampled(Drawn(), Weights(), rng), list(Z)],
     "weighed, refined": lambda rng: [sampled(JumpsSampled(), Weights(), rng), list(Z)],
     "weighed, w1 alone": lambda rng: [sampled(Drawn(), Weights(), rng, EkfProposal(exact=False)), list(Z)],

@@ -235,14 +235,10 @@ def test_the_plane_of_the_camera_gives_no_number_and_no_error():
     assert not np.isfinite(camera.project(np.array([1.0, 0.5, 0.0]))).any()
 
 
-VIEWERS = {
-    "plain": Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5),
-    "folding": Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.42, 0.21, 0.012, -0.009, -0.06)),
-    "fisheye": Pinhole(640, 480, 220.0, 220.0, 320.0, 240.0, (-0.03, 0.02, -0.012, 0.002), "equidistant"),
-}
+FOLDING = Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, DISTORTIONS["strong"])
 
 
-@pytest.mark.parametrize("camera", VIEWERS.values(), ids=VIEWERS.keys())
+@pytest.mark.parametrize("camera", [*CAMERAS.values(), FOLDING], ids=[*CAMERAS, "folding"])
 def test_chosen_features_are_those_that_the_camera_sees_nearly_as_at_first(camera):
     rng, count, margin, least, most = np.random.default_rng(1), 4000, 8.0, 0.7, 2.0
     place = np.concatenate([rng.uniform(-3.0, 3.0, (count, 3)), np.ones((count, 1))], axis=1)

@@ -137,20 +137,20 @@ def test_the_store_holds_what_a_dictionary_would(steps):
             np.testing.assert_array_equal(descriptor, held[i])
 
 
-def test_what_a_store_refuses():
+def test_what_a_store_and_a_manager_refuse():
     store = DescriptorStore(4)
     descriptors = unit(np.random.default_rng(0), 3, 4)
     store.add(np.array([2, 5, 6]), descriptors)
-    with pytest.raises(InputError, match="must ascend"):
-        store.add(np.array([6]), descriptors[:1])
-    with pytest.raises(InputError, match="must ascend"):
-        store.add(np.array([9, 8]), descriptors[:2])
-    with pytest.raises(InputError, match=r"must be \(1, 4\)"):
-        store.add(np.array([7]), descriptors[:1, :3])
-    with pytest.raises(InputError, match="no descriptor of landmark 3"):
-        store.remove(np.array([5, 3]))
-    with pytest.raises(InputError, match=r"\(K, 4\)"):
-        store.match(np.zeros((2, 128), dtype=np.float32), LIMITS)
+    for use, what, words in (
+        (store.add, (np.array([6]), descriptors[:1]), "must ascend"),
+        (store.add, (np.array([9, 8]), descriptors[:2]), "must ascend"),
+        (store.add, (np.array([7]), descriptors[:1, :3]), r"must be \(1, 4\)"),
+        (store.remove, (np.array([5, 3]),), "no descriptor of landmark 3"),
+        (store.match, (np.zeros((2, 128), dtype=np.float32), LIMITS), r"\(K, 4\)"),
+        (LandmarkManager(NewLandmarkConfig(), SIZE).observe, (np.array([0]),), "no landmark named 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            use(*what)
     assert store.ids.tolist() == [2, 5, 6]
 
 
@@ -247,9 +247,3 @@ def test_new_keys_spread_over_the_image():
     occupied = np.repeat(elsewhere[:1], 5, axis=0) + 15.0
     crowded = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)
     assert 60 not in crowded.tolist()
-
-
-def test_what_is_refused():
-    manager = LandmarkManager(NewLandmarkConfig(), SIZE)
-    with pytest.raises(InputError, match="no landmark named 0"):
-        manager.observe(np.array([0]))

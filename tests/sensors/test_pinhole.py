@@ -136,6 +136,9 @@ class TestVisible:
         assert not camera.inside(np.array([np.nan, 10.0]))
 
 
+CAMERA = Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5)
+BENT = "the camera of a rectified stereo pair has"
+RECTIFY = "rectify the images and give the camera of the rectified ones"
 GOOD = {"width": 640, "height": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
 FOUR = "the camera's distortion must be the 4 numbers k1, k2, k3, k4, got "
 FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0 if there are four), got "
@@ -158,19 +161,18 @@ FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0
             {"distortion_model": "equidistant", "distortion": (0.0, 0.0, 0.0, float("nan"))},
             "the camera's k4 must be a finite number, got nan",
         ),
+        ((CAMERA, 0.0), "the stereo baseline must be positive, got 0.0 m"),
+        ((CAMERA, float("nan")), "the stereo baseline must be a finite number, got nan"),
+        ((FOLDING, 0.1), f"{BENT} radial-tangential distortion (-0.25, 0.0, 0.0, 0.0, 0.0): {RECTIFY}"),
+        ((FISHEYES["ideal"], 0.1), f"{BENT} equidistant distortion (0.0, 0.0, 0.0, 0.0): {RECTIFY}"),
     ],
 )
-def test_a_wrong_camera_is_refused(wrong, message):
+def test_a_wrong_camera_and_a_wrong_pair_are_refused(wrong, message):
     with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
-        Pinhole(**(GOOD | wrong))
+        RectifiedStereo(*wrong) if isinstance(wrong, tuple) else Pinhole(**(GOOD | wrong))
 
 
-CAMERA = Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5)
 STEREO = RectifiedStereo(CAMERA, 0.12)
-
-
-BENT = "the camera of a rectified stereo pair has"
-RECTIFY = "rectify the images and give the camera of the rectified ones"
 
 
 class TestRectifiedStereo:
@@ -192,20 +194,6 @@ class TestRectifiedStereo:
         assert not STEREO.camera.visible(points[3])
         assert not STEREO.visible(points[1], margin_px=50.0)
         np.testing.assert_array_equal(STEREO.inside(STEREO.project(points[:2])), [False, True])
-
-
-@pytest.mark.parametrize(
-    ("camera", "baseline", "message"),
-    [
-        (CAMERA, 0.0, "the stereo baseline must be positive, got 0.0 m"),
-        (CAMERA, float("nan"), "the stereo baseline must be a finite number, got nan"),
-        (FOLDING, 0.1, f"{BENT} radial-tangential distortion (-0.25, 0.0, 0.0, 0.0, 0.0): {RECTIFY}"),
-        (FISHEYES["ideal"], 0.1, f"{BENT} equidistant distortion (0.0, 0.0, 0.0, 0.0): {RECTIFY}"),
-    ],
-)
-def test_a_wrong_stereo_pair_is_refused(camera, baseline, message):
-    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
-        RectifiedStereo(camera, baseline)
 
 
 @every_camera

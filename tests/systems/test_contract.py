@@ -1,6 +1,6 @@
 """What every system that takes frames promises: to go on from any checkpoint, to survive bad frames, to refuse the past."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import count, cycle, islice
 
@@ -64,7 +64,7 @@ class Case:
     """A system, its frames, after which of them a run is gone on with, and states that it has been in."""
 
     make: Callable[[], System]
-    frames: Callable[[], list]
+    frames: Callable[[], Iterable[object]]
     after: tuple[int, ...]
     states: set[TrackingState] = field(default_factory=set)
     joint: bool | None = None  #: whether it ends with a joint map; None where that is not asked.
@@ -76,38 +76,33 @@ def unnamed(**options) -> RangeBearingSlam:
     return RangeBearingSlam.of_log(corridor(0), config, keep_associations=True)
 
 
-def blurred() -> list:
+def blurred() -> Iterable[object]:
     """Five pairs of which the odometry makes nothing."""
-    return list(blur_motion(25, 10, 5)(pairs(18)).frames())
+    return blur_motion(25, 10, 5)(pairs(18)).frames()
 
 
 RESUMED = {
-    "known points": Case(lambda: mono(KNOWN), lambda: list(sequence(8).frames()), (0, 3, 6)),
-    "separate points": Case(lambda: mono(KNOWN, known="points"), lambda: list(sequence(8).frames()), (0, 3, 6)),
-    "nothing known": Case(mono, lambda: list(sequence(12).frames()), (0, 4, 6, 8, 10), {TrackingState.INITIALISING}),
-    "lost": Case(lambda: mono(KNOWN), lambda: list(sequence(18, blinking).frames()), (1, 4, 8, 10, 12, 14, 16), LOST),
+    "known points": Case(lambda: mono(KNOWN), lambda: sequence(8).frames(), (0, 3, 6)),
+    "separate points": Case(lambda: mono(KNOWN, known="points"), lambda: sequence(8).frames(), (0, 3, 6)),
+    "nothing known": Case(mono, lambda: sequence(12).frames(), (0, 4, 6, 8, 10), {TrackingState.INITIALISING}),
+    "lost": Case(lambda: mono(KNOWN), lambda: sequence(18, blinking).frames(), (1, 4, 8, 10, 12, 14, 16), LOST),
     "known points, joint map": Case(
-        lambda: mono(KNOWN, map="joint", settled_frames=3),
-        lambda: list(sequence(22).frames()),
-        (0, 4, 12, 19),
-        joint=True,
+        lambda: mono(KNOWN, map="joint", settled_frames=3), lambda: sequence(22).frames(), (0, 4, 12, 19), joint=True
     ),
     "known points, camera unknown": Case(
         lambda: mono(KNOWN, settled_frames=3, calibrate="online"),
-        lambda: list(sequence(22).frames()),
+        lambda: sequence(22).frames(),
         (0, 4, 12, 19),
         joint=True,
     ),
     "lost, joint map": Case(
         lambda: mono(KNOWN, map="joint", settled_frames=1),
-        lambda: list(sequence(30, lambda t, image: blinking(t - 12, image)).frames()),
+        lambda: sequence(30, lambda t, image: blinking(t - 12, image)).frames(),
         (15, 20, 22, 26),
         LOST,
         True,
     ),
-    "waiting": Case(
-        lambda: mono(KNOWN), lambda: list(sequence(4, lambda t, i: None if t < 2 else i).frames()), (0, 1, 2)
-    ),
+    "waiting": Case(lambda: mono(KNOWN), lambda: sequence(4, lambda t, i: None if t < 2 else i).frames(), (0, 1, 2)),
     "named": Case(lambda: MonoSlam(LOG.camera, SMALL, LOG.known), lambda: LOG.frames, (0, 3, 6)),
     "named, nothing known": Case(
         lambda: MonoSlam(LOG.camera, replace(SMALL, start=StartConfig(first_adjustment=4))),
@@ -121,22 +116,20 @@ RESUMED = {
         joint=True,
     ),
     "pairs": Case(
-        stereo, lambda: list(pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames()), (0, 5, 6, 9)
+        stereo, lambda: pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames(), (0, 5, 6, 9)
     ),
     "pairs, joint map": Case(
         lambda: stereo(map=MapConfig(kind="joint", submap=30), likelihood=StereoConfig.joint().likelihood),
-        lambda: list(pairs(12).frames()),
+        lambda: pairs(12).frames(),
         (0, 5, 7),
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
     "named pairs": Case(named_pairs, lambda: PIXELS.frames, (0, 5)),
     "robot, own maps": Case(
-        lambda: robot(RangeBearingConfig(particles=4, map="particles"))[0],
-        lambda: list(islice(robot()[1], 12)),
-        (0, 5, 9),
+        lambda: robot(RangeBearingConfig(particles=4, map="particles"))[0], lambda: islice(robot()[1], 12), (0, 5, 9)
     ),
     "robot, joint map": Case(
-        lambda: robot(RangeBearingConfig(particles=10, window=4))[0], lambda: list(islice(robot()[1], 16)), (0, 5, 9)
+        lambda: robot(RangeBearingConfig(particles=10, window=4))[0], lambda: islice(robot()[1], 16), (0, 5, 9)
     ),
     "robot, unnamed": Case(unnamed, lambda: corridor(0).frames, (0, 44, 58, 62)),
     "scans": Case(lambda: laser(), lambda: scans(12), (0, 5, 6, 9), {TrackingState.TRACKED, TrackingState.PREDICTED}),
@@ -193,7 +186,7 @@ def test_a_recordings_whole_paths_are_kept_where_they_fit(live):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", RESUMED.values(), ids=RESUMED)
 def test_a_checkpoint_after_any_frame_goes_on_with_the_same_bytes(case, tmp_path):
-    system, whole, frames = case.make(), [], case.frames()
+    system, whole, frames = case.make(), [], list(case.frames())
     for t, frame in enumerate(frames):
         whole.append(system.take(frame))
         assert whole[-1].values.keys() == {column.name for column in system.columns}

@@ -24,6 +24,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.report.page import _images, digits, program, scene, write_report
 from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
+from tests.cli.sequences import sentence
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -119,10 +120,7 @@ def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(run_f
     spoil(run_folder)
     (run_folder / "report.html").unlink()
     assert main(["validate", str(run_folder), "--against", against]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("rbpf: ")
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in sentence(capsys)
     assert f"Not compared with {against}" in page(run_folder)
     assert "ess mean" in page(run_folder)
 
@@ -143,9 +141,7 @@ def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(run_f
 def test_a_folder_that_is_no_run_is_refused(run_folder, command, spoil, message, capsys):
     spoil(run_folder)
     assert main([*command, str(run_folder)]) == 2 and not (run_folder / "export").exists()
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in sentence(capsys)
 
 
 def test_a_damaged_comparison_is_said_on_the_page(run_folder):

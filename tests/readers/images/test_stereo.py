@@ -11,19 +11,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.images.rectification import OUTSIDE, rectification
-from tests.readers.images.folders import (
-    CAM0,
-    EUROC_NS,
-    P0,
-    write_asl_camera,
-    write_asl_truth,
-    write_camera,
-    write_image,
-    write_images,
-    write_kitti,
-    write_plain,
-    write_rectified,
-)
+from tests.readers.images import folders
 
 
 def levels(sequence):
@@ -35,25 +23,25 @@ def levels(sequence):
 
 def test_a_euroc_pair(tmp_path):
     poses = SE3.from_ypr(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 1]]), [0, 0.1, 0.2], 0.0, 0.0)
-    write_rectified(tmp_path)
-    write_asl_truth(tmp_path / "mav0" / "state_groundtruth_estimate0", poses, EUROC_NS)
+    folders.write_rectified(tmp_path)
+    folders.write_asl_truth(tmp_path / "mav0" / "state_groundtruth_estimate0", poses, folders.EUROC_NS)
     sequence = open_stereo(tmp_path)
     assert len(sequence) == 3 and sequence.notes == () and sequence.name == tmp_path.name
     assert sequence.rig.baseline_m == pytest.approx(0.11) and sequence.rig.camera.fx == 20.0
-    assert sequence.stamps_ns.tolist() == list(EUROC_NS)
+    assert sequence.stamps_ns.tolist() == list(folders.EUROC_NS)
     assert levels(sequence) == [(10, 100), (20, 110), (30, 120)]
     assert all(frame.problem is None for frame in sequence.frames())
-    expected = SE3.compose(poses, CAM0)
+    expected = SE3.compose(poses, folders.CAM0)
     np.testing.assert_allclose(SE3.local(sequence.truth.poses, expected), 0.0, atol=1e-9)
-    assert [frame.stamp_ns for frame in sequence.frames(1)] == list(EUROC_NS[1:])
+    assert [frame.stamp_ns for frame in sequence.frames(1)] == list(folders.EUROC_NS[1:])
 
 
 def test_images_without_a_partner_are_left_out_and_named(tmp_path, caplog):
-    late = (EUROC_NS[0] + 3_000_000, EUROC_NS[2] - 1_000_000, EUROC_NS[2] + 40_000_000)
-    write_rectified(tmp_path, right=late)
+    late = (folders.EUROC_NS[0] + 3_000_000, folders.EUROC_NS[2] - 1_000_000, folders.EUROC_NS[2] + 40_000_000)
+    folders.write_rectified(tmp_path, right=late)
     with caplog.at_level(logging.WARNING):
         sequence = open_stereo(tmp_path)
-    assert sequence.stamps_ns.tolist() == [EUROC_NS[0], EUROC_NS[2]]
+    assert sequence.stamps_ns.tolist() == [folders.EUROC_NS[0], folders.EUROC_NS[2]]
     assert levels(sequence) == [(10, 100), (30, 110)]
     assert "1 of 3 left images have no partner" in sequence.notes[0] and "1 of 3 right" in sequence.notes[1]
     assert "1 of 3 left images have no partner within 0.005 s and are left out" in caplog.text
@@ -61,7 +49,7 @@ def test_images_without_a_partner_are_left_out_and_named(tmp_path, caplog):
 
 
 def test_two_clocks_are_refused(tmp_path):
-    write_rectified(tmp_path, right=tuple(stamp + 10_000_000 for stamp in EUROC_NS))
+    folders.write_rectified(tmp_path, right=tuple(stamp + 10_000_000 for stamp in folders.EUROC_NS))
     with pytest.raises(InputError, match=r"within 0.005 s, the nearest two are 0.010000 s apart"):
         open_stereo(tmp_path)
     assert len(open_stereo(tmp_path, tolerance_s=0.011)) == 3
@@ -69,14 +57,14 @@ def test_two_clocks_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("camera", "damage"), [("cam0", "missing"), ("cam1", "empty"), ("cam1", "size")])
 def test_a_pair_of_which_one_image_cannot_be_read_is_survived(tmp_path, camera, damage):
-    write_rectified(tmp_path)
-    file = tmp_path / "mav0" / camera / "data" / f"{EUROC_NS[1]}.png"
+    folders.write_rectified(tmp_path)
+    file = tmp_path / "mav0" / camera / "data" / f"{folders.EUROC_NS[1]}.png"
     if damage == "missing":
         file.unlink()
     elif damage == "empty":
         file.write_bytes(b"")
     else:
-        write_image(file, np.zeros((16, 30), np.uint8))
+        folders.write_image(file, np.zeros((16, 30), np.uint8))
     sequence = open_stereo(tmp_path)
     frames = list(sequence.frames())
     assert len(frames) == 3 and frames[0].problem is None and frames[2].problem is None
@@ -86,7 +74,7 @@ def test_a_pair_of_which_one_image_cannot_be_read_is_survived(tmp_path, camera, 
 
 
 def test_a_kitti_pair_whose_folders_may_be_of_different_length(tmp_path):
-    sequence = open_stereo(write_kitti(tmp_path))
+    sequence = open_stereo(folders.write_kitti(tmp_path))
     assert sequence.notes == () and sequence.rig.baseline_m == pytest.approx(0.54)
     (tmp_path / "image_1" / "000002.png").unlink()
     sequence = open_stereo(tmp_path)
@@ -96,7 +84,7 @@ def test_a_kitti_pair_whose_folders_may_be_of_different_length(tmp_path):
 
 def widened(folder, images):
     """The right images wider than the left ones."""
-    write_images(folder / images, [path.name for path in sorted((folder / images).iterdir())], 100, (16, 30))
+    folders.write_images(folder / images, [path.name for path in sorted((folder / images).iterdir())], 100, (16, 30))
     return folder
 
 
@@ -106,25 +94,28 @@ def without(folder, file):
 
 
 def kitti_shifted(tx):
-    return lambda folder: write_kitti(folder, calib=P0 + f"P1: 20 0 11.5 {tx} 0 21 7.5 0 0 0 1 0\n")
+    return lambda folder: folders.write_kitti(folder, calib=folders.P0 + f"P1: 20 0 11.5 {tx} 0 21 7.5 0 0 0 1 0\n")
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         *(
-            (lambda folder, file=file: without(write_rectified(folder), file), file)
+            (lambda folder, file=file: without(folders.write_rectified(folder), file), file)
             for file in ("cam0/sensor.yaml", "cam1/sensor.yaml", "cam1/data.csv")
         ),
-        (lambda folder: widened(write_kitti(folder), "image_1"), "left and right images have 24x16 and 30x16 px"),
-        (lambda folder: write_kitti(folder, right=False, calib=P0), "image_1: no such folder"),
+        (
+            lambda folder: widened(folders.write_kitti(folder), "image_1"),
+            "left and right images have 24x16 and 30x16 px",
+        ),
+        (lambda folder: folders.write_kitti(folder, right=False, calib=folders.P0), "image_1: no such folder"),
         (kitti_shifted(0.0), "calib.txt.*2.*a baseline of zero"),
         (kitti_shifted(10.8), "calib.txt.*2.*shifted to the right"),
-        (lambda folder: write_rectified(folder, baseline=0.0), "puts cam1 where cam0 is, a baseline of zero"),
-        (lambda folder: write_rectified(folder, baseline=-0.11), r"is at \(-0.11, .* expected it to the right"),
-        (lambda folder: write_rectified(folder, resolution=[26, 16]), "cam0 has 24x16 and cam1 26x16 px"),
-        (lambda folder: widened(write_rectified(folder), "mav0/cam1/data"), "cam1 have 30x16 px"),
-        (write_plain, r"expected a ROS bag.*; or an EuRoC sequence .* cam0 and cam1.*; or a KITTI"),
+        (lambda folder: folders.write_rectified(folder, baseline=0.0), "puts cam1 where cam0 is, a baseline of zero"),
+        (lambda folder: folders.write_rectified(folder, baseline=-0.11), r"is at \(-0.11, .* expected it to the right"),
+        (lambda folder: folders.write_rectified(folder, resolution=[26, 16]), "cam0 has 24x16 and cam1 26x16 px"),
+        (lambda folder: widened(folders.write_rectified(folder), "mav0/cam1/data"), "cam1 have 30x16 px"),
+        (folders.write_plain, r"expected a ROS bag.*; or an EuRoC sequence .* cam0 and cam1.*; or a KITTI"),
         (lambda folder: folder / "none", "no such file or folder; expected a stereo sequence"),
     ],
 )
@@ -134,26 +125,26 @@ def test_what_is_no_pair_is_refused(tmp_path, make, words):
 
 
 def test_a_given_calibration(tmp_path):
-    write_rectified(tmp_path / "a")
-    sequence = open_stereo(tmp_path / "a", write_camera(tmp_path, fx=22.0))
+    folders.write_rectified(tmp_path / "a")
+    sequence = open_stereo(tmp_path / "a", folders.write_camera(tmp_path, fx=22.0))
     assert sequence.rig.camera.fx == 22.0 and sequence.rig.baseline_m == pytest.approx(0.11)
-    assert open_stereo(tmp_path / "a", write_camera(tmp_path, fx=22.0, baseline_m=0.2)).rig.baseline_m == 0.2
-    write_kitti(tmp_path / "b")
-    assert open_stereo(tmp_path / "b", write_camera(tmp_path, baseline_m=0.2)).rig.baseline_m == 0.2
-    bent = write_camera(tmp_path, distortion=[0.1, 0, 0, 0])
+    assert open_stereo(tmp_path / "a", folders.write_camera(tmp_path, fx=22.0, baseline_m=0.2)).rig.baseline_m == 0.2
+    folders.write_kitti(tmp_path / "b")
+    assert open_stereo(tmp_path / "b", folders.write_camera(tmp_path, baseline_m=0.2)).rig.baseline_m == 0.2
+    bent = folders.write_camera(tmp_path, distortion=[0.1, 0, 0, 0])
     with pytest.raises(InputError, match="rectify the images"):
         open_stereo(tmp_path / "a", bent)
     with pytest.raises(InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"):
-        open_stereo(tmp_path / "a", write_camera(tmp_path, model="fisheye"))
+        open_stereo(tmp_path / "a", folders.write_camera(tmp_path, model="fisheye"))
 
 
 def test_a_pair_that_is_not_rectified_is_rectified(tmp_path):
     straight = {"distortion_coefficients": [0.1, 0.0, 0.0, 0.0]}
-    write_asl_camera(tmp_path / "mav0" / "cam0", CAM0, **straight)
-    mount = SE3.compose(CAM0, SE3.from_ypr(np.array([0.11, 0.002, 0.0]), 0.0, 0.02, 0.0))
-    write_asl_camera(tmp_path / "mav0" / "cam1", mount, EUROC_NS, 100, **straight)
+    folders.write_asl_camera(tmp_path / "mav0" / "cam0", folders.CAM0, **straight)
+    mount = SE3.compose(folders.CAM0, SE3.from_ypr(np.array([0.11, 0.002, 0.0]), 0.0, 0.02, 0.0))
+    folders.write_asl_camera(tmp_path / "mav0" / "cam1", mount, folders.EUROC_NS, 100, **straight)
     poses = SE3.from_ypr(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 1]]), [0, 0.1, 0.2], 0.0, 0.0)
-    write_asl_truth(tmp_path / "mav0" / "state_groundtruth_estimate0", poses, EUROC_NS)
+    folders.write_asl_truth(tmp_path / "mav0" / "state_groundtruth_estimate0", poses, folders.EUROC_NS)
     assert open_images(tmp_path).baseline_m is None
     sequence = open_stereo(tmp_path)
     assert "not rectified; their images are" in sequence.notes[0]
@@ -163,7 +154,7 @@ def test_a_pair_that_is_not_rectified_is_rectified(tmp_path):
     frame = next(sequence.frames())
     assert frame.image.shape == frame.right.shape == (16, 24)
     # A rectified camera keeps its place and turns towards the baseline.
-    turned = SE3.between(SE3.compose(poses, CAM0), sequence.truth.poses)
+    turned = SE3.between(SE3.compose(poses, folders.CAM0), sequence.truth.poses)
     np.testing.assert_allclose(SE3.translation(turned), 0.0, atol=1e-9)
     direction = SE3.rotation(turned[0])[:, 0]
     np.testing.assert_allclose(direction, np.array([0.11, 0.002, 0.0]) / np.hypot(0.11, 0.002), atol=1e-6)
