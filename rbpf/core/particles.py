@@ -285,11 +285,3 @@ def mixture_estimate(
     factor = prior.space.right_jacobian_inverse(spread[:n]) @ factor
     within = np.einsum("n,nar,nbr->ab", weights[:n], factor, factor)
     return Estimate(mean, gaussian.symmetrise(within + between))
-
-
-def mixture_mean(
-    prior: Prior, proposed: Proposed | None, log_weights: Float[np.ndarray, " N"]
-) -> Float[np.ndarray, " E"]:
-    """The mean of `mixture_estimate` alone, without a second weight."""
-    centres = prior.predicted() if proposed is None else prior.at(prior.moved(proposed.mean))
-    return prior.space.mean(centres, np.exp(log_weights))

@@ -19,7 +19,7 @@ import numpy as np
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Conditional, MotionModel, Records, Sensor
-from rbpf.core.particles import Estimate, mixture_mean
+from rbpf.core.particles import Estimate, mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
@@ -300,7 +300,7 @@ class MonoSlam(System):
         revision: Revision | None = None
         if not self.start.over or self.hand_over.is_ahead:
             # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
-            self.first.note(seen, mixture_mean(*report.mixture)[:7])
+            self.first.note(seen, mixture_estimate(*report.mixture).mean[:7])
             is_usable, is_lost = not sensor.bad_frames, sensor.lost and len(sensor.table) > 0
             adjusted, words = self.start.after_frame(self.filter, is_usable, is_lost)
             messages = [words, *messages] if words is not None else messages
