@@ -384,10 +384,9 @@ class SharedStore:
                 for column, row in zip(columns, self.columns.rows(np.array(columns)).tolist(), strict=True):
                     cold = self._cold.get(column)
                     if cold is not None and alive.size <= COLD_FRACTION * cold.kept.size:
-                        where = found.get(id(cold.kept))
-                        if where is None:
-                            where = found[id(cold.kept)] = np.searchsorted(cold.kept, alive)
-                        self._cold[column] = Cold(alive, cold.data.take(where, axis=1))
+                        if id(cold.kept) not in found:
+                            found[id(cold.kept)] = np.searchsorted(cold.kept, alive)
+                        self._cold[column] = Cold(alive, cold.data.take(found[id(cold.kept)], axis=1))
                     elif cold is None and alive.size <= HOT_FRACTION * self.n:
                         pool = self._pool(row)
                         self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))

@@ -220,6 +220,13 @@ def distances(matrix, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, sq
             squared[first + i] = _dot(white, white) if lanes[_DEPTH + i] > 0.0 else np.inf
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _white(lanes, place, i, v):
+    # W v of a point whose z⁻, z and W lie from the place on.
+    first = _dot(_three(lanes, place + 6 * _LANES, i), v)
+    return first, _dot(_three(lanes, place + 9 * _LANES, i), v), _dot(_three(lanes, place + 12 * _LANES, i), v)
+
+
 @njit(cache=True, error_model="numpy")
 def _miss(matrix, n, lanes):
     # d² of the lanes, as `_sweep` without a branch.
@@ -232,10 +239,8 @@ def _miss(matrix, n, lanes):
             now[1] - _raised(down, before) / depth,
             now[2] - _raised(other, before) / depth,
         )
-        p = _dot(_three(lanes, _WHITE, i), miss)
-        q = _dot(_three(lanes, _WHITE + 3 * _LANES, i), miss)
-        r = _dot(_three(lanes, _WHITE + 6 * _LANES, i), miss)
-        lanes[_SQUARED + i] = p * p + q * q + r * r if depth > 0.0 else np.inf
+        white = _white(lanes, _BEFORE, i, miss)
+        lanes[_SQUARED + i] = _dot(white, white) if depth > 0.0 else np.inf
 
 
 @njit(cache=True, error_model="numpy")
@@ -250,10 +255,8 @@ def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
         n = min(_LANES, count - first)
         for i in range(n):
             for a in range(3):
-                lanes[_BEFORE + a * _LANES + i], lanes[_NOW + a * _LANES + i] = (
-                    z_prev[first + i, a],
-                    z_now[first + i, a],
-                )
+                lanes[_BEFORE + a * _LANES + i] = z_prev[first + i, a]
+                lanes[_NOW + a * _LANES + i] = z_now[first + i, a]
                 for b in range(3):
                     lanes[_WHITE + (3 * a + b) * _LANES + i] = white[first + i, a, b]
         for c in range(matrices.shape[0]):
@@ -339,13 +342,6 @@ def _put_motion(lanes, i, quat, shift):
     _put(lanes, _POSE, i, (quat[0], quat[1], quat[2]))
     lanes[_POSE + 3 * _LANES + i] = quat[3]
     _put(lanes, _POSE + 4 * _LANES, i, shift)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _white(lanes, place, i, v):
-    # W v of a point.
-    first = _dot(_three(lanes, place + 6 * _LANES, i), v)
-    return first, _dot(_three(lanes, place + 9 * _LANES, i), v), _dot(_three(lanes, place + 12 * _LANES, i), v)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -473,7 +469,4 @@ def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motio
                 turn, way = exp_pair(_three(lanes, _at(6, 0), i), _three(lanes, _at(6, 3), i))
                 way = turned(quat, way)
                 _put_motion(lanes, i, multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2]))
-        for i in range(n):
-            quat, shift = _motion(lanes, i)
-            motions[first + i, 0], motions[first + i, 1], motions[first + i, 2], motions[first + i, 3] = quat
-            motions[first + i, 4], motions[first + i, 5], motions[first + i, 6] = shift
+        motions[first : first + n] = lanes[_POSE:_SLOPE].reshape(7, _LANES)[:, :n].T

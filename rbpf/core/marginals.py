@@ -62,13 +62,10 @@ class StateOnly(Conditional):
             if group.data is not None:
                 raw += log_likelihoods(group, state)
                 continue
-            nu = numbers(
-                group.model.innovation(group.z, state[:, None, :]), f"what {type(group.model).__name__} predicts"
-            )
+            name = type(group.model).__name__
+            nu = numbers(group.model.innovation(group.z, state[:, None, :]), f"what {name} predicts")
             if nu.shape != (state.shape[0], *group.z.shape):
-                raise InputError(
-                    f"{type(group.model).__name__}.predict returned {nu.shape} for {state.shape[0]} states"
-                )
+                raise InputError(f"{name}.predict returned {nu.shape} for {state.shape[0]} states")
             if group.likelihood is None or group.likelihood.kernel_id == GAUSSIAN.kernel_id:
                 chol = gaussian.cholesky(group.cov)
                 log_densities(nu, chol, gaussian.log_det(chol), total)

@@ -152,14 +152,11 @@ def add_squares(vector, count, total):
 def add_gram(matrix, sign, count, total):
     """Total += sign · matrixᵀ matrix, packed; up to three rows in one pass: a sum is loaded and stored once for them."""
     p = matrix.shape[0]
-    done = min(p, 3)
+    done = min(p, 3) if p > 1 else 0
     for e in range(matrix.shape[1]):
         for f in range(e + 1):
             m = packed(e, f)
-            if p == 1:
-                for i in range(count):
-                    total[m, i] += sign * matrix[0, e, i] * matrix[0, f, i]
-            elif p == 2:
+            if p == 2:
                 for i in range(count):
                     first = total[m, i] + sign * matrix[0, e, i] * matrix[0, f, i]
                     total[m, i] = first + sign * matrix[1, e, i] * matrix[1, f, i]
