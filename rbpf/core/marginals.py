@@ -64,8 +64,10 @@ class StateOnly(Conditional):
                 continue
             name = type(group.model).__name__
             nu = numbers(group.model.innovation(group.z, state[:, None, :]), f"what {name} predicts")
+            if len(nu) == 1:  # the same for all states
+                nu = np.repeat(nu, state.shape[0], axis=0)
             if nu.shape != (state.shape[0], *group.z.shape):
-                raise InputError(f"{name}.predict returned {nu.shape} for {state.shape[0]} states")
+                raise InputError(f"{name}: innovations have the shape {nu.shape} for {state.shape[0]} states")
             if group.likelihood is None or group.likelihood.kernel_id == GAUSSIAN.kernel_id:
                 chol = gaussian.cholesky(group.cov)
                 log_densities(nu, chol, gaussian.log_det(chol), total)

@@ -4,6 +4,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf.errors import InputError
 from rbpf.sensors.features.interface import Detector, checked_image
 
 WINDOW_PX = 9  #: The score looks at 9 × 9 px: a template of 11 × 11 px without its border.
@@ -40,6 +41,7 @@ class CornerDetector(Detector):
         inner = image[first : image.shape[0] - first, first : image.shape[1] - first]
         found = cv2.FastFeatureDetector.create(self.fast_threshold, False).detect(inner)
         px = np.asarray(cv2.KeyPoint.convert(found), dtype=np.int64).reshape(-1, 2) + first
+        px = px[np.argsort(px[:, 1], kind="stable")]  # row by row, as its own order is
         if mask is not None:
             px = px[mask[px[:, 1], px[:, 0]]]
         # A corner's score is good enough, and the highest among its neighbours that FAST found.
@@ -50,8 +52,14 @@ class CornerDetector(Detector):
 
 
 def corner_score(image: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """The score of `CornerDetector` at pixels (K, 2) inside the image, rounded to whole ones: (K,) grey levels per pixel."""
-    reach, px = CornerDetector.margin_px, np.rint(px).astype(np.int64)
+    """The score of `CornerDetector` at pixels (K, 2), rounded to whole ones: (K,) grey levels per pixel.
+
+    Raises InputError: a pixel lies outside the image.
+    """
+    reach, last = CornerDetector.margin_px, np.array(image.shape[1::-1]) - 1
+    if not (np.abs(px - last / 2.0) <= last / 2.0 + 0.5).all():
+        raise InputError("a corner's score is asked for outside the image")
+    px = np.clip(np.rint(px), 0, last).astype(np.int64)
     order = np.argsort(px[:, 1], kind="stable")
     squared = np.empty(len(px))
     squared[order] = _squared_scores(np.pad(checked_image(image), reach, mode="reflect"), px[order] + reach)

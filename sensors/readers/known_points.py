@@ -5,7 +5,7 @@
 
 sigma_m is the standard deviation of the place as a whole, the root of its covariance's trace: the root mean square
 distance from where the point truly is. A further column across_m is the standard deviation of the place along each axis
-across the line of sight of the first image; who surveyed points to alike in all directions gives sigma_m / √3. The columns
+across the line of sight of the first image: sigma_m / √3 of points that were surveyed, alike in all directions. The columns
 may come in any order, and others beside them are passed over.
 Pixel centres are at whole numbers.
 """

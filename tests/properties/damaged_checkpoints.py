@@ -88,7 +88,7 @@ def tell(name: str, damage: str, **result: str) -> None:
 def try_damages(name: str, folder: Path, most: int) -> None:
     """Tries so many damages of a case's checkpoint, in an order drawn at random."""
     case, rng = CASES[name], np.random.default_rng(0)
-    run, frames = Run(Listed(), case.make()), case.frames()
+    run, frames = Run(Listed(), case.make()), list(case.frames())
     before, after = frames[: case.after[-1] + 1], frames[case.after[-1] + 1 :]
     for frame in before:
         run.take(frame)

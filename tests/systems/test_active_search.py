@@ -191,7 +191,8 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     camera = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
     simulate_images(TexturedDesk(frames=150, texel_m=0.003), Imaging(), camera, tmp_path / "desk", seed=1)
     recording = open_images(tmp_path / "desk")
-    known = read_known_points(tmp_path / "desk" / "known_points.csv")
+    # Particles with own maps of a world that is uncertain across the line of sight, too, may lose it whatever is trusted.
+    known = replace(read_known_points(tmp_path / "desk" / "known_points.csv"), across_m=None)
     damaged = cover_view(1 / 3, 60, 60)(recording)
     stamps, own = recording.stamps_ns, MonoConfig(map="particles")
     # Runs differ from seed to seed by more than the kinds do: their means over six.

@@ -258,7 +258,7 @@ class ActiveSearch:
         affines = self.first_affines(rows, pose)
         along = parallax(self.features.camera, table.position[rows], table.first_pose[rows], pose)
         squared, slopes = np.square(along).sum(axis=1), table.slopes(rows)
-        least = np.linalg.eigvalsh(table.told[rows, :, :2])[:, 0] + 1.0
+        least = np.linalg.eigvalsh(table.plane_information[rows, :, :2])[:, 0] + 1.0
         tells = PLANE_HALF_PX**2 * squared > SHOWN_PX**2 * focal.mean() ** 2 * least
         windows = {k: cut(image, px[k], PLANE_HALF_PX) for k in np.flatnonzero(tells).tolist()}
         chosen = [k for k, window in windows.items() if window is not None]
@@ -282,11 +282,11 @@ class ActiveSearch:
         left = (error[..., None] - by_all @ np.linalg.solve(normal, right))[..., 0]
         variance = np.square(left) @ _WEIGHTS / _WEIGHTS.sum() + ROUNDING
         others = normal[:, :2, 2:] @ np.linalg.inv(normal[:, 2:, 2:])
-        told = (normal[:, :2, :2] - others @ normal[:, 2:, :2]) / variance[:, None, None]
-        vector = (right[:, :2] - others @ right[:, 2:]) / variance[:, None, None] + told @ slopes[..., None]
-        table.told[rows] += np.concatenate([told, vector], axis=2)
-        total, greatest = table.parallax[rows].T
-        table.parallax[rows] = np.column_stack([total + squared, np.maximum(greatest, squared)])
+        info = (normal[:, :2, :2] - others @ normal[:, 2:, :2]) / variance[:, None, None]
+        vector = (right[:, :2] - others @ right[:, 2:]) / variance[:, None, None] + info @ slopes[..., None]
+        table.plane_information[rows] += np.concatenate([info, vector], axis=2)
+        total, greatest = table.squared_parallax[rows].T
+        table.squared_parallax[rows] = np.column_stack([total + squared, np.maximum(greatest, squared)])
 
     def _innovations(
         self, belief: Belief, rows: np.ndarray, px: np.ndarray

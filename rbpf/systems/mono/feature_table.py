@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 
 from rbpf.core.checkpoint import grey, integers, numbers, poses, read, truths
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import SearchConfig
@@ -31,8 +32,8 @@ _COLUMNS = {
     "first_pose": poses("features"),
     "last_pose": poses("features"),
     "position": numbers("features", 4),
-    "told": numbers("features", 2, 3),
-    "parallax": numbers("features", 2, least=0.0),
+    "plane_information": numbers("features", 2, 3),
+    "squared_parallax": numbers("features", 2, least=0.0),
     "attempts": integers("features", least=0),
     "found": integers("features", least=0),
     "missed": integers("features", least=0),
@@ -51,9 +52,9 @@ class FeatureTable:
     first_pose: np.ndarray  #: (F, 7) world_from_camera of the first one, in the heaviest particle's world.
     last_pose: np.ndarray  #: (F, 7) likewise of the later one.
     position: np.ndarray  #: (F, 4) homogeneous point in the heaviest particle's world, when it was last observed.
-    #: (F, 2, 3) what views told of its first patch's `slopes`: the sums of their information, and of that times the slope.
-    told: np.ndarray
-    parallax: np.ndarray  #: (F, 2) of these views: the sum of the squares, and the greatest square, see `parallax`.
+    #: (F, 2, 3) what views say of its first patch's `slopes`: the sums of their information, and of that times the slope.
+    plane_information: np.ndarray
+    squared_parallax: np.ndarray  #: (F, 2) of these views: sum, and the greatest, see `parallax`.
     attempts: np.ndarray  #: (F,) times looked for.
     found: np.ndarray  #: (F,) times found.
     missed: np.ndarray  #: (F,) times not found in a row.
@@ -121,9 +122,9 @@ class FeatureTable:
         and the prior's standard deviation. Of the noise that views compare half is the first patch's, the same in all of
         them: n views say 2 n / (1 + n) times what one does.
         """
-        told, (total, greatest) = self.told[rows], self.parallax[rows].T
-        told = 2.0 / (1.0 + total / np.maximum(greatest, np.finfo(float).tiny))[:, None, None] * told
-        return np.asarray(np.linalg.solve(told[:, :, :2] + np.eye(2), told[:, :, 2:])[..., 0])
+        info, (total, greatest) = self.plane_information[rows], self.squared_parallax[rows].T
+        info = 2.0 / (1.0 + total / np.maximum(greatest, np.finfo(float).tiny))[:, None, None] * info
+        return np.asarray(np.linalg.solve(info[:, :, :2] + np.eye(2), info[:, :, 2:])[..., 0])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -131,9 +132,12 @@ class FeatureTable:
 
     def restore(self, arrays: dict[str, np.ndarray], members: int) -> None:
         """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.checkpoint.read`."""
-        count = len(arrays.get("features/alive", ()))  # before planes were learnt nothing was known of them
-        given = {"features/told": np.zeros((count, 2, 3)), "features/parallax": np.zeros((count, 2))} | arrays
+        count = np.size(arrays.get("features/alive", ()))  # before planes were learnt nothing was known of them
+        nothing = {"plane_information": np.zeros((count, 2, 3)), "squared_parallax": np.zeros((count, 2))}
+        given = {f"features/{name}": values for name, values in nothing.items()} | arrays
         self._room = read(given, _COLUMNS, "features/", members=members)
+        if (np.linalg.eigvalsh(self._room["plane_information"][:, :, :2]) < -0.1).any():
+            raise InputError("features/plane_information: expected information that is not less than none")
         self._use(len(self._room["alive"]))
 
     def _use(self, count: int) -> None:
