@@ -16,8 +16,8 @@ _SHARED = re.compile(r"^from rbpf\.kernels(\.(?!signature)\w+)? import", re.MULT
 def kernel_modules() -> list[str]:
     """Modules of `rbpf` with compiled functions of their own, without those only compiled into others, in a good order.
 
-    The drivers of landmarks first, which take longest, then by length; but what compiles functions of `rbpf.kernels` into its
-    own waits until the drivers there, which do the same, have them in the cache: two processes would compile them twice.
+    The drivers of landmarks first, which take longest, and leave functions of `rbpf.kernels` in the cache; then what compiles
+    these into its own, which takes long as well; then by length.
     """
     paths = [*(_ROOT / "kernels").glob("*.py")]
     for folder in ("sensors", "motion", "maps", "systems", "validation"):
@@ -26,7 +26,7 @@ def kernel_modules() -> list[str]:
     compiled = {path: s.count("@njit(") + s.count("@observation_kernel") for path, s in sources.items()}
     chosen = [path for path, count in compiled.items() if count > sources[path].count('inline="always"')]
     waits = {path: path.parent.name != "kernels" and bool(_SHARED.search(sources[path])) for path in chosen}
-    chosen.sort(key=lambda path: (path.stem != "landmarks", waits[path], -len(sources[path]), path))
+    chosen.sort(key=lambda path: (path.stem != "landmarks", not waits[path], -len(sources[path]), path))
     return [".".join(["rbpf", *path.relative_to(_ROOT).with_suffix("").parts]) for path in chosen]
 
 
@@ -57,7 +57,9 @@ def compile_kernels(every: bool = False) -> list[str]:
 
         with progress() as bar, Parallel(n_jobs=-1, return_as="generator_unordered") as parallel:
             report = bar("compiling")
+            # What takes longest first, the calls that need others' kernels last.
             jobs = [delayed(_load)(name) for name in missing] + [delayed(call)() for call in FIRST_CALLS]
+            jobs.insert(1, jobs.pop())
             for done, _ in enumerate(parallel(jobs), 1):
                 report(done, len(jobs))
     if every:
@@ -99,4 +101,4 @@ def _drive() -> None:
 
 
 #: What is compiled at its first call.
-FIRST_CALLS = (_move, _drive)
+FIRST_CALLS = (_drive, _move)
