@@ -31,7 +31,10 @@ class PriorProposal(Proposal):
 
 @lru_cache
 def _as_before(rank: int) -> Proposed:
-    return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1))
+    held = np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1)
+    for array in held:  # one for all filters
+        array.flags.writeable = False
+    return Proposed(*held)
 
 
 @final
