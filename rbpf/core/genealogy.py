@@ -217,7 +217,7 @@ class Lineage:
             self._members[generation] = self._leaves.copy()
 
     def _forget(self) -> None:
-        """Where nobody needs what the forest holds, another one is to be planted by who asks, at the oldest that is needed."""
+        """Drops the forest where no retained generation is in it; `_grow` plants another at the oldest retained one."""
         newest = self.generation - len(self._pending)
         if self._pending and not any(generation <= newest for generation in self._retained):
             self._oldest = min(self._retained, default=self.generation)
