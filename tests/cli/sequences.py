@@ -1,7 +1,9 @@
-"""Short image sequences for the tests of `rbpf run mono` and `rbpf run stereo`."""
+"""Short image sequences for the tests of `rbpf run mono` and `rbpf run stereo`, and a disk that is full."""
 
 import json
+import resource
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 from rbpf.cli import main
@@ -69,3 +71,14 @@ def refused(capsys, sequence, out, *arguments):
     assert run(sequence, out, *map(str, arguments)) == 2
     assert not (out / "summary.json").exists()
     return sentence(capsys)
+
+
+@contextmanager
+def full_disk(most_bytes):
+    """No file grows beyond so many bytes: what writes more gets an error, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -1,8 +1,6 @@
 """Full disks, killed runs, damaged files: one sentence, no traceback, and nothing finished is lost."""
 
 import json
-import resource
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.cli.sequences import CAMERA, FRAMES, sentence
+from tests.cli.sequences import CAMERA, FRAMES, full_disk, sentence
 
 pytestmark = pytest.mark.slow
 
@@ -33,17 +31,6 @@ def desk(tmp_path_factory):
     world = TexturedDesk(frames=FRAMES, texel_m=0.003)
     simulate_images(world, Imaging(noise_std=1.0), RectifiedStereo(CAMERA, 0.12), folder, seed=1)
     return folder
-
-
-@contextmanager
-def full_disk(most_bytes):
-    """No file grows beyond so many bytes: what writes more gets an error, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def command(desk, out, *more):
