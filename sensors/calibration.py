@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import skew
+from rbpf.lie import SE3
 from rbpf.sensors.camera import LENSES, Pinhole
 from rbpf.sensors.features.interface import checked_image
 from rbpf.sensors.readers.known_points import KnownPixels
@@ -359,8 +359,7 @@ def _deviations(camera: Pinhole, places: np.ndarray, px: np.ndarray, free: np.nd
     more = [replace(camera, **{name: getattr(camera, name) + 1.0}) for name in ("fx", "fy", "cx", "cy")]
     more += [replace(camera, distortion=tuple((k + unit).tolist())) for unit in np.eye(k.size)]
     by_camera = np.stack([one.project(places) - camera.project(places) for one in more], axis=-1)[..., free]
-    turned = np.concatenate([-skew(places), np.broadcast_to(np.eye(3), (*places.shape, 3))], axis=-1)
-    by_pose = camera.jacobian(places) @ turned
+    by_pose = camera.jacobian(places) @ SE3.transform_jacobian(places)
     v, m = places.shape[:2]
     a, b = by_camera.reshape(v, 2 * m, -1), by_pose.reshape(v, 2 * m, 6)
     shared = a.mT @ b

@@ -503,9 +503,9 @@ def label(axes: Any, title: str, xlabel: str, ylabel: str, equal: bool) -> None:
     axes.grid(alpha=0.3)
 
 
-def outline(mean: np.ndarray, cov: np.ndarray, points: int = 40) -> np.ndarray:
-    """The `SIGMAS` ellipses (..., points, 2) of Gaussians (..., 2), (..., 2, 2)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
+def outline(mean: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """The `SIGMAS` ellipses (..., 40, 2) of Gaussians (..., 2), (..., 2, 2)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 40)
     circle = SIGMAS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     values, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]

@@ -1,4 +1,7 @@
-"""The map of a finished filter as one Gaussian per landmark, within + between particles."""
+"""The map of a filter as one Gaussian per landmark, within + between particles; poses and points seen from a frame of it.
+
+The frame is one that each particle knows in a world of its own, such as that of known points.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -7,10 +10,10 @@ import numpy as np
 
 from rbpf.core.filter import Filter
 from rbpf.core.models import Records
-from rbpf.lie import SE2Group
+from rbpf.core.particles import Estimate, Prior, mixture_estimate
+from rbpf.lie import LieGroup, SE2Group
 from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.range_bearing import RelativePosition
-from rbpf.systems.anchoring import Anchored
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,21 @@ def estimate_map(filter_: Filter) -> MapEstimate:
     ids = landmark_map.ids
     mean, cov = belief.moments(ids)
     return MapEstimate(ids, mean.reshape(-1, dim), cov.reshape(-1, dim, dim))
+
+
+@dataclass(frozen=True)
+class Anchored:
+    """The frame in each particle's own world: world_from_frame (N, E), and a factor (N, d, d) of its covariance there."""
+
+    mean: np.ndarray
+    factor: np.ndarray
+
+
+def relative_estimate(space: LieGroup, anchored: Anchored, state: np.ndarray, log_weights: np.ndarray) -> Estimate:
+    """Mean and covariance of states (N, E) relative to the frame, x_0⁻¹ · x."""
+    relative = space.between(anchored.mean, state)
+    factor = space.adjoint(space.inverse(relative)) @ anchored.factor
+    return mixture_estimate(Prior(space, relative, np.zeros((1, space.dim)), factor), None, log_weights)
 
 
 def relative_points(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from itertools import combinations, islice
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3, Array, skew
+from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
 
 FLAT = 1e-3  #: Points whose second spread is below this fraction of the first lie on a line.
@@ -153,8 +153,7 @@ def refined_on_all(camera: Pinhole, pose: Array, sights: Sights, gates: tuple[fl
         if inliers.sum() < 4:
             return None
         seen, white = seen[inliers], white[inliers]
-        by_pose = np.concatenate([skew(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=-1)
-        jac = white @ camera.jacobian(seen) @ by_pose
+        jac = -white @ camera.jacobian(seen) @ SE3.transform_jacobian(seen)
         information = np.einsum("kpa,kpb->ab", jac, jac)
         if np.linalg.cond(information) > 1e12:
             return None

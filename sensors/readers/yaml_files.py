@@ -121,12 +121,12 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
     return YamlValue(path, "the file", node)
 
 
-def read_plain_yaml(path: Path, hint: str = "settings") -> Any:
+def read_plain_yaml(path: Path) -> Any:
     """What a YAML file says in plain values: mappings, lists, text, numbers, dates.
 
     Raises InputError: as `read_yaml`, a key comes twice, a tag is not plain, or a value is none of its type.
     """
-    whole = read_yaml(path, hint)
+    whole = read_yaml(path, "settings")
     _require_plain(whole)
     try:
         return yaml.SafeLoader("").construct_document(whole.node)

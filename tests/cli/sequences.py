@@ -3,6 +3,7 @@
 import json
 import resource
 import shutil
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -76,9 +77,11 @@ def refused(capsys, sequence, out, *arguments):
 @contextmanager
 def full_disk(most_bytes):
     """No file grows beyond so many bytes: what writes more gets an error, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before, bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # Python does not notice that what it compiles is cut off
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = bytecode

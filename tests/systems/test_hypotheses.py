@@ -13,7 +13,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.runs.recordings import filter_opened, open_robot_log, part_of_log
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.readers import Frame, Part, RobotLog
-from rbpf.systems.anchoring import Anchored, relative_estimate
+from rbpf.systems.map_estimate import Anchored, relative_estimate
 from rbpf.systems.range_bearing.config import AssociationConfig, RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log

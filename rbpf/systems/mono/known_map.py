@@ -18,8 +18,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
 from rbpf.sensors.camera.points import MembersView
 from rbpf.sensors.feature_log import KnownPoints
-from rbpf.systems.anchoring import Anchored
-from rbpf.systems.map_estimate import MapEstimate, relative_points
+from rbpf.systems.map_estimate import Anchored, MapEstimate, relative_points
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.system import Gauge

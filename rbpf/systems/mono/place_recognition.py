@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from rbpf import gaussian
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Estimate, Particles, uniform_log_weights
-from rbpf.lie import SE3, skew
+from rbpf.lie import SE3
 from rbpf.maps.joint.solution import Given
 from rbpf.maps.joint_map import JointMap
 from rbpf.motion.constant_velocity import PosePrior
@@ -94,7 +94,7 @@ def log_likelihood(
         weighed = np.linalg.solve(spread, miss[..., None])[..., 0]
         density = area * np.exp(-0.5 * (miss * weighed).sum(axis=1)) / (2.0 * np.pi * np.sqrt(np.linalg.det(spread)))
         right = (1.0 - WRONG) * np.where(seen[:, 2] > 0.0, density, 0.0)
-        by_pose = jac @ np.concatenate([skew(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=-1)
+        by_pose = -jac @ SE3.transform_jacobian(seen)
         share = right / (right + WRONG)
         off = np.zeros(6) if prior is None else SE3.local(prior.mean, pose)
         back = SE3.right_jacobian_inverse(off)

@@ -32,8 +32,7 @@ from rbpf.sensors.features import Descriptor, Detector
 from rbpf.sensors.readers import ImageFrame, KnownPixels
 from rbpf.sensors.readers.images.calibration import NAME as CAMERA
 from rbpf.sensors.readers.images.calibration import camera_text
-from rbpf.systems.anchoring import Anchored, relative_estimate
-from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.map_estimate import Anchored, MapEstimate, relative_estimate
 from rbpf.systems.mono.active_search import OutlierGate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth

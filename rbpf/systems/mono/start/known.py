@@ -18,7 +18,7 @@ from rbpf.sensors.camera.resection import resect
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.sensors.features.corners import corner_score
 from rbpf.sensors.readers import KnownPixels
-from rbpf.systems.anchoring import Anchored
+from rbpf.systems.map_estimate import Anchored
 
 MAX_SIGMAS, MAX_PX = 6.0, 4.0
 """A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""
