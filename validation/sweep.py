@@ -12,28 +12,26 @@ settings: {window: 10}                 # of all runs
 rows.jsonl   one line per finished run, written as soon as it is done; a sweep that is called again computes the rest
 table.csv    one row per run, one column per figure: CSV, because pandas, polars, R and spreadsheets read it and
              Parquet would take a library of 170 MB for a table of some hundred rows
-
-A further system is one line in `SYSTEMS`.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
 from rbpf import __version__
 from rbpf.errors import InputError
-from rbpf.runs import recordings
 from rbpf.runs.files import OnDone, prepare_folder, write_csv
 from rbpf.runs.folder import summarise
 from rbpf.runs.reading import PathAndMap
+from rbpf.runs.recordings import SYSTEMS, filter_recording
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
@@ -48,22 +46,6 @@ MOST_RUNS = 100_000
 Value = str | int | float | bool | None
 Row = dict[str, Any]
 Named = tuple[tuple[str, str], ...]
-
-
-class SweepSystem(NamedTuple):
-    """A system that a sweep can run."""
-
-    recording: Callable[..., recordings.Recording]  #: opens a sequence, from the paths of its fields.
-    fields: tuple[str, ...] = ("recording",)  #: of a sequence, each a path; the first is the recording itself.
-
-
-#: By their names.
-SYSTEMS = {
-    "range-bearing": SweepSystem(recordings.RobotRecording),
-    "laser": SweepSystem(recordings.LaserRecording),
-    "mono": SweepSystem(recordings.MonoRecording, ("recording", "known_points", "calibration")),
-    "stereo": SweepSystem(recordings.StereoRecording, ("recording", "calibration")),
-}
 
 
 @dataclass(frozen=True)
@@ -103,7 +85,7 @@ class Job:
 
     def config(self) -> Any:
         """All settings of the run. An InputError says which one is wrong."""
-        return load_settings(recordings.CONFIGS[self.system], self.system, None, self.settings, self.given)
+        return load_settings(SYSTEMS[self.system].config, self.system, None, self.settings, self.given)
 
     def facts(self) -> dict[str, Any]:
         """The first columns of its row in the table."""
@@ -133,7 +115,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     """All runs of a sweep; paths are taken from a folder. Errors as `read_plan`."""
     if file.system not in SYSTEMS:
         raise InputError(f"a sweep runs one of the systems {', '.join(SYSTEMS)}, not {file.system!r}")
-    sequences = [_sequence(given, SYSTEMS[file.system].fields, folder, where) for given in file.sequences]
+    sequences = [_sequence(given, SYSTEMS[file.system].paths, folder, where) for given in file.sequences]
     seeds: Sequence[int] = range(file.seeds) if isinstance(file.seeds, int) else file.seeds  # a range takes no room
     for what, values in (("sequences", sequences), ("seeds", seeds), ("options", list(file.options))):
         if not values:
@@ -185,8 +167,8 @@ def sweep(
     prepare_folder(out)
     done = read_rows(out / ROWS)
     todo = [job for job in jobs if job.key not in done]
-    told = on_run or (lambda _done, _total: None)
-    told(len(jobs) - len(todo), len(jobs))
+    report = on_run or (lambda _done, _total: None)
+    report(len(jobs) - len(todo), len(jobs))
     try:
         with (out / ROWS).open("a", encoding="utf-8") as file:
             for row in _results(todo, workers, scheduler):
@@ -194,7 +176,7 @@ def sweep(
                 file.flush()
                 os.fsync(file.fileno())
                 done[row["key"]] = row
-                told(sum(job.key in done for job in jobs), len(jobs))
+                report(sum(job.key in done for job in jobs), len(jobs))
     finally:
         rows = [job.facts() | done[job.key]["figures"] for job in jobs if job.key in done]
         # One line per row, figures within figures as NAME.INNER; one that a run does not have is left empty.
@@ -240,7 +222,7 @@ def run_job(job: Job) -> Row:
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        figures = _figures(recordings.filter_recording(system.recording(*map(paths.get, system.fields)), job.config()))
+        figures = _figures(filter_recording(system.recording(*map(paths.get, system.paths)), job.config()))
     except InputError as error:
         figures = {"failure": str(error)}
     finally:

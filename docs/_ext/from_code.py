@@ -37,9 +37,9 @@ class Settings(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """A table for the run and one for each group."""
-        from rbpf.runs.recordings import CONFIGS
+        from rbpf.runs.recordings import SYSTEMS
 
-        config = CONFIGS[self.arguments[0]]()
+        config = SYSTEMS[self.arguments[0]].config()
         return [node for name, part in _groups("", config) for node in _table(name, part)]
 
 

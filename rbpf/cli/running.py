@@ -205,8 +205,8 @@ class RunLaser(RunOptions):
         from rbpf.sensors.readers import LaserOptions
         from rbpf.systems.laser.config import LaserConfig
 
-        told = LaserOptions(self.scanner, self.upside_down, self.max_range, self.recording.part())
-        _run(self, LaserRecording(self.log, told), self.settings(LaserConfig, "laser"))
+        options = LaserOptions(self.scanner, self.upside_down, self.max_range, self.recording.part())
+        _run(self, LaserRecording(self.log, options), self.settings(LaserConfig, "laser"))
 
 
 @RUN.add("mono")

@@ -1,6 +1,6 @@
 """What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -267,12 +267,26 @@ def first_image(sequence: readers.ImageSequence | LiveCamera) -> np.ndarray:
     return first.image
 
 
-#: Of each system's settings, by its name.
-CONFIGS: Mapping[str, type[Any]] = {
-    "range-bearing": RangeBearingConfig, "laser": LaserConfig, "mono": MonoConfig, "stereo": StereoConfig,
-}  # fmt: skip
 #: What the command line filters: it can be opened as often as one likes, and says what it is made of, for config.yaml.
 Recording = RobotRecording | MonoRecording | StereoRecording | LaserRecording
+
+
+class SystemKind(NamedTuple):
+    """A system as command line, reports and sweeps know it."""
+
+    config: type[Any]  #: of its settings.
+    recording: Callable[..., Recording]  #: what it filters, from the paths that are named.
+    #: That make a recording, as config.yaml calls them; all but the first may lack.
+    paths: tuple[str, ...] = ("recording",)
+
+
+#: By their names; a further system is one line here.
+SYSTEMS: Mapping[str, SystemKind] = {
+    "range-bearing": SystemKind(RangeBearingConfig, RobotRecording),
+    "laser": SystemKind(LaserConfig, LaserRecording),
+    "mono": SystemKind(MonoConfig, MonoRecording, ("recording", "known_points", "calibration")),
+    "stereo": SystemKind(StereoConfig, StereoRecording, ("recording", "calibration")),
+}
 
 
 def filter_recording(

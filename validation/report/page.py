@@ -38,7 +38,7 @@ from rbpf.runs.plots import (
 )
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import CONFIGS
+from rbpf.runs.recordings import SYSTEMS
 from rbpf.validation.consistency import comparison as verdicts
 from rbpf.validation.consistency.comparison import Comparison, Verdict
 
@@ -50,13 +50,13 @@ _TITLES = {
 }  # fmt: skip
 #: What a picture shows, by its name without its comparison's; those of a run itself say it in their docstrings.
 _CAPTIONS = {
-    "nees": "Normalised squared error of the pose: inside the band in 95 of 100 steps of an honest filter.",
-    "landmarks": "Distances of the landmarks in σ, beside those of independent ones of an honest filter.",
+    "nees": "Normalised squared error of the pose: inside the band in 95 of 100 steps of a consistent filter.",
+    "landmarks": "Distances of the landmarks in σ, beside those of independent ones of a consistent filter.",
     "map": "The map over what it is compared with.",
     "cloud": "Distances of the landmarks from the surface of COLMAP's points.",
     "ess": "Effective sample size and innovations, frame by frame.",
 }
-#: Paths beside the filter's own that figures of summary.json are told of, by the beginning of their names.
+#: Paths beside the filter's own that figures of summary.json are of, by the beginning of their names.
 _OTHERS = {"odometry_": "odometry", "vo_": "odometry", "batch_": "batch", "final_": "final"}
 _WORDS = {
     "position_rmse_m": "error of the positions, rms",
@@ -130,14 +130,14 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     environment = Environment(loader=loader, autoescape=select_autoescape(), trim_blocks=True, lstrip_blocks=True)
     environment.filters["digits"] = digits
     # System, size, date and version.
-    day, kind = str(record.summary.get("finished", ""))[:10], CONFIGS.get(record.system)
+    day, kind = str(record.summary.get("finished", ""))[:10], SYSTEMS.get(record.system)
     counted = [f"{record.summary[name]} {name}" for name in ("frames", "particles") if name in record.summary]
-    told = {
+    shown = {
         "verdict": verdict,
         "world": world,
         "facts": ", ".join([record.system, *counted, *([day] if day else []), f"rbpf {record.config.get('rbpf', '')}"]),
         # That repeats it; nothing of a system that is not on the command line.
-        "command": "" if kind is None else shlex.join(command_of(record.config, asdict(kind()))),
+        "command": "" if kind is None else shlex.join(command_of(record.config, asdict(kind.config()))),
         "remarks": [*record.summary.get("remarks", ()), *problems],
         "on_frames": record.summary.get("problems", ()),
         "sections": [each for each in sections if any(each.get(part) for part in each if part != "title")],
@@ -145,7 +145,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         "scene": turned,
         "program": program() if turned else "",
     }
-    write_text(folder / PAGE, environment.get_template(PAGE).render(title=record.name, **told))
+    write_text(folder / PAGE, environment.get_template(PAGE).render(title=record.name, **shown))
     return verdict
 
 
