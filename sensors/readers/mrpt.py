@@ -34,12 +34,14 @@ from rbpf.sensors.readers.robot_log import UNNAMED, LogNoise, RobotLog, assemble
 from rbpf.sensors.readers.text import read_csv
 from rbpf.sensors.readers.yaml_files import read_yaml
 
+#: Columns of the tables.
 _POSE = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
-_PLANAR = ("step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp", "cpp")
+PLANAR = ("step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp", "cpp")
 _TRIANGLE = tuple(f"cov{i}{j}" for i, j in combinations_with_replacement(range(6), 2))
-_SPATIAL = ("step", "dx_m", "dy_m", "dz_m", *_POSE[3:], *_TRIANGLE)
+SPATIAL = ("step", "dx_m", "dy_m", "dz_m", *_POSE[3:], *_TRIANGLE)
 _OBSERVATION = ("range_m", "yaw_rad", "pitch_rad", "std_range_m", "std_yaw_rad", "std_pitch_rad")
-_OBSERVATIONS = [("step", "landmark_id", *_OBSERVATION), ("step", *_OBSERVATION)]
+NAMED, ANONYMOUS = ("step", "landmark_id", *_OBSERVATION), ("step", *_OBSERVATION)
+PATH, LANDMARKS = ("step", *_POSE), ("id", *_POSE[:3])
 _MOUNT = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 _PITCH_SIGNS = {"up": 1.0, "down": -1.0}
 
@@ -54,9 +56,9 @@ class Mrpt(Format[LogNoise, RobotLog]):
         return any((path / name).is_file() for name in ("observations.csv", "odometry.csv", "sensor.yaml"))
 
     def read(self, path: Path, noise: LogNoise) -> RobotLog:
-        odometry = read_csv(path / "odometry.csv", [_PLANAR, _SPATIAL], self.kind)
-        table = read_csv(path / "observations.csv", _OBSERVATIONS, self.kind)
-        planar = odometry.columns == _PLANAR
+        odometry = read_csv(path / "odometry.csv", [PLANAR, SPATIAL], self.kind)
+        table = read_csv(path / "observations.csv", [NAMED, ANONYMOUS], self.kind)
+        planar = odometry.columns == PLANAR
         applicable = ["std_range_m", "std_bearing_rad", "scale_odometry"] + ["std_pitch_rad"] * (not planar)
         noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
         # Where the sensor sits; in the plane its height is left out.
@@ -129,7 +131,7 @@ def _read_truth(path: Path, planar: bool) -> Truth | None:
     stamps, poses = np.empty(0, dtype=np.int64), np.empty((0, 3 if planar else 7))
     landmarks: dict[int, np.ndarray] = {}
     if path_file.exists():
-        table = read_csv(path_file, [("step", *_POSE)])
+        table = read_csv(path_file, [PATH])
         stamps = table.integers("step")
         table.require(np.diff(table["step"], prepend=-1) > 0, "step", "later than in the row before, from 0")
         if planar:
@@ -139,7 +141,7 @@ def _read_truth(path: Path, planar: bool) -> Truth | None:
         else:
             poses = SE3.from_ypr(table.block("x_m", "z_m"), *table.block("yaw_rad", "roll_rad").T)
     if landmark_file.exists():
-        table = read_csv(landmark_file, [("id", *_POSE[:3])])
+        table = read_csv(landmark_file, [LANDMARKS])
         positions = table.block("x_m", "y_m" if planar else "z_m")
         landmarks = dict(zip(table.names("id").tolist(), positions, strict=True))
     return Truth(stamps, poses, landmarks)

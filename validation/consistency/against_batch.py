@@ -4,7 +4,7 @@ Frame and chart. Both are given in the run's own world. A pose's covariance is c
 pose to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
 
 What is conditioned on what. The map and the last pose know the same measurements in filter and batch, and are compared as
-Gaussians. An earlier online pose knows its past only, the optimum's also its future: of it the squared error is told that
+Gaussians. An earlier online pose knows its past only, the optimum's also its future: of it the squared error is reported that
 the optimum's posterior expects, see `rbpf.validation.consistency.statistic.posterior_ratio`.
 
 A second witness. The weights of draws from a robot's batch posterior say whether the posterior is the Gaussian that filter and
@@ -74,20 +74,12 @@ class AgainstBatch:
 
     def statistics(self) -> list[Statistic]:
         """Whether poses and landmarks are as far from the truth, by the batch's posterior, as the filter says."""
-        cov, cov_batch, delta = self.pose_errors()
-        ours, theirs = self.ours.landmarks, self.optimum.estimate.landmarks
-        _, rows, others = np.intersect1d(ours.ids, theirs.ids, return_indices=True)
-        found: tuple[Array, ...] = ours.cov[rows], theirs.cov[others], theirs.mean[others] - ours.mean[rows]
-        if self.floats and rows.size:
-            basis = gaussians.across_of(theirs.mean[others] - self.optimum.estimate.world_from_body[0, 4:])
-            found = tuple(gaussians.projected(basis, part) for part in found)
-        known = np.isfinite(found[1]).all(axis=(1, 2))
-        own, batch, apart = (values[known] for values in found)
-        poses = posterior_ratio(POSES, cov, cov_batch, delta)
-        landmarks = posterior_ratio(LANDMARKS, own, batch, apart, same_data=True)
+        both = self.landmarks
+        poses = posterior_ratio(POSES, *self.pose_errors())
+        landmarks = posterior_ratio(LANDMARKS, both.cov, both.cov_other, both.delta, same_data=True)
         return [statistic for statistic in (poses, landmarks) if statistic is not None]
 
-    def pose_errors(self) -> tuple[Array, ...]:
+    def pose_errors(self) -> tuple[Array, Array, Array]:
         """Of B steps the filter's covariances (B, d, d), the batch's, and its poses from the filter's (B, d).
 
         All in the chart at the filter's poses; none where the optimum has no covariances.
@@ -101,7 +93,8 @@ class AgainstBatch:
         if not self.floats:
             return found
         basis = gaussians.across_of(gaussians.away_from_first(ours.world_from_body))
-        return tuple(gaussians.projected(basis, part) for part in found)
+        own, batch, apart = (gaussians.projected(basis, part) for part in found)
+        return own, batch, apart
 
     def as_dict(self) -> dict[str, Any]:
         """Everything for JSON."""

@@ -16,7 +16,7 @@ from rbpf.runs.plots import moved_map
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.trajectory import Similarity
 
-#: What is told of each pair of Gaussians.
+#: What is reported of each pair of Gaussians.
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
 #: A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none.
 _TINY = 1e-9
@@ -56,10 +56,17 @@ class Differences:
     kullback_leibler: Array
     bhattacharyya: Array  #: (K,) the symmetric distance.
     sigma_ratio: Array  #: (K,) the filter's mean standard deviation over the optimum's; below 1 is over-confident.
-    dims: int  #: of the Gaussians.
+    delta: Array  #: (K, n) the filter's means less the optimum's, in the directions that are compared.
+    cov: Array  #: (K, n, n) of the filter, there.
+    cov_other: Array  #: (K, n, n) of the optimum, there.
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    @property
+    def dims(self) -> int:
+        """Of the Gaussians, n."""
+        return self.delta.shape[-1]
 
     def as_dict(self) -> dict[str, Any]:
         """Medians and 90 % quantiles for JSON, and every row."""
@@ -89,8 +96,8 @@ def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differenc
 def compare_last_pose(ours: PathAndMap, other: PathAndMap, step: int, across: bool) -> Differences:
     """The last poses of two estimates, in the chart at the other's, where both have covariances; see `compare_maps`."""
     if not (len(ours.cov_poses) and len(other.cov_poses)):
-        none = np.zeros(0)
-        return Differences(np.zeros(0, dtype=np.int64), none, none, none, none, none, ours.space.dim)
+        none, no_cov = np.zeros((0, ours.space.dim)), np.zeros((0, ours.space.dim, ours.space.dim))
+        return _differences(np.zeros(0, dtype=np.int64), none[:, 0], none, (no_cov, no_cov), None)
     space, mine, theirs = ours.space, ours.world_from_body[-1], other.world_from_body[-1]
     delta = space.local(theirs, mine)
     carry = space.right_jacobian_inverse(delta)
@@ -137,7 +144,9 @@ def _differences(
         kullback_leibler=kullback_leibler(-delta, theirs, ours),
         bhattacharyya=bhattacharyya(delta, ours, theirs),
         sigma_ratio=sigma_ratio(ours, theirs),
-        dims=delta.shape[-1],
+        delta=delta,
+        cov=ours,
+        cov_other=theirs,
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.ranges import MOST, Angle, Count, NotNegative, Positive, Range, Ranged
 from rbpf.runs.files import write_csv, write_text
-from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.sensors.readers import RobotLog, mrpt, open_log
 from rbpf.sensors.readers.robot_log import UNNAMED
 
 
@@ -50,11 +50,9 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     points = [0.0, world.radius_m, 0.0] + rng.uniform(-1, 1, (world.landmarks, 3)) * size
     yaw, pitch, roll = SE3.ypr(truth)
     table = np.column_stack([SE3.translation(truth), yaw, pitch, roll]).tolist()
-    header = ["step", "x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad"]
-    write_csv(folder / "robot_path_groundtruth.csv", header, ([t, *row] for t, row in enumerate(table)))
-    header = ["id", "x_m", "y_m", "z_m"]
+    write_csv(folder / "robot_path_groundtruth.csv", mrpt.PATH, ([t, *row] for t, row in enumerate(table)))
     named = ([i, *place] for i, place in enumerate(points.tolist(), 1))
-    write_csv(folder / "landmarks_groundtruth.csv", header, named)
+    write_csv(folder / "landmarks_groundtruth.csv", mrpt.LANDMARKS, named)
     # Odometry: noise is added to the increment's coordinates, as the log's covariance says.
     delta = SE3.between(truth[:-1], truth[1:])
     yaw, pitch, roll = SE3.ypr(delta)
@@ -62,14 +60,12 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     if world.spatial:
         std = np.array([world.std_translation_m] * 3 + [turn] * 3)
         exact = np.column_stack([SE3.translation(delta), yaw, pitch, roll])
-        header = ["step", "dx_m", "dy_m", "dz_m", "yaw_rad", "pitch_rad", "roll_rad"]
-        header += [f"cov{a}{b}" for a in range(6) for b in range(a, 6)]
     else:
         std = np.array([world.std_translation_m] * 2 + [turn])
         exact = np.column_stack([SE3.translation(delta)[:, :2], yaw])
-        header = ["step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp", "cpp"]
     noisy = exact + std * rng.standard_normal(exact.shape)
     cov = np.diag(std**2)[np.triu_indices(std.size)].tolist()
+    header = mrpt.SPATIAL if world.spatial else mrpt.PLANAR
     write_csv(folder / "odometry.csv", header, ([t, *row, *cov] for t, row in enumerate(noisy.tolist(), 1)))
     # Range, yaw and pitch of the landmarks that are near enough and in view.
     turn = np.deg2rad(world.std_angle_deg)
@@ -86,8 +82,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
             [t, UNNAMED if world.unnamed else i + 1, *row, *std]
             for i, row in zip(np.flatnonzero(seen).tolist(), noisy.tolist(), strict=True)
         )
-    header = ["step", "landmark_id", "range_m", "yaw_rad", "pitch_rad"]
-    write_csv(folder / "observations.csv", [*header, "std_range_m", "std_yaw_rad", "std_pitch_rad"], rows)
+    write_csv(folder / "observations.csv", mrpt.NAMED, rows)
     text = (
         "robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}\n"
         f"std: {{range_m: {world.std_range_m}, yaw_deg: {world.std_angle_deg}, pitch_deg: {world.std_angle_deg}}}\n"
