@@ -1,6 +1,7 @@
 """A finished run, for people: in a notebook, a script, or a shell.
 
-run = rbpf.load("RUN") run.trajectory, run.covariance, run.map, run.to_dataframe(), run.plot()
+run = rbpf.load("RUN")
+run.trajectory, run.covariance, run.map, run.to_dataframe(), run.plot()
 """
 
 from html import escape

@@ -253,13 +253,13 @@ class Carmen(Format[LaserOptions, ScansOfFile]):
         else:
             laser, odometry = np.stack([one.poses for _, one in found if one.poses is not None], axis=1)
             scans, mounts = replace(scans, odometry=odometry), SE2.between(odometry, laser)
-        # Where it sits: as all lines imply, else as the parameters tell, zero where they do not.
-        told = np.array([params.get(key, 0.0) for key in offsets])
+        # Where it sits: as all lines imply, else as the parameters say, zero where they do not.
+        stated = np.array([params.get(key, 0.0) for key in offsets])
         same = len(mounts) > 0 and float(np.abs(SE2.local(mounts[0], mounts)).max()) < 1e-3
-        if same and (np.abs(mounts[0]).max() > 1e-3 or not told.any()):
+        if same and (np.abs(mounts[0]).max() > 1e-3 or not stated.any()):
             mount = np.asarray(mounts[0])
         elif not rear:
-            mount = np.asarray(SE2.normalise(told))
+            mount = np.asarray(SE2.normalise(stated))
         else:
             _log.warning(
                 "%s: nothing says where %s sits; taken as in the robot's middle, looking backwards.", path, name
@@ -322,8 +322,8 @@ class _Line(NamedTuple):
     @property
     def beams(self) -> str:
         """In words, which differ where they do."""
-        told = [f"{name} {value:g}" for name, value in zip(_HEAD[1:5], self.head[1:5], strict=False)]
-        return ", ".join([f"{self.ranges.size} readings", *told])
+        named = [f"{name} {value:g}" for name, value in zip(_HEAD[1:5], self.head[1:5], strict=False)]
+        return ", ".join([f"{self.ranges.size} readings", *named])
 
 
 def _not_beams(start: float, step: float, count: int) -> str:

@@ -6,7 +6,7 @@ that from S seeds with mean m and variance s² of log Ẑ
 
     log Z ≈ m + s²/2,   with variance  s²/S + s⁴ / (2 (S − 1))
 
-That law is of no use where s is large: then log Z is taken as the logarithm of the mean of Ẑ, which a single seed may
+That distribution is of no use where s is large: then log Z is taken as the logarithm of the mean of Ẑ, which a single seed may
 carry, with s for its error.
 
 Where a robot's landmarks are named and its likelihood is Gaussian, the filter's model is the batch's, and Ẑ is that of
@@ -35,7 +35,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
-NOISY = 3.0  #: Spread s of log Ẑ over the seeds beyond which its law is not used.
+NOISY = 3.0  #: Spread s of log Ẑ over the seeds beyond which its distribution is not used.
 CLEAR = 2.0  #: A difference of this many of its errors is one.
 Config = RangeBearingConfig | MonoConfig | StereoConfig
 Data = Path | RobotRecording | RobotLog | FeatureLog
@@ -103,7 +103,7 @@ def compare_evidence(
         raise InputError(f"a {type(config_a).__name__} does not filter a {type(data).__name__}")
     if len(seeds) < 2:
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
-    # What is told of landmarks must be the same, and must be counted once.
+    # What is given of landmarks must be the same, and must be counted once.
     for name, config in (("first", config_a), ("second", config_b)):
         if not isinstance(config, MonoConfig) and not config.likelihood.build().normalised:
             raise InputError(

@@ -65,8 +65,8 @@ class Statistic:
     def entries(self) -> dict[str, Any]:
         """For JSON; bounds that are infinite are null."""
         values = asdict(self) | {"outcome": self.outcome}
-        told = {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in values.items()}
-        return told | {"zone": [bound if np.isfinite(bound) else None for bound in self.zone]}
+        found = {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in values.items()}
+        return found | {"zone": [bound if np.isfinite(bound) else None for bound in self.zone]}
 
     @classmethod
     def of_entries(cls, entries: dict[str, Any]) -> "Statistic":
@@ -87,7 +87,7 @@ class WhitenedErrors:
 
     @property
     def nees(self) -> np.ndarray:
-        """(T,) normalised errors squared; the mean of an consistent filter's is the rank."""
+        """(T,) normalised errors squared; the mean of a consistent filter's is the rank."""
         return np.square(self.errors).sum(axis=1)
 
 
@@ -163,7 +163,7 @@ def posterior_ratio(
     normalised squared error tr P_f⁻¹ (P_b + δ δᵀ), δ = m_b − m_f: the rank of P_f for a filter that lost nothing. An
     online estimate knows less than the posterior of all measurements, so that its δ is random, of covariance
     P_f − P_b; the interval is that of this part. Where both know the same, as of a map, no part is random, and the median
-    over the estimates is told: a few landmarks of which the filter has a prior and the posterior has none, or that hang on
+    over the estimates is reported: a few landmarks of which the filter has a prior and the posterior has none, or that hang on
     a false match, say nothing of the others. None without any estimate that is uncertain. P_f, P_b (T, d, d) and
     δ (T, d) are in one chart; with `same_data` both know the same.
     """
@@ -200,7 +200,7 @@ def map_ratio(name: str, positions: np.ndarray, white: np.ndarray) -> Statistic:
 
 
 def step_ratio(name: str, squares: np.ndarray, dofs: np.ndarray, factor: float = NOISE_FACTOR) -> Statistic | None:
-    """Ratio of squared errors (T,), each χ² of `dofs` (T,) for an consistent filter and independent from step to step.
+    """Ratio of squared errors (T,), each χ² of `dofs` (T,) for a consistent filter and independent from step to step.
 
     Where the steps are correlated, or scatter more than χ² does, they count for less. None without any.
     """

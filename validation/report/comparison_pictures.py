@@ -139,11 +139,11 @@ def _nees(run: RunFolder, errors: TruthErrors) -> tuple[np.ndarray, np.ndarray]:
 def consistency_figure(
     title: str, words: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], dim: int, banded: bool, ax: Any = None
 ) -> Any:
-    """Normalised squared errors (R,) over the steps (R,) by name, their mean, and where an honest filter's would lie."""
+    """Normalised squared errors (R,) over the steps (R,) by name, their mean, and where a consistent filter's would lie."""
     (figure, axes), band = new_axes(title, words, "step", ax=ax), chi_square_band(dim)
     low = band.low if banded else 0.1
     if banded:
-        axes.axhspan(low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
+        axes.axhspan(low, band.high, color="tab:green", alpha=0.2, label="95 % band of a consistent filter, each step")
     axes.axhline(dim, color="tab:green", lw=0.8, label=f"its mean, {dim}")
     least = 0.5 * low
     for name, (rows, values) in curves.items():
@@ -157,12 +157,12 @@ def consistency_figure(
 
 
 def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
-    """Distances of landmarks (M,) in σ, in order, beside those that an honest filter's would have."""
+    """Distances of landmarks (M,) in σ, in order, beside those that a consistent filter's would have."""
     figure, axes = new_axes(title, "distance [σ of the filter]", "landmark")
     places = np.arange(1, squares.size + 1)
     right = np.sqrt(chi_square_quantile((places - 0.5) / squares.size, dim))
     axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
-    axes.plot(places, right, color="tab:green", lw=1.0, label="independent landmarks of an honest filter")
+    axes.plot(places, right, color="tab:green", lw=1.0, label="independent landmarks of a consistent filter")
     axes.set_ylim(bottom=0.0)
     axes.legend(fontsize="small")
     return figure

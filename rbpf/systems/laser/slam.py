@@ -191,8 +191,8 @@ class LaserSlam(Kept, System):
             way, turned = float(np.hypot(delta[1], delta[2])), float(abs(delta[0]))
             has_delta = max(way, turned) <= fastest * max(seconds, 0.1)
             if not has_delta:
-                told = f"{way:.1f} m and {np.degrees(turned):.0f} degrees in {seconds:.2f} s"
-                messages.append(f"the odometry jumps by {told}: the motion is assumed to go on as before")
+                jump = f"{way:.1f} m and {np.degrees(turned):.0f} degrees in {seconds:.2f} s"
+                messages.append(f"the odometry jumps by {jump}: the motion is assumed to go on as before")
         if has_delta:
             self._moved += [way, turned, 0.0]
         elif self.filter.steps:  # before, the world begins where the first scan is taken

@@ -2,7 +2,7 @@
 
 slam = RangeBearingSlam(RangeBearingConfig(particles=100))
 for stamp_ns, odometry, names, z, cov_z in log:
-frame = slam.track(z, cov_z, names, odometry, stamp_ns)
+    frame = slam.track(z, cov_z, names, odometry, stamp_ns)
 """
 
 from typing import Any, ClassVar, final
