@@ -150,6 +150,9 @@ def inverse(matrix: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batc
 #: Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.forward` begins to bend: (u, v)
 #: and its errors grow without bound towards 90°.
 MAX_ANGLE = np.deg2rad(75.0)
+#: Least depth of a direction over its length, see `rbpf.sensors.camera.points.clamp_depth`; below cos MAX_ANGLE, so that
+#: nothing that is seen is clamped.
+MIN_DEPTH_FRACTION = 0.2
 NEAR = 1e-16  #: Squared distance from the axis below which the lens is its own tangent, to rounding.
 ANGLE_SETTLED = 1e-15  #: A step of the angle, relative to 1, that ends the iteration of `undistort`.
 

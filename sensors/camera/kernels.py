@@ -12,7 +12,7 @@ from numba import boolean, int64, njit, types
 from rbpf.kernels.block import flat, rotation_at, store_by_state
 from rbpf.kernels.se3 import back, rotation, times
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
-from rbpf.sensors.camera.distortion import NEAR
+from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION, NEAR
 
 KIND = 9  #: Place of the lens in `Pinhole.params`, the last one: 0 radial-tangential, 1 equidistant.
 #: Pixel of a point and its Jacobian by rows: (px, py, d00, d01, d02, d10, d11, d12).
@@ -67,9 +67,6 @@ def project_equidistant(x: float, y: float, z: float, params: np.ndarray) -> Pro
     d00, d01, d10, d11 = fx * (scale + bend * u * u), fx * uv, fy * uv, fy * (scale + bend * v * v)
     px, py = params[0] * scale * u + params[2], params[1] * scale * v + params[3]
     return px, py, d00, d01, -(d00 * u + d01 * v), d10, d11, -(d10 * u + d11 * v)
-
-
-MIN_DEPTH_FRACTION = 0.2  #: The same as `rbpf.sensors.camera.points.MIN_DEPTH_FRACTION`; the tests compare them.
 
 
 @njit(cache=True, error_model="numpy", inline="always")

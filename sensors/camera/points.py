@@ -16,10 +16,9 @@ from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Part, Rec
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION
 
 Given = Array | None  #: What a model may read, see `ObservationModel`.
-#: Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside.
-MIN_DEPTH_FRACTION = 0.2
 
 
 class CameraModel(ObservationModel):

@@ -12,8 +12,9 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION
 from rbpf.sensors.camera.kernels import in_view, project
-from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay, MembersView, StereoPoint
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay, MembersView, StereoPoint
 from rbpf.systems.mono.feature_table import directions
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN, Rays, compiled, with_velocity

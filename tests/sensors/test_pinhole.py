@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.camera.distortion import MAX_ANGLE, Equidistant
-from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION
+from rbpf.sensors.camera.distortion import MAX_ANGLE, MIN_DEPTH_FRACTION, Equidistant
 
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
 TUM_VI = (0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182)
