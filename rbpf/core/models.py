@@ -509,7 +509,7 @@ class Conditional(ABC):
 
 
 class Map(Conditional):
-    """Landmarks, given the sampled states: what sensors ask of it and do to it. `rbpf.maps.LandmarkMap` is one.
+    """Landmarks, given the sampled states: what sensors ask of it and do to it. `rbpf.maps.landmark_map.LandmarkMap` is one.
 
     `evidence` says whether it keeps, per particle, the log-odds that each landmark exists.
     """

@@ -147,7 +147,7 @@ def inverse(matrix: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batc
     return adjugate / _determinant(matrix)[..., None, None]
 
 
-#: Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.forward` begins to bend: (u, v)
+#: Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.clamp_depth` begins to bend: (u, v)
 #: and its errors grow without bound towards 90°.
 MAX_ANGLE = np.deg2rad(75.0)
 #: Least depth of a direction over its length, see `rbpf.sensors.camera.points.clamp_depth`; below cos MAX_ANGLE, so that
