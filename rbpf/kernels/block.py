@@ -87,65 +87,82 @@ def rotation_at(pose, i):
 
 
 @njit(cache=True, error_model="numpy")
-def cholesky(total, count, scale):
-    """Replaces the lower triangle of `total` by its Cholesky factor with INVERTED diagonal; scale *= Π 1/l_aa."""
+def whiten(total, count, vector, scale, squared):
+    """Replaces the lower triangle of `total` by its Cholesky factor L with INVERTED diagonal, and a vector by L⁻¹ times it.
+
+    `scale` is multiplied by the inverted pivots, the vector's square is added to `squared`. Three rows take a pass each.
+    """
     p = total.shape[0]
-    for a in range(p):
+    for i in range(count):
+        pivot = 1.0 / math.sqrt(total[0, 0, i])
+        total[0, 0, i] = pivot
+        scale[i] *= pivot
+        vector[0, i] *= pivot
+        squared[i] += vector[0, i] * vector[0, i]
+    if p > 1:
+        for i in range(count):
+            first = total[1, 0, i] * total[0, 0, i]
+            pivot = 1.0 / math.sqrt(total[1, 1, i] - first * first)
+            total[1, 0, i] = first
+            total[1, 1, i] = pivot
+            scale[i] *= pivot
+            rest = (vector[1, i] - first * vector[0, i]) * pivot
+            vector[1, i] = rest
+            squared[i] += rest * rest
+    if p > 2:
+        for i in range(count):
+            first = total[2, 0, i] * total[0, 0, i]
+            second = (total[2, 1, i] - first * total[1, 0, i]) * total[1, 1, i]
+            pivot = 1.0 / math.sqrt(total[2, 2, i] - first * first - second * second)
+            total[2, 0, i] = first
+            total[2, 1, i] = second
+            total[2, 2, i] = pivot
+            scale[i] *= pivot
+            rest = (vector[2, i] - first * vector[0, i] - second * vector[1, i]) * pivot
+            vector[2, i] = rest
+            squared[i] += rest * rest
+    for a in range(3, p):
         for b in range(a):
             for c in range(b):
                 for i in range(count):
                     total[a, b, i] -= total[a, c, i] * total[b, c, i]
             for i in range(count):
                 total[a, b, i] *= total[b, b, i]
-        for c in range(a):
-            for i in range(count):
-                total[a, a, i] -= total[a, c, i] * total[a, c, i]
+                total[a, a, i] -= total[a, b, i] * total[a, b, i]
+                vector[a, i] -= total[a, b, i] * vector[b, i]
         for i in range(count):
-            t = 1.0 / math.sqrt(total[a, a, i])
-            total[a, a, i] = t
-            scale[i] *= t
-
-
-@njit(cache=True, error_model="numpy")
-def whiten_vector(factor, count, vector):
-    """Solves L y = vector in place, for a factor made by `cholesky`."""
-    for a in range(factor.shape[0]):
-        for c in range(a):
-            for i in range(count):
-                vector[a, i] -= factor[a, c, i] * vector[c, i]
-        for i in range(count):
-            vector[a, i] *= factor[a, a, i]
+            pivot = 1.0 / math.sqrt(total[a, a, i])
+            total[a, a, i] = pivot
+            scale[i] *= pivot
+            vector[a, i] *= pivot
+            squared[i] += vector[a, i] * vector[a, i]
 
 
 @njit(cache=True, error_model="numpy")
 def whiten_matrix(factor, count, matrix):
-    """Solves L Y = matrix in place, for a factor made by `cholesky`; up to three rows in one pass each."""
+    """Solves L Y = matrix in place, for a factor made by `whiten`; up to three rows in one pass."""
     p = matrix.shape[0]
     for e in range(matrix.shape[1]):
-        for i in range(count):
-            matrix[0, e, i] *= factor[0, 0, i]
-        if p > 1:
+        if p == 1:
             for i in range(count):
-                rest = matrix[1, e, i] - factor[1, 0, i] * matrix[0, e, i]
-                matrix[1, e, i] = rest * factor[1, 1, i]
-        if p > 2:
+                matrix[0, e, i] *= factor[0, 0, i]
+        elif p == 2:
             for i in range(count):
-                rest = matrix[2, e, i] - factor[2, 0, i] * matrix[0, e, i] - factor[2, 1, i] * matrix[1, e, i]
-                matrix[2, e, i] = rest * factor[2, 2, i]
+                first = matrix[0, e, i] * factor[0, 0, i]
+                matrix[0, e, i] = first
+                matrix[1, e, i] = (matrix[1, e, i] - factor[1, 0, i] * first) * factor[1, 1, i]
+        else:
+            for i in range(count):
+                first = matrix[0, e, i] * factor[0, 0, i]
+                second = (matrix[1, e, i] - factor[1, 0, i] * first) * factor[1, 1, i]
+                rest = matrix[2, e, i] - factor[2, 0, i] * first - factor[2, 1, i] * second
+                matrix[0, e, i], matrix[1, e, i], matrix[2, e, i] = first, second, rest * factor[2, 2, i]
         for a in range(3, p):
             for c in range(a):
                 for i in range(count):
                     matrix[a, e, i] -= factor[a, c, i] * matrix[c, e, i]
             for i in range(count):
                 matrix[a, e, i] *= factor[a, a, i]
-
-
-@njit(cache=True, error_model="numpy")
-def add_squares(vector, count, total):
-    """Total += vectorᵀ vector."""
-    for a in range(vector.shape[0]):
-        for i in range(count):
-            total[i] += vector[a, i] * vector[a, i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -172,11 +189,14 @@ def add_gram(matrix, sign, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_transposed_product(matrix, vector, count, total):
-    """Total += matrixᵀ vector; three rows in one pass, as in `add_gram`."""
+    """Total += matrixᵀ vector; up to three rows in one pass, as in `add_gram`."""
     p = matrix.shape[0]
-    done = 3 if p > 2 else 0
+    done = min(p, 3) if p > 1 else 0
     for e in range(matrix.shape[1]):
-        if p > 2:
+        if p == 2:
+            for i in range(count):
+                total[e, i] = total[e, i] + matrix[0, e, i] * vector[0, i] + matrix[1, e, i] * vector[1, i]
+        elif p > 2:
             for i in range(count):
                 first = total[e, i] + matrix[0, e, i] * vector[0, i]
                 total[e, i] = first + matrix[1, e, i] * vector[1, i] + matrix[2, e, i] * vector[2, i]
@@ -230,17 +250,22 @@ def _innovation_covariance_of_two(jac, cov, noise, count, cross, total):
 
 @njit(cache=True, error_model="numpy")
 def _innovation_covariance_of_three(jac, cov, noise, count, cross, total):
+    one, other, spread, out, n = flat(jac), flat(cov), flat(cross), flat(total), BLOCK
     for a in range(len(jac)):
-        for c in range(3):
-            k, m, n = packed(0, c), packed(1, c), packed(2, c)
+        row = 3 * a * BLOCK
+        end, r = (a * len(jac) + a) * BLOCK, noise[a, a]
+        for i in range(count):
+            x, y, z = one[row + i], one[row + n + i], one[row + 2 * n + i]
+            first = x * other[i] + y * other[n + i] + z * other[3 * n + i]
+            second = x * other[n + i] + y * other[2 * n + i] + z * other[4 * n + i]
+            third = x * other[3 * n + i] + y * other[4 * n + i] + z * other[5 * n + i]
+            spread[row + i], spread[row + n + i], spread[row + 2 * n + i] = first, second, third
+            out[end + i] = r + first * x + second * y + third * z
+        for b in range(a):
+            left, end, r = 3 * b * BLOCK, (a * len(jac) + b) * BLOCK, noise[a, b]
             for i in range(count):
-                first = jac[a, 0, i] * cov[k, i] + jac[a, 1, i] * cov[m, i]
-                cross[a, c, i] = first + jac[a, 2, i] * cov[n, i]
-        for b in range(a + 1):
-            r = noise[a, b]
-            for i in range(count):
-                first = r + cross[a, 0, i] * jac[b, 0, i] + cross[a, 1, i] * jac[b, 1, i]
-                total[a, b, i] = first + cross[a, 2, i] * jac[b, 2, i]
+                first = r + spread[row + i] * one[left + i] + spread[row + n + i] * one[left + n + i]
+                out[end + i] = first + spread[row + 2 * n + i] * one[left + 2 * n + i]
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rbpf.kernels.block import add_spread, add_squares, cholesky, whiten_vector
+from rbpf.kernels.block import add_spread, whiten
 from rbpf.kernels.signature import BLOCK
 
 
@@ -33,16 +33,14 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
         for i in range(count):
             white[a, i] = nu[a, i]
     add_spread(jac_state, factor, start, count, column, spread)
-    cholesky(spread, count, scale)
-    whiten_vector(spread, count, white)
-    add_squares(white, count, squared)
+    whiten(spread, count, white, scale, squared)
     if kernel_id == 3:
         # d² + log|S + H Q Hᵀ|/|S|, so that it is as probable as an outlier at the limit.
         for i in range(count):
             squared[i] -= 2.0 * math.log(scale[i])
             scale[i] = 1.0
         _copy_lower(total, count, spread)
-        cholesky(spread, count, scale)
+        whiten(spread, count, white, scale, column[0])  # for the pivots alone
         for i in range(count):
             squared[i] += 2.0 * math.log(scale[i])
     for i in range(count):

@@ -84,10 +84,8 @@ def _refine_block(block, fused, records, observed, factor, sizes, sums):
                 weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
             accept_predicted(kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty)
             leave_out(weight, count, nu, jac_state, total)
-        lanes.cholesky(total, count, scale)
-        lanes.whiten_vector(total, count, nu)
+        lanes.whiten(total, count, nu, scale, sum_quad)
         lanes.whiten_matrix(total, count, jac_state)
-        lanes.add_squares(nu, count, sum_quad)
         lanes.add_gram(jac_state, 1.0, count, sum_info)
         lanes.add_transposed_product(jac_state, nu, count, sum_vector)
         pivots += p
@@ -183,9 +181,7 @@ def _update_block(block, fused, records, targets, observed, sizes, log_density):
             for i in range(count):
                 squared[i] = 0.0
                 scale[i] = 1.0
-        lanes.cholesky(total, count, scale)
-        lanes.whiten_vector(total, count, nu)
-        lanes.add_squares(nu, count, squared)
+        lanes.whiten(total, count, nu, scale, squared)
         rejected = False
         if kernel_id == 0:
             pivots += p

@@ -12,7 +12,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 #: Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache.
-BLOCK = 128
+BLOCK = 256
 #: Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double.
 FACTORS_PER_LOG = 18
 #: Particle-observation pairs worth a thread: a quarter of a millisecond of work, far above a wake-up.
