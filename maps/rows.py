@@ -185,8 +185,9 @@ class RowEngine:
                 total.add(self._information_numpy(batch, group, state, prior))
                 continue
             factor = np.ascontiguousarray(prior.factor)
-            for part in self._parts(batch, group):
-                fused, measured, sizes = self._observed(part, group, state, EVERYTHING)
+            kernel = fused_kernel(group.model)
+            for part in self._parts(batch, kernel):
+                fused, measured, sizes = self._observed(part, group, kernel, state, EVERYTHING)
                 access, pairs = tuple(self.store.access(part.ids)), state.shape[0] * part.ks.size
                 run_driver(refine, pairs, fused, access, measured, factor, sizes, out, alone=refine_alone)
         for rows in plan.joint:
@@ -214,8 +215,9 @@ class RowEngine:
                 for part in _one_after_the_other(batch):
                     self._correct_once(part, group, state, log_density)
                 continue
-            for part in self._parts(batch, group):
-                fused, measured, sizes = self._observed(part, group, state, MAP)
+            kernel = fused_kernel(group.model)
+            for part in self._parts(batch, kernel):
+                fused, measured, sizes = self._observed(part, group, kernel, state, MAP)
                 access, targets = self.store.rewrite(part.ids)
                 what = fused, tuple(access), targets, measured, sizes, log_density
                 run_driver(update, state.shape[0] * part.ks.size, *what, alone=update_alone)
@@ -229,9 +231,9 @@ class RowEngine:
     def _is_compiled(self, group: Observations) -> bool:
         return self.compiled and _likelihood(group).kernel_id >= 0
 
-    def _parts(self, batch: Batch, group: Observations) -> list[Batch]:
+    def _parts(self, batch: Batch, kernel: FusedKernel | None) -> list[Batch]:
         """A batch as the drivers take it: whole, or so much of it at once as NumPy linearises in the cache."""
-        if group.model.kernel() is not None:
+        if kernel is not None:
             return [batch]
         size = max(1, PAIRS_AT_ONCE // self.store.n)
         return [
@@ -241,14 +243,14 @@ class RowEngine:
         ]
 
     def _observed(
-        self, batch: Batch, group: Observations, state: np.ndarray, by: frozenset[Part]
+        self, batch: Batch, group: Observations, kernel: FusedKernel | None, state: np.ndarray, by: frozenset[Part]
     ) -> tuple[tuple[Any, ...], tuple[Any, ...], np.ndarray]:
         """What both drivers take: the kernel and the states; the measurements and their likelihood; the sizes d, D, A.
 
         A model without a kernel is linearised in NumPy, and its rows are handed on.
         """
         likelihood, landmark = _likelihood(group), self.layout_of(int(batch.ids[0])).landmark
-        z, kernel = group.z[batch.ks], fused_kernel(group.model)
+        z = group.z[batch.ks]
         if kernel is None:
             _, records = self._read(batch.ids)
             nu, jac = linearise(group.model, self.space, z, state[:, None], records.mean, records.const, by=by)

@@ -323,8 +323,8 @@ class SharedStore:
         at = self.columns.rows(columns)
         slabs = self.columns.slab[at]
         if slabs.min() < 0:
-            cold = np.unique(columns[slabs < 0])
-            for column, records in zip(cold.tolist(), self.read_all(cold), strict=True):
+            cold = sorted(set(columns[slabs < 0].tolist()))
+            for column, records in zip(cold, self.read_all(np.array(cold)), strict=True):
                 self.replace(column, records)
             slabs = self.columns.slab[at]
         generations = self.columns.generation[at].tolist()
@@ -347,19 +347,20 @@ class SharedStore:
         generations = self.columns.generation[at]
         if (generations == now).all():
             return access, access.slabs
-        stale = np.unique(columns[generations != now])
-        rows, pool = self.columns.rows(stale), self._pool(int(at[0]))
+        named = columns.tolist()
+        past = dict(sorted(zip(named, generations.tolist(), strict=True)))
+        stale = [column for column, generation in past.items() if generation != now]
+        rows, pool = self.columns.rows(np.array(stale)), self._pool(int(at[0]))
         old = self.columns.slab[rows].copy()
-        self.columns.slab[rows] = pool.take(stale.size)
+        self.columns.slab[rows] = pool.take(len(stale))
         pool.give(old)
         # All of one past generation together, as a resampling leaves them.
-        past = self.columns.generation[rows]
-        for generation in np.unique(past).tolist():
-            self._leave(generation, stale[past == generation].tolist())
+        for generation in {past[column] for column in stale}:
+            self._leave(generation, [column for column in stale if past[column] == generation])
         self.columns.generation[rows] = now
-        self._join(stale.tolist(), now)
+        self._join(stale, now)
         targets = self.columns.slab[at]
-        if len(set(columns.tolist())) == columns.size:
+        if len(past) == columns.size:
             return Access(pool.data, access.slabs, access.which, access.maps), targets
         _, first = np.unique(columns, return_index=True)
         again = np.ones(columns.size, dtype=bool)

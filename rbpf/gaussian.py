@@ -142,7 +142,7 @@ def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n
 
 def log_det(chol: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
     """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...)."""
-    return 2.0 * np.log(np.asarray(chol, dtype=float).diagonal(axis1=-2, axis2=-1)).sum(-1)
+    return _looked_up(_log_det, chol)
 
 
 def log_density(
@@ -181,6 +181,10 @@ def unscented_transform(
     values = function(mean + offsets)
     mean_y = np.einsum("s,s...->...", weights, values)
     return mean_y, gram(np.moveaxis(values - mean_y, 0, -1) * np.sqrt(weights))
+
+
+def _log_det(chol: Array) -> Array:
+    return np.asarray(2.0 * np.log(chol.diagonal(axis1=-2, axis2=-1)).sum(-1))
 
 
 def _looked_up(factor: Callable[[Array], Array], cov: Like[ArrayLike, "*batch n n"]) -> Array:

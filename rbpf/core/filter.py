@@ -5,8 +5,7 @@
 The bootstrap filter, FastSLAM 2.0 and the exact importance ratio, Mathematics (correction), differ in the proposal.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
@@ -184,7 +183,7 @@ class Filter:
         it was; otherwise it stands between two steps: `load` a checkpoint.
         """
         proposal = proposal or self.proposal
-        with self._unchanged_by_failure():
+        with _UnchangedByFailure(self):
             # Predict, and observe given the prediction.
             stamp_ns, dt = self._clock(stamp_ns)
             prior = self._predict(control, dt)
@@ -329,7 +328,7 @@ class Filter:
         Raises InputError: the file is missing, damaged, or belongs to another filter.
         """
         arrays, rng_state = checkpoint.read_checkpoint(Path(path), self._fingerprint())
-        with self._unchanged_by_failure(), checkpoint.fitting(Path(path)):
+        with _UnchangedByFailure(self), checkpoint.fitting(Path(path)):
             self.restore(arrays)
             self.rng.bit_generator.state = rng_state
         return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
@@ -388,20 +387,6 @@ class Filter:
             "random generator": type(self.rng.bit_generator).__name__,
         }
 
-    @contextmanager
-    def _unchanged_by_failure(self) -> Iterator[None]:
-        """Puts the filter back as it was where it is refused; what it would be takes new objects, never the old ones."""
-        held = [(item, dict(vars(item))) for item in (self, *self.marginals.parts.values())]
-        rng_state = self.rng.bit_generator.state
-        try:
-            yield
-        except InputError:
-            for item, attributes in held:
-                vars(item).clear()
-                vars(item).update(attributes)
-            self.rng.bit_generator.state = rng_state
-            raise
-
     def _clock(self, stamp_ns: int | None) -> tuple[int, float]:
         previous = self.stamp_ns
         if stamp_ns is None:
@@ -458,6 +443,24 @@ class Filter:
                 ids.append(its.map.add(new_landmarks, self.particles.state))
             first = end
         return np.concatenate(ids)
+
+
+class _UnchangedByFailure:
+    """Puts a filter back as it was where it is refused; what it would be takes new objects, never the old ones."""
+
+    def __init__(self, of: Filter) -> None:
+        self._held = [(item, dict(vars(item))) for item in (of, *of.marginals.parts.values())]
+        self._rng, self._rng_state = of.rng.bit_generator, of.rng.bit_generator.state
+
+    def __enter__(self) -> None:
+        """What to go back to is held already."""
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and issubclass(kind, InputError):
+            for item, attributes in self._held:
+                vars(item).clear()
+                vars(item).update(attributes)
+            self._rng.state = self._rng_state
 
 
 def are_explained(groups: Sequence[Observations]) -> bool:

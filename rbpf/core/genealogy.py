@@ -113,14 +113,14 @@ class Lineage:
         self._alive[generation] = alive
         return alive
 
-    def due(self) -> list[int]:
-        """Past generations, ascending, whose rows are worth compacting now: at ages growing by a quarter.
+    def due(self, oldest: int = 0) -> list[int]:
+        """Past generations from `oldest` on, ascending, whose rows are worth compacting now: at ages growing by a quarter.
 
         Lineages coalesce ever more slowly.
         """
         due = []
         age = _FIRST_CHECK
-        while age <= self.generation:
+        while age <= self.generation - oldest:
             due.append(self.generation - age)
             age += max(_FIRST_CHECK, age // 4)
         due.reverse()
@@ -291,10 +291,10 @@ class History:
         now = self.lineage.generation
         block = self._blocks.get(now)
         if block is None:
-            block = self._blocks[now] = PathBlock(now, np.arange(state.shape[0]), [], [], [])
+            block = self._blocks[now] = PathBlock(now, self.lineage.rows(now), [], [], [])
             self.lineage.retain(now)
             # Blocks whose lineages have coalesced shrink to the rows that still have descendants.
-            for generation in [] if self.clouds or len(self._blocks) == 1 else self.lineage.due():
+            for generation in [] if self.clouds else self.lineage.due(next(iter(self._blocks))):
                 past = self._blocks.get(generation)
                 if past is None or past.kept.size == 1:
                     continue

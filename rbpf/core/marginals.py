@@ -271,6 +271,8 @@ class Marginals(Conditional):
         self.space = space
         self.parts = {part.supplies: part for part in (StateOnly(space), *parts)}
         self._holder = dict(self.parts)
+        #: Who takes groups of a part and of what their model reads.
+        self._found = dict[tuple[Part | None, frozenset[Part]], Conditional]()
         for part in parts:
             self._holder |= dict.fromkeys(part.also, part)
         held = [part.supplies for part in parts] + [other for part in parts for other in part.also - {Part.STATE}]
@@ -376,21 +378,26 @@ class Marginals(Conditional):
     def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
         routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
         for group in groups:
-            wanted = {group.part} if group.part is not None else group.model.reads - {Part.STATE} or {Part.STATE}
-            holders = {self._holder.get(part) for part in wanted}
-            if len(holders) > 1:
-                raise InputError(
-                    f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
-                    "sample that part of the substate instead, or hold both in a JointMap"
-                )
-            holder = holders.pop()
-            if holder is None:
-                what = "raw data are for" if group.data is not None else f"{type(group.model).__name__} reads"
-                raise InputError(f"{what} a {next(iter(wanted))}, which this filter does not hold")
+            to = group.part, frozenset(group.model.reads)
+            holder = self._found[to] = self._found.get(to) or self._holder_of(group)
             if group.data is not None and not holder.takes_raw:
                 raise InputError(f"{type(holder).__name__} takes no raw data, but rows with an observation model")
             routed[holder.supplies].append(group)
         return routed
+
+    def _holder_of(self, group: Observations) -> Conditional:
+        wanted = {group.part} if group.part is not None else group.model.reads - {Part.STATE} or {Part.STATE}
+        holders = {self._holder.get(part) for part in wanted}
+        if len(holders) > 1:
+            raise InputError(
+                f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
+                "sample that part of the substate instead, or hold both in a JointMap"
+            )
+        holder = holders.pop()
+        if holder is None:
+            what = "raw data are for" if group.data is not None else f"{type(group.model).__name__} reads"
+            raise InputError(f"{what} a {next(iter(wanted))}, which this filter does not hold")
+        return holder
 
 
 def prefix(part: Part) -> str:
