@@ -24,7 +24,9 @@ if TYPE_CHECKING or "jaxtyping" not in sys.modules:
 else:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Bool", "Float", "Int", "Like", "numbers"]
+__all__ = ["Array", "Bool", "Float", "Int", "Like", "numbers"]
+
+Array = NDArray[np.float64]
 
 
 def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:

@@ -14,10 +14,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbpf.arrays import Float, Like
+from rbpf.arrays import Array, Float, Like
 from rbpf.errors import InputError
-
-Array = NDArray[np.float64]
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 _ASYMMETRY = 1e-9

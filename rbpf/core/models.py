@@ -23,7 +23,7 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.particles import Information, Particles, Prior, Proposed
 from rbpf.errors import InputError
 from rbpf.kernels.signature import ObservationKernel
-from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group
+from rbpf.lie import Array, Euclidean, LieGroup, SE2Group, SE3Group
 
 #: Step of central differences, where truncation and rounding errors balance.
 STEP = float(np.finfo(float).eps) ** (1 / 3)
@@ -41,6 +41,9 @@ Estimates = Float[np.ndarray, "*#batch D"]
 Means = Estimates | None
 Constants = Float[np.ndarray, "*#batch A"] | None
 Substates = Float[np.ndarray, "*#batch m"] | None
+Given = (
+    Array | None
+)  #: For a model of one's own that states no shapes: landmarks, constants or substates, where it reads them.
 Measured = Float[np.ndarray, "*#batch p"]
 Result = Float[np.ndarray, "*batch p"]
 Covariances = Float[np.ndarray, "*#batch p p"]

@@ -5,7 +5,8 @@ x (+) xi = x Exp(xi). Angles are exact from 0 to pi. Formulas: Sola, Deray and A
 estimation in robotics" (2018), and Barfoot, "State Estimation for Robotics" (2017), chapter 7.
 """
 
-from rbpf.lie.base import Array, LieGroup
+from rbpf.arrays import Array
+from rbpf.lie.base import LieGroup
 from rbpf.lie.product import Euclidean, Finite, Product
 from rbpf.lie.se2 import SE2Group
 from rbpf.lie.se3 import SE3Group, skew

@@ -5,11 +5,9 @@ from collections.abc import Sequence
 from typing import final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rbpf.arrays import Float, Like
-
-Array = NDArray[np.float64]
+from rbpf.arrays import Array, Float, Like
 
 States = Like[ArrayLike, "*#batch {self.size}"]  #: Elements (..., E), as they are given.
 Tangents = Like[ArrayLike, "*#batch {self.dim}"]  #: Tangent vectors (..., d), as they are given.

@@ -7,9 +7,9 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbpf.arrays import Float, Like
+from rbpf.arrays import Array, Float, Like
 from rbpf.errors import InputError
-from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
+from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
 
 class Commutative(LieGroup):

@@ -10,8 +10,8 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbpf.arrays import Float, Like
-from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents
+from rbpf.arrays import Array, Float, Like
+from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents
 
 Complex = NDArray[np.complex128]
 

@@ -6,10 +6,10 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbpf.arrays import Float, Like
+from rbpf.arrays import Array, Float, Like
 from rbpf.errors import InputError
 from rbpf.kernels import se3 as kernels
-from rbpf.lie.base import MEAN, Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
+from rbpf.lie.base import MEAN, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
 
 @final

@@ -12,13 +12,11 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Part, Records
+from rbpf.core.models import FusedKernel, Given, Jacobians, ObservationModel, Part, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION
-
-Given = Array | None  #: What a model may read, see `ObservationModel`.
 
 
 class CameraModel(ObservationModel):

@@ -12,10 +12,8 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
+from rbpf.core.models import FusedKernel, Given, Jacobians, ObservationModel
 from rbpf.lie import Array, SE2Group, SE3Group, skew
-
-Given = Array | None  #: What a model may read, see `ObservationModel`.
 
 
 class RigidPointModel(ObservationModel):

@@ -18,7 +18,7 @@ from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraProblem, CameraState, solve_features
 from rbpf.validation.gtsam.observations import observation_table
 from rbpf.validation.gtsam.path_sampling import draw_posterior
-from rbpf.validation.gtsam.robot import Problem, solve
+from rbpf.validation.gtsam.robot import RobotProblem, solve
 from rbpf.validation.metrics.accuracy import landmark_errors
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
@@ -60,7 +60,7 @@ def test_simulated_recordings_give_the_errors_of_the_reference(data_dir, folder,
 def test_mrclam_is_solved_better_than_by_a_reference_that_takes_depths_for_ranges(data_dir):
     log = open_log(data_dir / "mrclam6_robot1")
     m = from_log(log)
-    assert Problem(m).null.any()
+    assert RobotProblem(m).null.any()
     plain, robust = (solve(m, threshold, marginals=False, incremental=True) for threshold in (None, 1.345))
     for found, reference in ((plain, (0.144, 0.089)), (robust, (0.118, 0.076))):
         errors = planar_errors(m, log, found.world_from_body, found.landmarks)
@@ -73,7 +73,7 @@ def test_victoria_park_needs_the_incremental_start(data_dir):
     found = solve(m, incremental=True)
     redundancy = m.z.size - 2 * len(found.landmarks)
     assert 0.3 * redundancy < found.error < 0.7 * redundancy
-    problem = Problem(m)
+    problem = RobotProblem(m)
     lost = problem.graph().error(problem.values(initial_estimate(m)))
     assert lost > 1000 * found.error
 

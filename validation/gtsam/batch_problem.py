@@ -27,10 +27,10 @@ from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
-OnIteration = Callable[[int, float], None]
+OnIteration = Callable[[int, float], None]  #: What is called before each, with its number and the error there.
 LEAST = 4  #: Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses.
 #: Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long.
-EXACT = 1e-4
+SOFTENED = 1e-4
 #: Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work
 #: is counted and not the time, so that a result does not depend on what else the machine does.
 WORK = 30_000_000
@@ -146,7 +146,7 @@ def softened(known: KnownPoints | None) -> KnownPoints | None:
     if known is None or known.cov.any():
         return known
     extent = float(np.ptp(known.positions, axis=0).max())
-    return replace(known, cov=np.tile((EXACT * extent) ** 2 * np.eye(3), (known.names.size, 1, 1)))
+    return replace(known, cov=np.tile((SOFTENED * extent) ** 2 * np.eye(3), (known.names.size, 1, 1)))
 
 
 def connected_frames(log: FeatureLog) -> NDArray[np.intp]:

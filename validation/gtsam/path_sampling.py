@@ -33,7 +33,7 @@ from scipy.sparse.linalg import splu
 
 from rbpf.lie import Array
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
-from rbpf.validation.gtsam.robot import Problem
+from rbpf.validation.gtsam.robot import RobotProblem
 
 DRAWS = 400
 #: Root mean square over the draws of what is not linear in a motion's whitened noise, from which on it is drawn itself.
@@ -79,7 +79,7 @@ def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, dr
     `optimum` has poses (T, E) and the position of every landmark; far from the batch optimum the weights scatter.
     Raises InputError: a measurement's covariance is singular, or the optimum lacks something.
     """
-    problem, path, size = Problem(m), optimum.world_from_body, m.z.shape[1]
+    problem, path, size = RobotProblem(m), optimum.world_from_body, m.z.shape[1]
     places = np.array([optimum.landmarks[name] for name in problem.names.tolist()]).reshape(-1, size)
     # Derivatives of the whitened motions by all moves, of the whitened observations by the landmarks' and the poses'.
     dim, (ahead, back, _) = m.space.dim, _linear_noise(problem, path)
@@ -126,7 +126,7 @@ def draw_posterior(m: Measurements, optimum: InitialEstimate, rng: Generator, dr
     return PosteriorDraws(poses, problem.names, landmarks, log_motion + log_seen - _log_first(m) - log_draw)
 
 
-def _linear_noise(problem: Problem, path: Array) -> tuple[Array, Array, Array]:
+def _linear_noise(problem: RobotProblem, path: Array) -> tuple[Array, Array, Array]:
     """The linear noise of every motion of a path, at + ahead ξ_t − back ξ_{t−1}: ahead, back and at."""
     m, space = problem.m, problem.m.space
     at = space.local(space.compose(path[:-1], m.deltas), path[1:])
@@ -134,7 +134,7 @@ def _linear_noise(problem: Problem, path: Array) -> tuple[Array, Array, Array]:
     return space.right_jacobian_inverse(at), back, at
 
 
-def _driven(problem: Problem, path: Array, xi: Array) -> tuple[Array, Array]:
+def _driven(problem: RobotProblem, path: Array, xi: Array) -> tuple[Array, Array]:
     """Poses (S, T, E) by the moves (S, T, d) of a path, and the log-density (S,) of their motions by the moves."""
     m, space, axes = problem.m, problem.m.space, problem.axes
     variances, noisy = np.where(problem.null, 1.0, problem.variances), ~problem.null
@@ -163,7 +163,7 @@ def _log_det(xi: Array) -> Array:
     return times * np.log(np.sinc(np.linalg.norm(turn, axis=-1) / (2.0 * np.pi)))
 
 
-def _residuals(problem: Problem, poses: Array, landmarks: Array) -> Iterator[tuple[slice, Array]]:
+def _residuals(problem: RobotProblem, poses: Array, landmarks: Array) -> Iterator[tuple[slice, Array]]:
     """Whitened residuals (K p, s) of all observations, some draws at a time."""
     m, block = problem.m, max(1, _BLOCK // max(len(problem.m.z), 1))
     whiten = np.linalg.inv(np.linalg.cholesky(m.cov_z))

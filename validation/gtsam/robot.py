@@ -9,7 +9,7 @@ in time: what the filter approximates. F. Dellaert and M. Kaess, "Factor graphs 
 
 A singular Q_t (a robot that cannot slip sideways) is kept exactly: the residual is turned into Q_t's
 eigenvectors, and those without variance become hard constraints. A solver that starts far away would have to
-follow these constraints along a curve, therefore `Problem.graph(soft=True)` first gives them a tenth of the largest
+follow these constraints along a curve, therefore `RobotProblem.graph(soft=True)` first gives them a tenth of the largest
 standard deviation of the same step.
 """
 
@@ -50,7 +50,7 @@ def solve(
     Raises InputError: an observation has no noise, the measurements do not determine a variable, or the optimiser does
     not converge.
     """
-    problem = Problem(m, robust)
+    problem = RobotProblem(m, robust)
     with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):
         graph = problem.graph()
         if incremental:  # ISAM2 closes every loop from near by.
@@ -84,12 +84,12 @@ def solve_online(m: Measurements) -> Array:
     By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
     of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
     """
-    problem = Problem(m)
+    problem = RobotProblem(m)
     with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):
         return np.array([pose for pose, _ in _grown(problem, 1, MOVED)])
 
 
-def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterator[tuple[Array, Any]]:
+def _grown(problem: "RobotProblem", chunk: int, moved: float | None = None) -> Iterator[tuple[Array, Any]]:
     """The newest pose (E,), and ISAM2, after every `chunk` steps.
 
     With `moved`, all that has moved by so much [rad, m] is linearised anew every time, else as GTSAM usually does.
@@ -161,7 +161,7 @@ class Sensor:
 
 
 @final
-class Problem:
+class RobotProblem:
     """Variables and factors of a run; see `solve`. An InputError names an observation whose covariance is singular."""
 
     def __init__(self, m: Measurements, robust: float | None = None) -> None:
