@@ -75,7 +75,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     for t, pose in enumerate(truth):
         x, y, h = SE3.inverse_transform(pose, points).T
         z = np.stack([np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1)
-        near = (z[:, 0] <= world.max_range_m) & (z[:, 0] > 0.2)
+        near = (z[:, 0] <= world.max_range_m) & (z[:, 0] > max(0.2, 4.0 * world.std_range_m))  # else 0 or less is read
         seen = near & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view)
         noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))
         rows.extend(
