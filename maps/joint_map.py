@@ -66,6 +66,11 @@ LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
 FEWEST = 3
 """Landmarks from afar with which all sub-maps are solved for."""
+LOCAL, WORTH = 3.0, 20
+"""Times as far as landmarks are seen from that a sub-map of so many landmarks may reach.
+
+What a turn of the heading does to a landmark in the second order, which a Gaussian leaves out, grows with its distance.
+"""
 SINGULAR = 1e-15
 """Fraction of the largest variance of an increment below which another one is none."""
 
@@ -85,8 +90,8 @@ class JointMap(Map):
         substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
             frame; None has none. It may be observed together with a landmark.
         compiled: use the models' fused kernels where they have one.
-        submap: landmarks with which a sub-map ends, so that a step costs the same however large the map becomes; None keeps
-            one Gaussian. Nothing may be observed in the world.
+        submap: landmarks with which a sub-map ends at the latest (`LOCAL`), so that a step costs the same however large the
+            map becomes; None keeps one Gaussian. Nothing may be observed in the world.
         passed_on: a sub-map ends when landmarks are `put_away`, and what stays goes over into the next one, as always with a
             substate; else that begins with nothing.
         unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
@@ -147,6 +152,7 @@ class JointMap(Map):
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
         self.held = JointColumns(self.space, self._first, self.held.kinds)
+        self._reach = 0.0  # distance from the frame at which its landmarks were begun, at most
         self._leave_step()
 
     def _leave_step(self) -> None:
@@ -240,11 +246,17 @@ class JointMap(Map):
             if self.leaving.size or self._returning.size:
                 self._exchange()
             # Where nothing is passed on, a sub-map that has been joined to the old ones is followed by one with nothing.
-            elif not (self._in_step or self.passed_on) and self.old.take(self.finished(), len(self.ids) >= self.submap):
+            elif not (self._in_step or self.passed_on) and self.old.take(self.finished(), self._is_large()):
                 self._begin_submap()
             if self.old.maps:
                 self.old.look_from(self.finished())
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
+
+    def _is_large(self) -> bool:
+        """Whether the present sub-map should end: it is too much for a step, or reaches too far for one Gaussian."""
+        assert self.submap is not None
+        away = np.linalg.norm(self.mean[0, self.held.of_one_kind(self.ids).columns], axis=1)
+        return away.size >= self.submap or (away.size >= WORTH and bool(away.max() > LOCAL * self._reach))
 
     @property
     def is_full(self) -> bool:
@@ -340,6 +352,9 @@ class JointMap(Map):
 
     def estimate(self, particles: Particles) -> Estimate:
         """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
+        if self.old.maps and not self.passed_on:
+            # What finished sub-maps know of the landmarks it has begun anew, the present one is told of here alone.
+            return self.old.end(self._consolidated(particles).finished(self.old))
         d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
         origin, turn = self.space.mean(world, weights), self._turn(particles)
         within = self.cov[:d, :d] if self.old.frame is None else self.old.frame.cov
@@ -498,6 +513,8 @@ class JointMap(Map):
             raise InputError("a new landmark has a mean or covariance that is not finite")
         count, dim, d = records.mean.shape[1], landmark.dim, self.space.dim
         ids = checked_new_ids(ids, count, self._next_id, self.holds)
+        if not landmark.anchored:
+            self._reach = max(self._reach, float(np.linalg.norm(records.mean[0], axis=-1).max(initial=0.0)))
         # Given the path, what is new owes its error to its own measurement alone, and a clone of the path has none.
         mean = np.broadcast_to(records.mean, (self.n, count, dim)).reshape(self.n, -1)
         clone, origins, places = np.full(count, -1), np.zeros((0, self.space.size)), np.zeros((self.n, 0, d))
@@ -619,6 +636,7 @@ class JointMap(Map):
         if self.submap is None:
             return named
         waiting = {"given": self._given_ids, "leaving": self.leaving, "returning": self._returning}
+        named["joint/reach"] = np.array([self._reach])
         return named | {f"joint/{name}": array for name, array in waiting.items()} | self.old.arrays()
 
     def options(self) -> dict[str, object]:
@@ -641,5 +659,6 @@ class JointMap(Map):
             schema = {name: checkpoint.integers(f"{name} ids") for name in ("given", "leaving", "returning")}
             found = checkpoint.read(arrays, schema, "joint/")
             self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
+            self._reach = float(checkpoint.read_one(arrays, "joint/reach", checkpoint.numbers(1))[0])
             if not np.isin(self._given_ids, self.old.near).all():
                 raise InputError("the array joint/given names a landmark that is not about the start of the sub-map")

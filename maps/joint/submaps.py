@@ -200,14 +200,24 @@ class SubMaps:
             spread = rest + cross @ by_new.T
             own = np.block([[spread, cross[:, :d]], [cross[:, :d].T, present.cov[:d, :d]]])
         else:
-            x, cov, half, _ = self._tied(present)
-            ends = np.append(np.arange(d), d + self.dim * self.near.size + np.arange(d))
+            about, present = self._of_both(present)
+            x, cov, half, _ = about._tied(present)
+            ends = np.append(np.arange(d), d + self.dim * about.near.size + np.arange(d))
             x, own = x[ends], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
         end = space.retract(present.end, x[d:])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
         turn = np.concatenate([by_start, space.right_jacobian(x[d:])], axis=1)
         mean = space.compose(space.retract(self.start, x[:d]), end)
         return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
+
+    def _of_both(self, present: SubMap) -> tuple["SubMaps", SubMap]:
+        """The start and the present sub-map, without the landmarks that one of them alone has: these do not move ends."""
+        d, dim, about = self.space.dim, self.dim, copy(self)
+        mine, its = (np.flatnonzero(np.isin(*pair)) for pair in ((self.near, present.ids), (present.ids, self.near)))
+        columns, theirs = (np.append(np.arange(d), d + dim * rows[:, None] + np.arange(dim)) for rows in (mine, its))
+        about.near, about.points, about.cov = self.near[mine], self.points[mine], self.cov[np.ix_(columns, columns)]
+        cov = present.cov[np.ix_(theirs, theirs)]
+        return about, present._replace(ids=present.ids[its], points=present.points[its], cov=cov)
 
     def relative(self, number: int, present: SubMap) -> Estimate:
         """Where the end of the present sub-map is as seen from that of an older one, by all that is known."""

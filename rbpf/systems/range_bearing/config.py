@@ -55,7 +55,7 @@ class RangeBearingConfig(RunConfig):
     #: falls below the threshold of resampling, which does not take place.
     window: Count = 5
     #: of a joint map: landmarks with which a sub-map ends and the next begins, so that a step costs the same however large
-    #: the map becomes; a log that names fewer has one. None keeps one Gaussian of all.
+    #: the map becomes; with 20 it ends where it reaches three times as far as the sensor. None keeps one Gaussian of all.
     submap: Count | None = 150
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.

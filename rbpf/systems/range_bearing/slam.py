@@ -5,6 +5,7 @@ for stamp_ns, odometry, names, z, cov_z in log:
     frame = slam.track(z, cov_z, names, odometry, stamp_ns)
 """
 
+from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -151,6 +152,9 @@ class RangeBearingSlam(System):
             self._odometry = self.space.compose(self._odometry, odometry.delta)
 
         estimate = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
+        if self.joint is not None and self.joint.old.maps:
+            # A landmark that a further sub-map begins anew has been measured before, which its density does not know.
+            report = replace(report, log_evidence=np.nan)
         d, e = self.space.dim, self.space.size
         correction = motion_correction(report.mixture)
         return Tracked(
