@@ -496,6 +496,9 @@ class JointMap(Map):
         ids = self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
         slope = model.new_by_substate(z)
         if slope is not None and model.about is not None:
+            if not new_landmarks.landmark.anchored:
+                centre, middle = self.space.mean(state, np.full(self.n, 1.0 / self.n)), records.mean.mean(axis=0)
+                slope = np.linalg.solve(new_landmarks.landmark.seen_from(self.space, centre, middle)[1], slope)
             columns, by_own = self.held.of_one_kind(ids).columns.ravel(), slope.reshape(-1, slope.shape[-1])
             self.mean[:, columns] += (self.mean[:, own] - model.about) @ by_own.T
             self.cov[columns] += by_own @ self.cov[own]
@@ -629,6 +632,11 @@ class JointMap(Map):
         z = model.predict(belief.state[mode, None], records.mean, records.const)[0]
         nu, cov, _ = self._foreseen([Observations(z, np.zeros((*z.shape, z.shape[1])), model, ids=ids)], belief)
         return z - nu.reshape(z.shape), cov
+
+    def expected_alone(self, model: ObservationModel, belief: Belief, ids: np.ndarray) -> tuple[Array, Array]:
+        """`project_jointly` of each landmark by itself: mean (K, p) and covariance (K, p, p)."""
+        mean, cov = self.project_jointly(model, ids, belief)
+        return mean, diagonal_blocks(cov, np.arange(mean.size).reshape(mean.shape))
 
     def arrays(self) -> dict[str, np.ndarray]:
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}

@@ -73,10 +73,13 @@ class OdometryMotion(MotionModel):
             injects some and names no figure; none is the default, for covariances are tested.
         free: (d,) bool: the components of Log(delta) and of the noise that are kept, as `CAMERA_PLANE`, which keeps a
             camera in the x–z plane of its first pose (S05); the others are dropped. None keeps all.
+        constants: numbers of a substate that stay what they are and do not move the robot, as of a calibration.
     """
 
-    def __init__(self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None) -> None:
-        self.space = space
+    def __init__(
+        self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None, constants: int = 0
+    ) -> None:
+        self.space, self.constants = space, constants
         self.cov_added = np.diag(deviations(std_added, space.dim, "std_added") ** 2)
         self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
@@ -84,7 +87,7 @@ class OdometryMotion(MotionModel):
         """The increment, the same for all particles; refused is one that is not finite, or whose covariance is none."""
         d = self.space.dim
         if control is None:
-            return Transition(state, np.zeros((1, d, d)))
+            return self._with_constants(state, np.zeros((d, d)))
         if control.delta.shape != (self.space.size,) or control.cov.shape != (d, d):
             raise InputError(
                 f"odometry needs delta ({self.space.size},) and cov ({d}, {d}), "
@@ -97,7 +100,14 @@ class OdometryMotion(MotionModel):
             factor = gaussian.psd_factor(moved.cov)
         except InputError as error:
             raise InputError(f"the covariance of the odometry is not one: {error}") from error
-        return Transition(self.space.compose(state, moved.delta), factor[None])
+        return self._with_constants(self.space.compose(state, moved.delta), factor)
+
+    def _with_constants(self, mean: np.ndarray, factor: np.ndarray) -> Transition:
+        d, k = self.space.dim, self.constants
+        if not k:
+            return Transition(mean, factor[None])
+        factor = np.pad(factor, ((0, k), (0, 0)))
+        return Transition(mean, factor[None], np.zeros((1, d, k)), np.eye(k)[None], np.zeros((1, k)))
 
     def constrained(self, measured: Odometry) -> Odometry:
         """The increment and the covariance that particles are moved by, of a measured one."""

@@ -143,6 +143,9 @@ class StereoMatcher:
         self.extractor = extractor or Sift()
         self.config = config or PairConfig()
         self.impulse_fraction = 0.0  #: Fraction of the pixels that were replaced in the last pair.
+        self.offset_px = (
+            0.0  #: By which columns of the right image are known to be too large: they are measured without it.
+        )
         self._last: tuple[tuple[np.ndarray, np.ndarray], Features, Features, int] | None = None
 
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
@@ -196,7 +199,7 @@ class StereoMatcher:
                 )
         z = np.column_stack([left.px[matches.first], right.px[matches.second, 0]])
         good, z[:, 2] = self._refined(images, z[:, :2], z[:, 2])
-        matches, z = matches.take(good), z[good]
+        matches, z = matches.take(good), z[good] - [0.0, 0.0, self.offset_px]
         far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
         chosen, noise = left.take(matches.first[far]), self.noise(left.scale[matches.first[far]])
         return StereoFeatures.measured(self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors)

@@ -266,7 +266,10 @@ class ObservationModel(ABC):
         raise InputError(f"{type(self).__name__} has an `about`: override by_substate")
 
     def new_by_substate(self, z: Z) -> Float[np.ndarray, "K D m"] | None:
-        """From measurements (K, p) how the landmarks of `initialise` move with the substate (K, D, m); None: not at all."""
+        """From measurements (K, p) how the landmarks of `initialise` move with the substate (K, D, m); None: not at all.
+
+        As they are seen from the state.
+        """
         return None
 
     def kernel(self) -> FusedKernel | None:

@@ -23,7 +23,7 @@ class CameraModel(ObservationModel):
     """The chain from a landmark to pixels; a subclass says where the landmark lies.
 
     `about` (m,) is the substate with which the camera is as given, where it is not known: its last four numbers are those of
-    `Pinhole.tuned`.
+    `Pinhole.tuned`, of a pair the last one is how much too large columns of the right image are.
     """
 
     def __init__(self, camera: Pinhole | RectifiedStereo, about: Given = None) -> None:
@@ -193,12 +193,27 @@ class StereoPoint(CameraPoint):
     """A world point in metres, seen by both cameras.
 
     S05 (4)–(7) compares points in space, with C^L from the pixels' noise; here pixels are compared, which is the same
-    to first order and stays Gaussian where the point is far.
+    to first order and stays Gaussian where the point is far. With `about`, pixels are
+    given without what that says.
     """
 
-    def __init__(self, rig: RectifiedStereo) -> None:
-        super().__init__(rig)
+    def __init__(self, rig: RectifiedStereo, about: Given = None) -> None:
+        super().__init__(rig, about=about)
         self.rig = rig
+
+    def by_substate(self, state: Array, landmark: Array, const: Given = None) -> Array:
+        assert self.about is not None
+        out = np.zeros((*np.broadcast_shapes(state.shape[:-1], landmark.shape[:-1]), 3, self.about.size))
+        out[..., 2, -1] = 1.0
+        return out
+
+    def new_by_substate(self, z: Array) -> Array | None:
+        """∂point/∂s = −∂point/∂u_right."""
+        if self.about is None:
+            return None
+        out = np.zeros((len(z), 3, self.about.size))
+        out[..., -1] = -np.linalg.inv(self.rig.jacobian(self.rig.triangulate(z)))[..., 2]
+        return out
 
     def invert(self, state: Array, z: Array) -> Array:
         """S05 (4); NaN without disparity."""

@@ -119,7 +119,9 @@ RESUMED = {
         stereo, lambda: pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames(), (0, 5, 6, 9)
     ),
     "pairs, joint map": Case(
-        lambda: stereo(map=MapConfig(kind="joint", submap=30), likelihood=StereoConfig.joint().likelihood),
+        lambda: stereo(
+            map=MapConfig(kind="joint", submap=30), likelihood=StereoConfig.joint().likelihood, calibrate="online"
+        ),
         lambda: pairs(12).frames(),
         (0, 5, 7),
     ),

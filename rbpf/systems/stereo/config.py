@@ -119,6 +119,14 @@ class RecoveryConfig(Ranged):
 
 
 @dataclass(frozen=True)
+class CalibrationConfig(Ranged):
+    """A pair that calibrates itself: how far its calibration may be from what is given, as a standard deviation."""
+
+    #: of all disparities together, px: 0.1 are cameras that are turned against each other by a hundredth of a degree.
+    disparity_px: Positive = 0.1
+
+
+@dataclass(frozen=True)
 class StereoConfig(RunConfig):
     """A run of stereo SLAM."""
 
@@ -134,6 +142,10 @@ class StereoConfig(RunConfig):
     #: which features become landmarks, and how long they stay.
     new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
     #: of a landmark's innovation, S05 (6) by default.
+    #: of a joint map: the pair calibrates itself, an error common to all disparities being estimated with everything else.
+    calibrate: Literal["off", "online"] = "off"
+    #: what is known of a pair that calibrates itself.
+    self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
     )

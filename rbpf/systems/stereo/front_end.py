@@ -16,6 +16,7 @@ from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import StereoPoint
 from rbpf.sensors.descriptors import match_all
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
@@ -61,6 +62,10 @@ class FrontEnd(ABC, Generic[F]):
     def impossible(self) -> tuple[int, int]:
         """Matches within the frame that was measured last which no point in space has, and all of them."""
         return 0, 0
+
+    def tune(self, about: np.ndarray) -> None:
+        """Columns of the right image are too large by `about` (1,) px: from here on they are measured without that."""
+        raise InputError(f"{type(self).__name__} has no cameras that calibrate themselves")
 
     @abstractmethod
     def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
@@ -164,6 +169,10 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
     def impossible(self) -> tuple[int, int]:
         return self.matcher.impossible
 
+    def tune(self, about: np.ndarray) -> None:
+        self.matcher.offset_px = float(about[0])
+        self.landmarks.model = StereoPoint(self.rig, about=about)
+
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
         one, other = before.features.descriptors, now.features.descriptors
         found = match_all(one, other, self.config.odometry.limits)
@@ -196,9 +205,15 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
     def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
         self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
         self.landmarks: NamedLandmarks = NamedLandmarks(rig, config)
+        self._offset_px = 0.0
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[FeatureFrame], str]:
-        return self.pair(self.ns_per_stamp * frame.stamp_ns, frame), ""
+        calibrated = replace(frame, z=frame.z - [0.0, 0.0, self._offset_px])
+        return self.pair(self.ns_per_stamp * frame.stamp_ns, calibrated), ""
+
+    def tune(self, about: np.ndarray) -> None:
+        self._offset_px = float(about[0])
+        self.landmarks.model = StereoPoint(self.rig, about=about)
 
     def match(self, before: Pair[FeatureFrame], now: Pair[FeatureFrame]) -> tuple[np.ndarray, np.ndarray]:
         names = before.features.landmarks, now.features.landmarks

@@ -352,8 +352,10 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         known = self.ids >= 0
         seen = self.ids[known]
         if self.noise is not None:
+            held = belief.map
+            assert isinstance(held, JointMap)
             for group in observed:
-                self.noise.learn_from(group, partial(self.expected, belief))
+                self.noise.learn_from(group, partial(held.expected_alone, self.model, belief))
         dropped = self.manager.observe(seen)
         if dropped.size:
             belief.map.remove(dropped)
@@ -541,6 +543,7 @@ class NamedLandmarks(Kept, Landmarks[FeatureFrame]):
         self._observations, self._unseen_for = np.zeros((2, 0), dtype=np.int64)
 
     def observe(self, frame: Pair[FeatureFrame], belief: Belief) -> Sequence[Observations]:
+        self._sensor.model = self.model
         self.ids = np.where(frame.for_map, frame.features.landmarks, NULL)
         return self._sensor.observe(frame.features.take(frame.for_map), belief)
 

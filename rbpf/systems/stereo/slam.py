@@ -191,6 +191,7 @@ class StereoSlam(System):
         timing("seconds_filter", "time of the rest of the update", "filter_ms"),
         Column("odometry", "world_from_camera by visual odometry alone", shape=(7,)),
         Column("measured", "whether the next pair is matched with this one", kind=bool),
+        Column("offset_px", "by which disparities were taken to be too small"),
     )
     observed = (
         Ragged("z", "pixels (u_left, v, u_right) of the features", (3,)),
@@ -224,14 +225,20 @@ class StereoSlam(System):
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
-        joint = None
+        joint, calibrates = None, config.calibrate == "online"
+        if calibrates and (config.map.kind != "joint" or model is not None):
+            raise InputError(
+                "calibrate=online holds the error of all disparities in a joint map of points: set map.kind=joint, and leave "
+                "out a model of your own"
+            )
         if config.map.kind == "joint":
             if not config.likelihood.build().normalised:
                 raise InputError(
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
                     "none: begin with StereoConfig.joint(), or set likelihood.kind=outliers"
                 )
-            joint = JointMap(SE3, compiled=config.compiled, submap=config.map.submap, passed_on=True)
+            disparity = (np.zeros(1), np.full((1, 1), config.self_calibration.disparity_px**2)) if calibrates else None
+            joint = JointMap(SE3, disparity, config.compiled, config.map.submap, passed_on=True)
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
@@ -242,8 +249,8 @@ class StereoSlam(System):
             )
         own = LandmarkMap(SE3, compiled=config.compiled)
         own.register(front_end.landmarks.landmark)
-        odometry, sensor, proposal = OdometryMotion(SE3, added, free), front_end.landmarks, self._proposal.build()
-        self.filter = self.new_filter(odometry, sensor, [joint or own], proposal, config.map.window)
+        odometry, sensor = OdometryMotion(SE3, added, free, constants=int(calibrates)), front_end.landmarks
+        self.filter = self.new_filter(odometry, sensor, [joint or own], self._proposal.build(), config.map.window)
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
@@ -278,6 +285,9 @@ class StereoSlam(System):
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
         landmarks = front_end.landmarks
+        offset_px = self.calibration()[0]
+        if config.calibrate == "online":
+            front_end.tune(np.array([offset_px]))
 
         # 1. Measure the pair: features that both cameras see.
         pair, problem = front_end.measure(frame)
@@ -376,6 +386,7 @@ class StereoSlam(System):
                 "seconds_filter": seconds_filter,
                 "odometry": at.world_from_camera,
                 "measured": measured,
+                "offset_px": offset_px,
             },
             {"z": pair.features.z, "cov_z": pair.features.cov, "kind": kinds, "landmarks": ids, "previous": previous},
             tuple(messages),
@@ -392,7 +403,10 @@ class StereoSlam(System):
 
     def measurements(self, name: str, log: FrameLog) -> FeatureLog:
         """Every pixel that odometry or map used, once, as tracks; of pixels with names all of them."""
-        shown = [log.observed(t) for t in range(len(log))]
+        shown, offset_px = [log.observed(t) for t in range(len(log))], self.calibration()[0]
+        for pair, then_px in zip(shown, log["offset_px"].tolist(), strict=True):
+            # A run that calibrates itself knows better at its end.
+            pair["z"] = pair["z"] + [0.0, 0.0, then_px - offset_px]
         if self.front_end.names_landmarks:
             parts = [(pair["landmarks"], pair["z"], pair["cov_z"]) for pair in shown]
             stamped = zip(log.stamps_ns.tolist(), parts, strict=True)
@@ -401,17 +415,27 @@ class StereoSlam(System):
             frames = tracked_features(log.stamps_ns, log["measured"], shown)
         return FeatureLog(name, self.rig, frames)
 
+    def calibration(self) -> tuple[float, float]:
+        """By how many px all disparities are too small, and its standard deviation; both 0 where `calibrate` is off."""
+        if self.joint is None or self.joint.driving() is None:
+            return 0.0, 0.0
+        mean, cov = self.joint.moments(self.filter.particles, Part.SUBSTATE)
+        return float(mean[0]), float(np.sqrt(cov[0, 0]))
+
     def summary(self, log: FrameLog) -> dict[str, Any]:
         """What the pairs showed, and the filter's figures over its updates."""
         updated = log["updated"].astype(bool)
         evidence = log["log_evidence"][updated]
         milliseconds = 1e3 * (log["seconds_matching"] + log["seconds_filter"])[updated] if updated.any() else 0.0
         steps = np.diff(SE3.translation(log.poses), axis=0)
+        names, found = ("disparity_offset_px", "std_disparity_offset_px"), self.calibration()
+        calibration = {} if self.config.calibrate == "off" else {"calibration": dict(zip(names, found, strict=True))}
         return {
             "frames_measured": int((log["features"] >= self.config.odometry.estimate.min_matches).sum()),
             "updates": int(updated.sum()),
             "distance_m": float(np.linalg.norm(steps, axis=1).sum()),
             "dof": self.config.dof,
+            **calibration,
             "ms_per_update": {
                 "median": round(float(np.median(milliseconds)), 3),
                 "p95": round(float(np.percentile(milliseconds, 95)), 3),
@@ -566,7 +590,9 @@ class StereoSlam(System):
         if count < self.config.map.min_agreeing:
             return view, moved, None
         dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
-        prior = self._constrained(self.visual_odometry.prior.increment(self.reckoning.velocity_at_update, dt))
+        # Of a camera that has not been seen to move nothing is known: the prior is about what the odometry says.
+        velocity = self.reckoning.velocity_at_update if self.filter.steps > 1 else SE3.log(moved.delta) / dt
+        prior = self._constrained(self.visual_odometry.prior.increment(velocity, dt))
         return view, prior, self._proposal.build(SE3.local(prior.delta, moved.delta))
 
 
