@@ -644,7 +644,8 @@ class JointMap(Map):
         if self.submap is None:
             return named
         waiting = {"given": self._given_ids, "leaving": self.leaving, "returning": self._returning}
-        named["joint/reach"] = np.array([self._reach])
+        if not self.passed_on:
+            named["joint/reach"] = np.array([self._reach])
         return named | {f"joint/{name}": array for name, array in waiting.items()} | self.old.arrays()
 
     def options(self) -> dict[str, object]:
@@ -667,6 +668,7 @@ class JointMap(Map):
             schema = {name: checkpoint.integers(f"{name} ids") for name in ("given", "leaving", "returning")}
             found = checkpoint.read(arrays, schema, "joint/")
             self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
-            self._reach = float(checkpoint.read_one(arrays, "joint/reach", checkpoint.numbers(1))[0])
+            if not self.passed_on:
+                self._reach = float(checkpoint.read_one(arrays, "joint/reach", checkpoint.numbers(1))[0])
             if not np.isin(self._given_ids, self.old.near).all():
                 raise InputError("the array joint/given names a landmark that is not about the start of the sub-map")
