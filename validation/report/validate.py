@@ -27,9 +27,10 @@ if TYPE_CHECKING:
 #: Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do.
 KEY_FRAMES = 60
 Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folder.
+TRUTH = "groundtruth"
 
 
-def _groundtruth(record: RunFolder, precision: Precision = EXACT) -> Comparison:
+def _groundtruth(record: RunFolder, precision: Precision) -> Comparison:
     from rbpf.validation.consistency.against_groundtruth import compare_with_truth, truth_errors
     from rbpf.validation.report.comparison_pictures import draw_truth
 
@@ -91,10 +92,8 @@ def _path(record: RunFolder, file: Path) -> Comparison:
     return Comparison("path", said, figures)
 
 
-ANY = "*"
-#: By what a run is compared with, then by the run's system.
+#: By what a run is compared with, besides the truth, then by the run's system.
 COMPARISONS: dict[str, dict[str, Compare]] = {
-    "groundtruth": {ANY: _groundtruth},
     "gtsam": dict.fromkeys(("range-bearing", "mono", "stereo"), compare_gtsam),
     "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
@@ -107,23 +106,23 @@ def validate(
 ) -> Verdict:
     """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again; returns the verdict.
 
-    `against` is a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`; `out` is a further folder for the JSON;
-    `truth` is how precise the ground truth is, by default exact. An InputError says that it is not possible; the report is
-    written all the same, and says why.
+    `against` is `TRUTH` or a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`; `out` is a further folder for the
+    JSON; `truth` is how precise the ground truth is, by default exact. An InputError says that it is not possible; the
+    report is written all the same, and says why.
     """
     record = RunFolder.open(folder)
     try:
         if file is not None:
             comparison = WITH_A_FILE[against](record, file)
+        elif against == TRUTH:
+            comparison = _groundtruth(record, truth)
+        elif against not in COMPARISONS:
+            raise InputError(f"a run is compared with {', '.join([TRUTH, *COMPARISONS])}, not with {against}")
+        elif record.system not in COMPARISONS[against]:
+            able = f"(possible: {', '.join(sorted(COMPARISONS[against]))})"
+            raise InputError(f"a run of the system {record.system!r} cannot be compared with {against} {able}")
         else:
-            known = COMPARISONS.get(against)
-            if known is None:
-                raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
-            compare = known.get(record.system, known.get(ANY))
-            if compare is None:
-                able = f"(possible: {', '.join(sorted(known))})"
-                raise InputError(f"a run of the system {record.system!r} cannot be compared with {against} {able}")
-            comparison = _groundtruth(record, truth) if compare is _groundtruth else compare(record)
+            comparison = COMPARISONS[against][record.system](record)
     except InputError as error:
         write_report(folder, [f"Not compared with {against}: {error}."])
         raise
