@@ -8,9 +8,11 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.runs.run import Run
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import ImageFrame, ImageSequence
 from rbpf.sensors.readers.images.sequence import Source
+from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import StereoConfig
 from tests.systems.plane_sequences import CAMERA, path, texture, view
 
@@ -70,3 +72,12 @@ def errors_m(poses: np.ndarray, sequence: ImageSequence) -> np.ndarray:
     """Of the positions (T,); the first camera is the world."""
     true = SE3.between(sequence.truth.poses[0], sequence.truth.poses[: len(poses)])
     return np.linalg.norm(SE3.translation(poses) - SE3.translation(true), axis=1)
+
+
+def half_exchanged(rig: RectifiedStereo, features: StereoFeatures) -> StereoFeatures:
+    """Half of their places belong to one another."""
+    z, rng = features.z.copy(), np.random.default_rng(0)
+    rows = rng.permutation(len(z))[: len(z) // 2]
+    z[rows] = z[np.roll(rows, 1)]
+    rest = features.cov, features.scale, features.orientation, features.descriptors
+    return StereoFeatures.measured(rig, z, *rest)

@@ -12,7 +12,7 @@ from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
-from rbpf.systems.system import Tracked, TrackingState
+from rbpf.systems.system import TrackingState
 
 RIG = RectifiedStereo(Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5), 0.12)
 SECOND = 1_000_000_000
@@ -90,9 +90,8 @@ def test_over_a_missing_pair():
 
 
 def test_pairs_that_are_passed_over_are_counted_and_the_velocity_goes_on():
-    slam_, said = slam(), list[Tracked]()
-    for frame in frames(5, missing=(3, 4)):
-        said.append(slam_.take(frame))
+    slam_ = slam()
+    said = [slam_.take(frame) for frame in frames(5, missing=(3, 4))]
     assert [one.values["assumed"] for one in said] == [0, 0, 0, 1, 2]
     for t in (3, 4):
         np.testing.assert_allclose(said[t].values["odometry"], SE3.exp(t * STEP), atol=1e-6)

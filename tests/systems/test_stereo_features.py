@@ -34,6 +34,7 @@ CONFIG = StereoConfig(
     likelihood=LikelihoodConfig("gaussian"),
     proposal=ProposalConfig("ekf", iterations=1),
 )
+JOINT = replace(CONFIG, particles=50, map=MapConfig(kind="joint"))
 
 
 def simulated(frames: int = 40, seed: int = 0, camera=STEREO, **options) -> FeatureLog:
@@ -107,9 +108,8 @@ def test_nees_of_the_pose():
     once = replace(
         twice, proposal=ProposalConfig("ekf"), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
     )
-    joint = replace(CONFIG, particles=50, map=MapConfig(kind="joint"))
     nees, logs = [], [simulated(20, seed) for seed in range(12)]
-    for config in (once, twice, joint):
+    for config in (once, twice, JOINT):
         nees.append(np.mean([nees_of(filtered(log, config)) for log in logs]))
     assert 0.75 < nees[0] < 1.25  # 1.03 with a standard error of 0.09
     assert nees[1] > 1.2 * nees[0]
@@ -120,9 +120,9 @@ def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     """Twice round a room: as good and as sure of itself as one Gaussian of all, though hardly more is held than is seen."""
     measuring = Measuring(noise_px=0.5, measurements=15, known=0, new_per_frame=15, nearest_m=0.5, farthest_m=7.0)
     log = simulate_features(RoomWorld(frames=120, laps=2.0, points=200), measuring, STEREO, 0)
-    sizes, runs, config = list[int](), list[Run](), replace(CONFIG, particles=50)
+    sizes, runs = list[int](), list[Run]()
     for most in (1000, 30):
-        opened = open_features(log, replace(config, map=MapConfig(kind="joint", submap=most)))
+        opened = open_features(log, replace(JOINT, map=MapConfig(kind="joint", submap=most)))
         runs.append(filter_opened(opened, [lambda run, tracked: sizes.append(run.system.joint.ids.size)]))
     off = [np.linalg.norm(SE3.translation(run.log.poses) - SE3.translation(run.truth.poses), axis=1) for run in runs]
     assert off[1][-40:].mean() < 1.5 * off[0][-40:].mean() + 0.003
@@ -138,8 +138,7 @@ def test_wrong_pixels_in_a_joint_map():
     wrong, nees = simulated(outlier_rate=0.05), []
     for kind in ("outliers", "gaussian"):
         likelihood = replace(StereoConfig().likelihood, kind=kind)
-        config = replace(CONFIG, particles=50, likelihood=likelihood, map=MapConfig(kind="joint"))
-        nees.append(nees_of(filtered(wrong, config)))
+        nees.append(nees_of(filtered(wrong, replace(JOINT, likelihood=likelihood))))
     assert nees[0] < 2.0 and nees[1] > 10.0
 
 
@@ -159,17 +158,15 @@ def test_an_error_of_all_disparities_is_found():
     for seed in range(6):
         log = simulated(60, seed)
         wrong = replace(log, frames=[replace(frame, z=frame.z + error) for frame in log.frames])
-        runs = [filtered(wrong, config) for config in (online, joint)]
-        nees.append([nees_of(run) for run in runs])
-        system, path = runs[0].system, runs[0].log
-        found, std = system.calibration()
+        run, without = (filtered(wrong, config) for config in (online, joint))
+        nees.append([nees_of(run), nees_of(without)])
+        found, std = run.system.calibration()
         squared.append(((found - 0.3) / std) ** 2)
-        assert std < 0.2 and system.summary(path)["calibration"]["disparity_offset_px"] == found
-        for ours, theirs in zip(system.measurements("told", path).frames, log.frames, strict=True):
+        assert std < 0.2 and run.system.summary(run.log)["calibration"]["disparity_offset_px"] == found
+        for ours, theirs in zip(run.system.measurements("told", run.log).frames, log.frames, strict=True):
             np.testing.assert_allclose(ours.z - theirs.z, np.tile([0.0, 0.0, 0.3 - found], (len(ours), 1)), atol=1e-9)
     assert np.mean(squared) < 2.1  # 95 % of χ² with six degrees of freedom
-    online_nees, nees_without = np.mean(nees, axis=0)
-    assert online_nees < 1.3 and nees_without > 2.5
+    assert np.mean(nees, axis=0)[0] < 1.3 and np.mean(nees, axis=0)[1] > 2.5
 
 
 def test_settings_that_do_not_go_together_are_refused(log):
@@ -178,7 +175,7 @@ def test_settings_that_do_not_go_together_are_refused(log):
     with pytest.raises(InputError, match=r"odometry\.role=proposal needs proposal\.kind=ekf and map\.weigh=all"):
         filtered(log, replace(CONFIG, odometry=OdometryConfig(role="proposal")))
     with pytest.raises(InputError, match=r"a likelihood that is a density, and likelihood\.kind=truncated is none"):
-        filtered(log, replace(CONFIG, likelihood=StereoConfig().likelihood, map=MapConfig(kind="joint")))
+        filtered(log, replace(JOINT, likelihood=StereoConfig().likelihood))
 
 
 def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:
@@ -192,7 +189,7 @@ def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:
 def test_found_again_by_what_was_put_away(log):
     """All landmarks are in old sub-maps while the camera is lost; those in view are held again when it is found."""
     broken, poses, messages = without_names(log, 20, 3), [], []
-    slam = open_features(broken, replace(CONFIG, particles=50, map=MapConfig(kind="joint"))).system
+    slam = open_features(broken, JOINT).system
     for t, frame in enumerate(broken.frames):
         if t == 23:
             slam.joint.put_away(slam.joint.ids)

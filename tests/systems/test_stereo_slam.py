@@ -18,7 +18,7 @@ from rbpf.systems.stereo.landmarks import AssociationGate, Pair
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import TrackingState
 from tests.systems.plane_sequences import texture
-from tests.systems.stereo_sequences import Pairs, errors_m, filtered, pairs, swapped
+from tests.systems.stereo_sequences import Pairs, errors_m, filtered, half_exchanged, pairs, swapped
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
 CONFIG = StereoConfig(particles=60)
@@ -195,7 +195,7 @@ def found(keypoints_once: None) -> Run:
 @pytest.fixture(scope="module")
 def settled(keypoints_once: None) -> StereoSlam:
     """After the last of these pairs, which shows what the map has."""
-    return filtered(pairs(12), replace(CONFIG, trigger=TriggerConfig(0.0, 0.0))).system
+    return filtered(pairs(12), ALWAYS).system
 
 
 def test_found_again(found):
@@ -241,14 +241,8 @@ def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> Pair[Stereo
     """The last pair of `settled`, of this wall or another; half of the places are exchanged."""
     source = Pairs(texture(seed), pairs(12).truth.poses, lambda t, frame: frame)
     pair, _ = slam.front_end.measure(next(iter(source.frames(11))))
-    features, rng = pair.features, np.random.default_rng(0)
-    z, rows = features.z.copy(), rng.permutation(len(features))[: len(features) // 2]
-    if mistaken:
-        z[rows] = z[np.roll(rows, 1)]
-    rest = features.cov, features.scale, features.orientation, features.descriptors
-    return replace(
-        pair, uncertain=True, stamp_ns=slam.filter.stamp_ns, features=StereoFeatures.measured(slam.rig, z, *rest)
-    )
+    features = half_exchanged(slam.rig, pair.features) if mistaken else pair.features
+    return replace(pair, uncertain=True, stamp_ns=slam.filter.stamp_ns, features=features)
 
 
 def located(slam: StereoSlam, shown: Pair[StereoFeatures]):
