@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from rbpf.kernels.se3 import rotation
-from rbpf.kernels.signature import BLOCK
+from rbpf.kernels.signature import BLOCK, prefetch
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -61,6 +61,15 @@ def load_record(pool, slab, rows, start, count, mean, cov, const):
     for f in range(size_const):
         for i in range(count):
             const[f, i] = pool[slab, dim + size_cov + f, rows[start + i]]
+
+
+@njit(cache=True, error_model="numpy")
+def expect_record(pool, slab, rows, start, count):
+    """Asks memory for what `load_record` will gather next, while something else is computed; a line holds eight numbers."""
+    for f in range(pool.shape[1]):
+        field = pool.ctypes.data + 8 * (slab * pool.shape[1] + f) * pool.shape[2]
+        for i in range(0, count, 8):
+            prefetch(field + 8 * rows[start + i])
 
 
 @njit(cache=True, error_model="numpy", inline="always")

@@ -77,6 +77,8 @@ def _refine_block(block, fused, records, observed, factor, sizes, sums):
     lanes.load_states(state, start, count, x)
     for k in range(n_obs):
         lanes.load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
+        if k + 1 < n_obs:
+            lanes.expect_record(pool, slabs[k + 1], maps[which[k + 1]], start, count)
         kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
         lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
         if mask.shape[0] > 0 or kernel_id != 0:
@@ -171,6 +173,8 @@ def _update_block(block, fused, records, targets, observed, sizes, log_density):
     for k in range(n_obs):
         rows = maps[which[k]]
         lanes.load_record(pool, slabs[k], rows, start, count, mean, cov, const)
+        if k + 1 < n_obs:
+            lanes.expect_record(pool, slabs[k + 1], maps[which[k + 1]], start, count)
         kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
         lanes.innovation_covariance(jac_map, cov, noise[k], count, cross, total)
         if mask.shape[0] > 0:

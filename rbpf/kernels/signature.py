@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, final
 
 import numba
+from llvmlite import ir
 from numba import cfunc, float64, int64, types, void
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -54,6 +55,20 @@ def function_at(signature: Any) -> Any:
         return kind(address), build
 
     return at
+
+
+@intrinsic
+def prefetch(_typing: Any, address: Any) -> Any:
+    """Asks for the cache line at an address (int64), of memory that will be read; nothing waits for it."""
+
+    def build(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        read, nearest, data = (ir.Constant(number, value) for value in (0, 3, 1))
+        builder.call(ask, [builder.inttoptr(arguments[0], byte), read, nearest, data])
+
+    return types.void(types.int64), build
 
 
 def part_of(*arguments: Any) -> tuple[Any, Callable[[Callable[..., None]], Any]]:
