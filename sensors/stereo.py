@@ -143,9 +143,8 @@ class StereoMatcher:
         self.extractor = extractor or Sift()
         self.config = config or PairConfig()
         self.impulse_fraction = 0.0  #: Fraction of the pixels that were replaced in the last pair.
-        self.offset_px = (
-            0.0  #: By which columns of the right image are known to be too large: they are measured without it.
-        )
+        #: By which columns of the right image are known to be too large: they are measured without it.
+        self.offset_px = 0.0
         self._last: tuple[tuple[np.ndarray, np.ndarray], Features, Features, int] | None = None
 
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:

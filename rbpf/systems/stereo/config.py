@@ -141,11 +141,11 @@ class StereoConfig(RunConfig):
     map: MapConfig = field(default_factory=MapConfig)  #: which features are landmarks.
     #: which features become landmarks, and how long they stay.
     new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
-    #: of a landmark's innovation, S05 (6) by default.
     #: of a joint map: the pair calibrates itself, an error common to all disparities being estimated with everything else.
     calibrate: Literal["off", "online"] = "off"
     #: what is known of a pair that calibrates itself.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    #: of a landmark's innovation, S05 (6) by default.
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
     )
