@@ -1,6 +1,6 @@
 """Range-bearing SLAM in the plane and in space: odometry, a mounted sensor, point landmarks, FastSLAM 2.0.
 
-`RangeBearingSlam(RangeBearingConfig(particles=100))` takes each entry of a log by `track(z, cov_z, names, odometry, stamp_ns)`.
+`RangeBearingSlam(RangeBearingConfig(particles=100))` takes a log entry by `track(z, cov_z, names, odometry, stamp_ns)`.
 """
 
 from dataclasses import replace
