@@ -210,4 +210,7 @@ def _filtered(config: Any, data: Data) -> Run[Any]:
 
 
 def _evidence(config: Config, data: Data) -> float:
+    if isinstance(config, RangeBearingConfig):
+        # A landmark that a further sub-map begins anew would count as new: the evidence is that of one Gaussian of all.
+        config = replace(config, submap=None)
     return float(_filtered(config, data).system.filter.log_evidence)
