@@ -22,12 +22,14 @@ from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION
 class CameraModel(ObservationModel):
     """The chain from a landmark to pixels; a subclass says where the landmark lies.
 
-    `about` (m,) is the substate with which the camera is as given, where it is not known: its last four numbers are those of
-    `Pinhole.tuned`, of a pair the last one is how much too large columns of the right image are.
+    A landmark nearer to the border than `margin_px` is not expected to be seen. `about` (m,) is the substate with which the
+    camera is as given, where it is not known: its last four numbers are those of `Pinhole.tuned`, of a pair the last one is
+    by how much columns of the right image are too large.
     """
 
-    def __init__(self, camera: Pinhole | RectifiedStereo, about: Given = None) -> None:
+    def __init__(self, camera: Pinhole | RectifiedStereo, margin_px: float = 0.0, about: Given = None) -> None:
         self.camera = camera
+        self.margin_px = margin_px
         self.dim = camera.dim
         self.about = about
         if about is not None:
@@ -75,7 +77,7 @@ class CameraModel(ObservationModel):
         return Jacobians(by_state, slope @ turned, by_substate)
 
     def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
-        return self.camera.visible(self.in_camera(state, landmark, const))
+        return self.camera.visible(self.in_camera(state, landmark, const), self.margin_px)
 
 
 class CameraPoint(CameraModel):
@@ -101,8 +103,10 @@ class CameraRay(CameraModel):
     `rho` (2,) is the inverse depth of a landmark just started: mean and standard deviation, 1/m.
     """
 
-    def __init__(self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), about: Given = None) -> None:
-        super().__init__(camera, about)
+    def __init__(
+        self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0, about: Given = None
+    ) -> None:
+        super().__init__(camera, margin_px, about)
         if not (np.isfinite(rho).all() and min(rho) > 0.0):
             raise InputError(f"the prior of the inverse depth needs a positive mean and deviation, got {rho}")
         self.pinhole = camera
@@ -193,12 +197,12 @@ class StereoPoint(CameraPoint):
     """A world point in metres, seen by both cameras.
 
     S05 (4)–(7) compares points in space, with C^L from the pixels' noise; here pixels are compared, which is the same
-    to first order and stays Gaussian where the point is far. With `about`, pixels are
-    given without what that says.
+    to first order and stays Gaussian where the point is far. With `about` (1,), that many pixels have been taken off
+    every u_right.
     """
 
-    def __init__(self, rig: RectifiedStereo, about: Given = None) -> None:
-        super().__init__(rig, about=about)
+    def __init__(self, rig: RectifiedStereo, margin_px: float = 0.0, about: Given = None) -> None:
+        super().__init__(rig, margin_px, about)
         self.rig = rig
 
     def by_substate(self, state: Array, landmark: Array, const: Given = None) -> Array:

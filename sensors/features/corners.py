@@ -9,8 +9,6 @@ from rbpf.sensors.features.interface import Detector, checked_image
 
 WINDOW_PX = 9  #: The score looks at 9 × 9 px: a template of 11 × 11 px without its border.
 _FAST_RADIUS_PX = 3
-FAST_THRESHOLD = 10  #: Grey levels by which FAST's arc must differ from the corner's pixel.
-MIN_SCORE = 4.0  #: The lowest score of a corner.
 
 
 @final
@@ -21,9 +19,17 @@ class CornerDetector(Detector):
     per pixel: the gradient that a match can rely on in every direction. Noise σ places a template of 11 × 11 px to about
     σ √2 / (11 score) px. Among neighbouring pixels that FAST finds, the one of the highest score is a corner.
     Corners are at whole pixels; equal scores go by row, then column.
+
+    Args:
+        fast_threshold: grey levels by which FAST's arc must differ from the corner's pixel.
+        min_score: the lowest score.
     """
 
     margin_px = WINDOW_PX // 2 + 1
+
+    def __init__(self, fast_threshold: int = 10, min_score: float = 4.0) -> None:
+        self.fast_threshold = fast_threshold
+        self.min_score = min_score
 
     def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         import cv2
@@ -33,7 +39,7 @@ class CornerDetector(Detector):
         # All of FAST's corners: of equal neighbours, which ideal and saturated images have, its own suppression keeps none.
         first = margin_px - _FAST_RADIUS_PX
         inner = image[first : image.shape[0] - first, first : image.shape[1] - first]
-        found = cv2.FastFeatureDetector.create(FAST_THRESHOLD, False).detect(inner)
+        found = cv2.FastFeatureDetector.create(self.fast_threshold, False).detect(inner)
         px = np.asarray(cv2.KeyPoint.convert(found), dtype=np.int64).reshape(-1, 2) + first
         px = px[np.argsort(px[:, 1], kind="stable")]  # row by row, as its own order is
         if mask is not None:
@@ -41,7 +47,7 @@ class CornerDetector(Detector):
         # A corner's score is good enough, and the highest among its neighbours that FAST found.
         squared, is_best = _squared_scores(image, px), np.empty(len(px), dtype=bool)
         highest(px, squared, np.full(image.shape, -np.inf), is_best)
-        is_best &= squared >= MIN_SCORE**2
+        is_best &= squared >= self.min_score**2
         return px[is_best], np.sqrt(squared[is_best])
 
 

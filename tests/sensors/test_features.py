@@ -6,7 +6,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.sensors.features import CornerDetector, Extractor, Keypoints, Sift, SiftConfig
-from rbpf.sensors.features.corners import MIN_SCORE, WINDOW_PX
+from rbpf.sensors.features.corners import WINDOW_PX
 from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.sensors.features.sift import descriptors_from_histograms, pooled
 from rbpf.sensors.patches.search import cut
@@ -135,7 +135,7 @@ def test_scores_and_choice_equal_numpys():
     )
     rated = np.array([texture(image, place) for place in fast])
     highest = [rated[np.abs(fast - place).max(axis=1) <= 1.0].max() for place in fast]
-    assert np.array_equal(px, fast[(rated >= highest) & (rated >= MIN_SCORE)])
+    assert np.array_equal(px, fast[(rated >= highest) & (rated >= detector.min_score)])
     kept = list[int]()
     for row in np.argsort(-score, kind="stable").tolist():
         if all(np.linalg.norm(px[row] - px[other]) >= 8.0 for other in kept):
