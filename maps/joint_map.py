@@ -67,7 +67,7 @@ LARGEST = 6000
 FEWEST = 3
 """Landmarks from afar with which all sub-maps are solved for."""
 LOCAL, WORTH = 3.0, 20
-"""Times as far as landmarks are seen from that a sub-map of so many landmarks may reach.
+"""How far a sub-map may reach, over how far landmarks are seen from; and how many of them it must have to end by that.
 
 What a turn of the heading does to a landmark in the second order, which a Gaussian leaves out, grows with its distance.
 """
@@ -353,7 +353,7 @@ class JointMap(Map):
     def estimate(self, particles: Particles) -> Estimate:
         """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
         if self.old.maps and not self.passed_on:
-            # What finished sub-maps know of the landmarks it has begun anew, the present one is told of here alone.
+            # The present sub-map has begun some landmarks anew: what finished ones know of these counts here alone.
             return self.old.end(self._consolidated(particles).finished(self.old))
         d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
         origin, turn = self.space.mean(world, weights), self._turn(particles)

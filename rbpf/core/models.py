@@ -41,9 +41,8 @@ Estimates = Float[np.ndarray, "*#batch D"]
 Means = Estimates | None
 Constants = Float[np.ndarray, "*#batch A"] | None
 Substates = Float[np.ndarray, "*#batch m"] | None
-Given = (
-    Array | None
-)  #: For a model of one's own that states no shapes: landmarks, constants or substates, where it reads them.
+#: Of a model that states no shapes: landmarks, constants or substates, None where it does not read them.
+Given = Array | None
 Measured = Float[np.ndarray, "*#batch p"]
 Result = Float[np.ndarray, "*batch p"]
 Covariances = Float[np.ndarray, "*#batch p p"]
