@@ -267,7 +267,7 @@ class ObservationModel(ABC):
     def new_by_substate(self, z: Z) -> Float[np.ndarray, "K D m"] | None:
         """From measurements (K, p) how the landmarks of `initialise` move with the substate (K, D, m); None: not at all.
 
-        As they are seen from the state.
+        It is how they move as seen from the state: the map turns that into its own frame.
         """
         return None
 

@@ -275,8 +275,8 @@ class SystemKind(NamedTuple):
     """A system as command line, reports and sweeps know it."""
 
     config: type[Any]  #: of its settings.
-    recording: Callable[..., Recording]  #: what it filters, from the paths that are named.
-    #: That make a recording, as config.yaml calls them; all but the first may lack.
+    recording: Callable[..., Recording]  #: what it filters, from `paths` in their order.
+    #: What config.yaml calls the paths of a recording; all but the first may be left out.
     paths: tuple[str, ...] = ("recording",)
 
 
