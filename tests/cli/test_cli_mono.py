@@ -262,25 +262,10 @@ def in_line(rows):
     return [[*row[:3], str(0.1 * k), str(0.2 * k), "0.0", *row[6:]] for k, row in enumerate(rows)]
 
 
-def grey_about_the_second(rows, folder):
-    """What is spoilt is the image."""
-    image = cv2.imread(str(image_path(folder, 0)), cv2.IMREAD_GRAYSCALE)
-    u, v = round(float(rows[1][1])), round(float(rows[1][2]))
-    image[v - 12 : v + 13, u - 12 : u + 13] = 128
-    cv2.imwrite(str(image_path(folder, 0)), image)
-
-
-@pytest.mark.parametrize(
-    ("edit", "words"),
-    [(mixed_up, "which point is which"), (in_line, "lie on a line"), (None, "known point 2 .* shows no corner there")],
-)
+@pytest.mark.parametrize(("edit", "words"), [(mixed_up, "which point is which"), (in_line, "lie on a line")])
 def test_known_points_that_cannot_be_are_refused(desk, folder, tmp_path, capsys, edit, words):
     header, *lines = (desk / "known_points.csv").read_text().splitlines()
-    rows = [line.split(",") for line in lines]
-    if edit is None:
-        grey_about_the_second(rows, folder)
-    else:
-        rows = edit(rows)
+    rows = edit([line.split(",") for line in lines])
     points = tmp_path / "points.csv"
     points.write_text("\n".join([header, *map(",".join, rows)]) + "\n")
     assert re.search(words, refused(capsys, folder, tmp_path / "run", "--known-points", points))

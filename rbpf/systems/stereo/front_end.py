@@ -67,6 +67,10 @@ class FrontEnd(ABC, Generic[F]):
         """Columns of the right image are too large by `about` (1,) px: from here on they are measured without that."""
         raise InputError(f"{type(self).__name__} has no cameras that calibrate themselves")
 
+    def shifted(self, features: F, by_px: float) -> F:
+        """With columns of the right image so much larger: as they are now known to be. It must be overridden with `tune`."""
+        raise InputError(f"{type(self).__name__} has no cameras that calibrate themselves")
+
     @abstractmethod
     def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
         """Rows (M,) of the earlier pair and (M,) of the later one that are the same point, as the odometry takes it."""
@@ -173,6 +177,10 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         self.matcher.offset_px = float(about[0])
         self.landmarks.model = StereoPoint(self.rig, about=about)
 
+    def shifted(self, features: StereoFeatures, by_px: float) -> StereoFeatures:
+        kept = features.scale, features.orientation, features.descriptors
+        return StereoFeatures.measured(self.rig, features.z + np.array([0.0, 0.0, by_px]), features.cov, *kept)
+
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
         one, other = before.features.descriptors, now.features.descriptors
         found = match_all(one, other, self.config.odometry.limits)
@@ -214,6 +222,9 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
     def tune(self, about: np.ndarray) -> None:
         self._offset_px = float(about[0])
         self.landmarks.model = StereoPoint(self.rig, about=about)
+
+    def shifted(self, features: FeatureFrame, by_px: float) -> FeatureFrame:
+        return replace(features, z=features.z + np.array([0.0, 0.0, by_px]))
 
     def match(self, before: Pair[FeatureFrame], now: Pair[FeatureFrame]) -> tuple[np.ndarray, np.ndarray]:
         names = before.features.landmarks, now.features.landmarks

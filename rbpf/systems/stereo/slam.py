@@ -350,6 +350,10 @@ class StereoSlam(System):
         if measured:
             static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
             self._kept = replace(pair, labels=motion.labelled(len(pair), static))
+            if config.calibrate == "online" and updated:
+                # By the same calibration as that one, else what was learnt looks like a motion in depth.
+                by_px = offset_px - self.calibration()[0]
+                self._kept = replace(self._kept, features=front_end.shifted(pair.features, by_px))
         self.frames += 1
 
         # 5. Report: between updates the odometry moves the estimate.
