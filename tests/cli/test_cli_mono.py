@@ -14,11 +14,11 @@ from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.recordings import filter_features as filter_log
 from rbpf.runs.trajectory import read_tum
-from rbpf.sensors.readers import open_images, open_stereo
+from rbpf.sensors.readers import open_images
 from rbpf.systems.mono.config import MonoConfig
 from tests.cli.run_outputs import BATCH, FILES, OF_CAMERAS, REQUIRED, layout, names, outputs
-from tests.cli.sequences import CAMERA, FRAMES, refused, run, run_stereo, sentence, summary
-from tests.readers.images.bags import KINDS, film_images, film_pairs, recorded
+from tests.cli.sequences import CAMERA, FRAMES, refused, run, sentence, summary
+from tests.readers.images.bags import KINDS, film_images, recorded
 
 pytestmark = pytest.mark.slow
 
@@ -300,16 +300,6 @@ def test_a_bag_gives_the_bytes_of_its_images_in_a_folder(desk, as_bag, tmp_path)
     assert run(as_bag(KINDS[1]), tmp_path / "run", *known, "--truth-topic", "/truth", "--video") == 0
     bag = outputs(tmp_path / "run")
     assert {name for name in from_folder | bag if from_folder.get(name) != bag.get(name)} == {"config.yaml"}
-
-
-def test_a_stereo_bag_gives_the_bytes_of_its_folder(room, tmp_path):
-    with recorded(tmp_path / KINDS[0]) as bag:
-        film_pairs(bag, open_stereo(room), "image_rect")
-    quick = ["--no-video", "--no-batch"]
-    assert run_stereo(room, tmp_path / "folder", *quick) == 0
-    assert run_stereo(tmp_path / KINDS[0], tmp_path / "bag", *quick) == 0
-    for name in ("trajectory.tum", "map.csv"):
-        assert (tmp_path / "folder" / name).read_bytes() == (tmp_path / "bag" / name).read_bytes()
 
 
 @pytest.mark.parametrize("kind", KINDS)

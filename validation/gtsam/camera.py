@@ -241,7 +241,7 @@ class Adjusted(NamedTuple):
 
 
 def adjust(
-    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: solvers.OnIteration | None = None
+    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: solvers.OnMisfit | None = None
 ) -> Adjusted:
     """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
 
@@ -301,7 +301,7 @@ def solve_features(
     from_known: bool = False,
     robust: float | None = None,
     marginals: bool = True,
-    on_iteration: solvers.OnIteration | None = None,
+    on_iteration: solvers.OnMisfit | None = None,
     tolerance: float = FINE,
 ) -> solvers.BatchSolution:
     """Solve for all poses and landmarks at once.
@@ -388,7 +388,7 @@ def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
 
 
 def grown(
-    problem: CameraProblem, start: InitialEstimate, on_iteration: solvers.OnIteration | None = None
+    problem: CameraProblem, start: InitialEstimate, on_iteration: solvers.OnMisfit | None = None
 ) -> InitialEstimate:
     """A path that begins at the known points, and is found again frame by frame from the landmarks that have a place so far.
 

@@ -26,7 +26,7 @@ from rbpf.lie import Array
 ROUGH = 1e-4  #: Fraction of the error that still counts as progress far from the optimum.
 EXACT = 1e-11  #: The same near by.
 ITERATIONS = 200  #: Most of them.
-OnIteration = Callable[[float], None]  #: What is called before each iteration, with the error there.
+OnMisfit = Callable[[float], None]  #: What is called before each iteration, with the error there.
 _DAMPING = 1e-5
 _MIN_DAMPING = 1e-10
 _MAX_DAMPING = 1e10
@@ -128,7 +128,7 @@ def huber(base: Any, threshold: float | None) -> Any:
 
 
 def levenberg_marquardt(
-    graph: Any, values: Any, tolerance: float, iterations: int = ITERATIONS, on_iteration: OnIteration | None = None
+    graph: Any, values: Any, tolerance: float, iterations: int = ITERATIONS, on_iteration: OnMisfit | None = None
 ) -> tuple[Any, int, bool]:
     """Damped Gauss-Newton from some values; returns the values, the number of iterations, and whether it converged.
 
