@@ -91,11 +91,6 @@ def test_a_closed_standard_output_is_refused_where_a_result_is_wanted_there(tmp_
     assert (found.returncode, found.stderr) == (2, "rbpf: standard output is closed: --json has nowhere to write to\n")
 
 
-def test_its_version(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"rbpf {__version__}\n"
-
-
 def test_a_broken_pipe_ends_quietly():
     command = [sys.executable, "-m", "rbpf", "completion", "bash"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
@@ -117,7 +112,9 @@ def help_of(command, capsys, monkeypatch):
     return capsys.readouterr().out
 
 
-def test_every_command_is_named(capsys, monkeypatch):
+def test_its_version_and_every_command_are_named(capsys, monkeypatch):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"rbpf {__version__}\n"
     text = help_of("", capsys, monkeypatch)
     named = set(re.search(r"\{([\w,-]+)\}", text)[1].split(","))
     assert named == {command.split()[0] for command in COMMANDS}

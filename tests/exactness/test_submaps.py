@@ -81,8 +81,11 @@ def test_joined_they_say_what_one_gaussian_says(submap, window):
     readings, mean, cov = walk()
     tolerance = 1e-6 if window == 1 else 0.05  # a window's samples tell no more
     whole, joint = (JointMap(Euclidean(2), submap=most) for most in (None, submap))
-    options = {"n": 10 if window == 1 else 2000, "rng": np.random.default_rng(0), "lag": 1}
-    options["consolidation"] = Consolidation(window)
+    options = {
+        "n": 10 if window == 1 else 2000,
+        "rng": np.random.default_rng(0),
+        "consolidation": Consolidation(window),
+    }
     filters = [Filter(Walk(), NamedLandmarkSensor(Relative(), Point(2)), held, **options) for held in (whole, joint)]
     for t, reading in enumerate(readings):
         for filter_ in filters:
