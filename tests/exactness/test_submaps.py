@@ -79,13 +79,9 @@ def walk(steps: int = 14) -> tuple[list[Reading], np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("submap", [4, 7, 100])
 def test_joined_they_say_what_one_gaussian_says(submap, window):
     readings, mean, cov = walk()
-    tolerance = 1e-6 if window == 1 else 0.05  # a window's samples tell no more
+    n, tolerance = (10, 1e-6) if window == 1 else (2000, 0.05)  # a window's samples tell no more
     whole, joint = (JointMap(Euclidean(2), submap=most) for most in (None, submap))
-    options = {
-        "n": 10 if window == 1 else 2000,
-        "rng": np.random.default_rng(0),
-        "consolidation": Consolidation(window),
-    }
+    options = {"n": n, "rng": np.random.default_rng(0), "consolidation": Consolidation(window)}
     filters = [Filter(Walk(), NamedLandmarkSensor(Relative(), Point(2)), held, **options) for held in (whole, joint)]
     for t, reading in enumerate(readings):
         for filter_ in filters:
