@@ -56,8 +56,7 @@ def test_the_refined_proposal_beats_the_bootstrap_one(data_dir):
 
 def test_sub_maps_close_the_loops_of_victoria_park(data_dir):
     """Whose odometry turns by many times what it states: one Gaussian of all is surprised at every return."""
-    log = open_log(data_dir / "victoria_park")
-    run = filter_opened(open_robot_log(log, RangeBearingConfig(seed=0)))
+    run = filter_opened(open_robot_log(open_log(data_dir / "victoria_park"), RangeBearingConfig(seed=0)))
     assert run.system.map().ids.size == 151 and len(run.system.joint.old.maps) > 5
     assert np.nansum(run.log["nis"]) < np.nansum(run.log["nis_dof"])
     assert np.isnan(run.log["log_evidence"][-1]) and run.log["log_evidence"][0] == 0.0

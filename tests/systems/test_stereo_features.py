@@ -162,6 +162,7 @@ def test_an_error_of_all_disparities_is_found():
         nees.append([nees_of(run), nees_of(without)])
         found, std = run.system.calibration()
         squared.append(((found - 0.3) / std) ** 2)
+        np.testing.assert_allclose(run.system._kept.features.z, wrong.frames[-1].z - [0.0, 0.0, found], atol=1e-9)
         assert std < 0.2 and run.system.summary(run.log)["calibration"]["disparity_offset_px"] == found
         for ours, theirs in zip(run.system.measurements("told", run.log).frames, log.frames, strict=True):
             np.testing.assert_allclose(ours.z - theirs.z, np.tile([0.0, 0.0, 0.3 - found], (len(ours), 1)), atol=1e-9)
