@@ -23,14 +23,15 @@ from rbpf.lie import SE3
 from rbpf.runs.files import write_table
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_features, filter_opened, open_robot_log
-from rbpf.runs.truth import truth_at
+from rbpf.runs.truth import RunTruth, truth_at
 from rbpf.sensors.readers import RobotLog, open_log
-from rbpf.sensors.readers.measurements import InitialEstimate
+from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
+from rbpf.validation.gtsam.robot import solve
 from rbpf.validation.metrics.scores import score_estimate
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 
@@ -74,13 +75,19 @@ class EkfTrial:
         return of_ekf(log)
 
 
-def of_ekf(log: RobotLog) -> Trial:
-    """One Gaussian of pose and landmarks, linearised once per step."""
+def measured_in(log: RobotLog) -> tuple[Measurements, RunTruth]:
+    """What a filter uses of a log with the truth of all its steps, and this."""
     done = filter_opened(open_robot_log(log, replace(JOINT, particles=1, window=1)))
-    found = joint_ekf(done.system.measurements(log.name, done.log))
     assert log.truth is not None
     truth = truth_at(log.space, log.truth, done.log.stamps_ns, "first frame")
     assert truth is not None
+    return done.system.measurements(log.name, done.log), truth
+
+
+def of_ekf(log: RobotLog) -> Trial:
+    """One Gaussian of pose and landmarks, linearised once per step."""
+    measured, truth = measured_in(log)
+    found = joint_ekf(measured)
     errors = whitened_errors(log.space, found.world_from_robot, found.cov_poses, truth.poses)
     landmarks = []
     for name, point in found.landmarks.items():
@@ -92,6 +99,14 @@ def of_ekf(log: RobotLog) -> Trial:
         dim, np.linalg.norm(shift, axis=1), np.where(errors.ranks > 0, errors.nees, np.nan), nothing, nothing,
         np.array(landmarks), shift.shape[1], nothing, None, found.log_evidence,
     )  # fmt: skip
+
+
+def of_batch(log: RobotLog) -> float:
+    """How far the path is off that explains all measurements best, rms in metres."""
+    measured, truth = measured_in(log)
+    found = solve(measured, marginals=False, incremental=True)
+    shift = log.space.translation(found.world_from_body) - log.space.translation(truth.poses)
+    return float(np.sqrt((shift**2).sum(axis=1).mean()))
 
 
 def simulated(
@@ -289,6 +304,8 @@ def main(
         trials = {"joint EKF": EkfTrial(LONG), "joint map, sub-maps of 150": RobotTrial(LONG, JOINT)}
         long = {name: run_trials(trial, range(long_runs), workers) for name, trial in trials.items()}
         rows += rows_of("20,000 steps", long)
+        batch = [of_batch(simulated_log(LONG, seed)) for seed in range(long_runs)]
+        rows.append(["20,000 steps", "batch", long_runs, *[np.nan] * 5, float(np.mean(batch)), np.nan])
     write_table(out / "joint_map.csv", header, rows)
     if recordings is not None:
         configs = {f"joint, 50, window {w}": replace(JOINT, particles=50, window=w) for w in windows}
