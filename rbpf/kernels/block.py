@@ -19,6 +19,17 @@ def packed(a, b):
 
 
 @njit(cache=True, error_model="numpy")
+def lines(rows):
+    """Memory of as many rows of a block, end to end, that begins where a cache line does.
+
+    Eight numbers at a time are then one line each; from elsewhere they are parts of two, and a sum takes half as long again.
+    """
+    held = np.empty(rows * BLOCK + 8)
+    first = -(held.ctypes.data // 8) % 8
+    return held[first : first + rows * BLOCK]
+
+
+@njit(cache=True, error_model="numpy")
 def workspace(size, p, dim, dim_map, size_const):
     """Memory for a block that sees one landmark after another.
 
@@ -27,16 +38,18 @@ def workspace(size, p, dim, dim_map, size_const):
     kernel fills the leading columns, those of what it reads.
     """
     size_cov = dim_map * (dim_map + 1) // 2
+    jac_state = lines(p * dim).reshape(p, dim, BLOCK)
+    jac_state[:] = 0.0
     return (
-        np.empty((size, BLOCK)),
-        np.empty((dim_map, BLOCK)),
-        np.empty((size_cov, BLOCK)),
-        np.empty((size_const, BLOCK)),
-        np.empty((p, BLOCK)),
-        np.zeros((p, dim, BLOCK)),
-        np.empty((p, dim_map, BLOCK)),
-        np.empty((p, dim_map, BLOCK)),
-        np.empty((p, p, BLOCK)),
+        lines(size).reshape(size, BLOCK),
+        lines(dim_map).reshape(dim_map, BLOCK),
+        lines(size_cov).reshape(size_cov, BLOCK),
+        lines(size_const).reshape(size_const, BLOCK),
+        lines(p).reshape(p, BLOCK),
+        jac_state,
+        lines(p * dim_map).reshape(p, dim_map, BLOCK),
+        lines(p * dim_map).reshape(p, dim_map, BLOCK),
+        lines(p * p).reshape(p, p, BLOCK),
     )
 
 
@@ -175,8 +188,8 @@ def whiten_matrix(factor, count, matrix):
 
 
 @njit(cache=True, error_model="numpy")
-def add_gram(matrix, sign, count, total):
-    """Total += sign · matrixᵀ matrix, packed; up to three rows in one pass: a sum is loaded and stored once for them."""
+def subtract_gram(matrix, count, total):
+    """Total −= matrixᵀ matrix, packed; up to three rows in one pass: a sum is loaded and stored once for them."""
     p = matrix.shape[0]
     done = min(p, 3) if p > 1 else 0
     for e in range(matrix.shape[1]):
@@ -184,21 +197,21 @@ def add_gram(matrix, sign, count, total):
             m = packed(e, f)
             if p == 2:
                 for i in range(count):
-                    first = total[m, i] + sign * matrix[0, e, i] * matrix[0, f, i]
-                    total[m, i] = first + sign * matrix[1, e, i] * matrix[1, f, i]
+                    first = total[m, i] - matrix[0, e, i] * matrix[0, f, i]
+                    total[m, i] = first - matrix[1, e, i] * matrix[1, f, i]
             elif p > 2:
                 for i in range(count):
-                    first = total[m, i] + sign * matrix[0, e, i] * matrix[0, f, i]
-                    second = first + sign * matrix[1, e, i] * matrix[1, f, i]
-                    total[m, i] = second + sign * matrix[2, e, i] * matrix[2, f, i]
+                    first = total[m, i] - matrix[0, e, i] * matrix[0, f, i]
+                    second = first - matrix[1, e, i] * matrix[1, f, i]
+                    total[m, i] = second - matrix[2, e, i] * matrix[2, f, i]
             for a in range(done, p):
                 for i in range(count):
-                    total[m, i] += sign * matrix[a, e, i] * matrix[a, f, i]
+                    total[m, i] -= matrix[a, e, i] * matrix[a, f, i]
 
 
 @njit(cache=True, error_model="numpy")
 def add_transposed_product(matrix, vector, count, total):
-    """Total += matrixᵀ vector; up to three rows in one pass, as in `add_gram`."""
+    """Total += matrixᵀ vector; up to three rows in one pass, as in `subtract_gram`."""
     p = matrix.shape[0]
     done = min(p, 3) if p > 1 else 0
     for e in range(matrix.shape[1]):

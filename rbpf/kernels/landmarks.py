@@ -67,8 +67,9 @@ def _refine_block(block, fused, records, observed, factor, sizes, sums):
     x, mean, cov, const, nu, jac_state, jac_map, cross, total = lanes.workspace(size, p, dim, dim_map, size_const)
     weight = np.ones(BLOCK)
     scale = np.ones(BLOCK)
-    sum_info = np.zeros((dim * (dim + 1) // 2, BLOCK))
-    sum_vector = np.zeros((dim, BLOCK))
+    sum_info = lanes.lines(dim * (dim + 1) // 2).reshape(dim * (dim + 1) // 2, BLOCK)
+    sum_vector = lanes.lines(dim).reshape(dim, BLOCK)
+    sum_info[:] = sum_vector[:] = 0.0  # the first with the sign reversed
     sum_quad = np.zeros(BLOCK)
     sum_log = np.zeros(BLOCK)
     penalty = np.zeros(BLOCK)
@@ -88,7 +89,7 @@ def _refine_block(block, fused, records, observed, factor, sizes, sums):
             leave_out(weight, count, nu, jac_state, total)
         lanes.whiten(total, count, nu, scale, sum_quad)
         lanes.whiten_matrix(total, count, jac_state)
-        lanes.add_gram(jac_state, 1.0, count, sum_info)
+        lanes.subtract_gram(jac_state, count, sum_info)
         lanes.add_transposed_product(jac_state, nu, count, sum_vector)
         pivots += p
         for i in range(count):
@@ -107,7 +108,7 @@ def _refine_block(block, fused, records, observed, factor, sizes, sums):
         for a in range(dim):
             vector[start + i, a] += sum_vector[a, i]
             for b in range(dim):
-                info[start + i, a, b] += sum_info[packed(a, b), i]
+                info[start + i, a, b] -= sum_info[packed(a, b), i]
 
 
 @njit(void(int64, *_REFINE), parallel=True, cache=True, error_model="numpy")
@@ -206,7 +207,7 @@ def _update_block(block, fused, records, targets, observed, sizes, log_density):
         if rejected:
             leave_out(weight, count, nu, cross, total)
         lanes.add_transposed_product(cross, nu, count, mean)
-        lanes.add_gram(cross, -1.0, count, cov)
+        lanes.subtract_gram(cross, count, cov)
         _store_record(pool, targets[k], slabs[k], rows, start, count, mean, cov)
         if kernel_id != 0 and mask.shape[0] == 0:
             weight[:] = 1.0
