@@ -34,8 +34,7 @@ class Commands:
 
         Of a group, or where help on one is asked for, the parser says which commands there are.
 
-        Raises:
-            InputError: there is no such command or option, or a value is out of its range.
+        Raises InputError: there is no such command or option, or a value is out of its range.
         """
         if not arguments or arguments[0].startswith("-"):
             tyro.cli(self._parsed(), prog=before, description=self._help, args=arguments)

@@ -20,8 +20,8 @@ from rbpf.systems.mono.relocalisation import (
     MIN_VIEW_CORNERS,
     Attempt,
     LastView,
+    Relocaliser,
     TrackingLoss,
-    describe_corners,
     is_confirmed,
     is_convincing,
     most_agree,
@@ -152,9 +152,8 @@ def last():
 
 def matched(last, image, landmarks=None):
     """What is seen again in an image."""
-    px = SENSOR.detector.detect(image, 500, None, 6.0, 16.0).px
-    points = known_points().positions if landmarks is None else landmarks
-    return last.match(describe_corners(SENSOR, image, px), px, points)
+    px, descriptors = Relocaliser(SENSOR, RECOVERY).corners(image)
+    return last.match(descriptors, px, known_points().positions if landmarks is None else landmarks)
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())

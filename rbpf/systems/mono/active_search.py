@@ -20,33 +20,19 @@ from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import FeatureTable, parallax, patch_affines, tilted
 
-CELLS = 6
-"""The image is divided into so many columns and rows, from which features are chosen in turn."""
-
-AMBIGUOUS = 0.9
-"""Of two places one may be mistaken for the other when their scores differ by less than this fraction."""
-
-MIN_AGREEING = 4
-"""Matches that must agree on a motion for it to say where the others are."""
-
-WIDEST = 2.0
-"""An ellipse larger than so many times what is searched of it is hardly searched at all."""
-
+CELLS = 6  #: The image is divided into so many columns and rows, from which features are chosen in turn.
+AMBIGUOUS = 0.9  #: Of two places one may be mistaken for the other when their scores differ by less than this fraction.
+MIN_AGREEING = 4  #: Matches that must agree on a motion for it to say where the others are.
+WIDEST = 2.0  #: An ellipse larger than so many times what is searched of it is hardly searched at all.
+#: From so far around a feature how its patch lies in space is learnt; what is half as far counts half.
 PLANE_HALF_PX = 7
-"""From so far around a feature how its patch lies in space is learnt; what is half as far counts half."""
-
+#: It is learnt as long as what is not known of it moves the patch's border by more, in standard deviations.
 SHOWN_PX = 0.1
-"""It is learnt as long as what is not known of it moves the patch's border by more, in standard deviations."""
-
-ROUNDING = 1.0 / 6.0
-"""Variance of the difference of two grey levels that were rounded."""
-
+ROUNDING = 1.0 / 6.0  #: Variance of the difference of two grey levels that were rounded.
 _OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-PLANE_HALF_PX, PLANE_HALF_PX + 1.0)]), axis=-1)
 _WEIGHTS = 0.5 ** (np.square(2.0 * _OFFSETS / PLANE_HALF_PX).sum(axis=-1)).ravel()
-
-ROUNDS = 10
-CAUCHY_SCALE = 2.0
-"""Of the robust fit: reweightings, and the standard deviations at which a match keeps half of its weight."""
+ROUNDS = 10  #: Of the robust fit: reweightings.
+CAUCHY_SCALE = 2.0  #: Likewise: standard deviations at which a match keeps half of its weight.
 
 
 class MotionFit(NamedTuple):

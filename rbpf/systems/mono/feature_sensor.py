@@ -28,20 +28,15 @@ from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.feature_table import directions
 
-MIN_DEPTHS = 4
-"""Depths that must be known in view for new features to start at them."""
-
-MIN_SCALED = 3
-"""Points that must be seen for the scale to be theirs: so many determine the camera's pose."""
-
+MIN_DEPTHS = 4  #: Depths that must be known in view for new features to start at them.
+MIN_SCALED = 3  #: Points that must be seen for the scale to be theirs: so many determine the camera's pose.
+#: Times the standard deviation that the prior of depth has, which a young ray that moves in the image is given along
+#: its line on top: the same prior comes again in every frame, so that in a frame it counts a tenth.
 WIDENED = 3.0
-"""Times the standard deviation that the prior of depth has, which a young ray that moves in the image is given along its
-line on top: the same prior comes again in every frame, so that in a frame it counts a tenth."""
+#: Squared displacement in the image over the noise of both places, up to which a ray is seen where it was started.
 STILL_CHI2 = 4.0
-"""Squared displacement in the image over the noise of both places, up to which a ray is seen where it was started."""
-
+#: Times the greatest standard deviation at which something is looked for: so far off a measurement is taken as linear.
 LINEAR = 3.0
-"""Times the greatest standard deviation at which something is looked for: so far off a measurement is taken as linear."""
 
 
 class UnknownDepth(ABC):
@@ -334,27 +329,25 @@ class FeatureSensor(Sensor):
 
     def project(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where features (K,) should be seen under all particles: which of them, means (k, 2), covariances (k, 2, 2)."""
-        which, means, covs = [], [], []
+        parts = []
         for model, chosen, ids in self.by_model(belief, names):
             mean, cov = belief.project(model, ids)
-            which.append(chosen)
-            means.append(mean.reshape(-1, 2))
-            covs.append(_diagonal_blocks(cov, chosen.size))
-        return np.concatenate(which), np.concatenate(means), np.concatenate(covs)
+            parts.append((chosen, mean.reshape(-1, 2), _diagonal_blocks(cov, chosen.size)))
+        which, means, covs = map(np.concatenate, zip(*parts, strict=True))
+        return which, means, covs
 
     def innovations(
         self, belief: Belief, names: np.ndarray, px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of features (K,) found at px (K, 2), in the heaviest particle: which, ν (k, 2), H (k, 2, d), J P Jᵀ (k, 2, 2)."""
-        which, nus, jacs, covs = [], [], [], []
+        parts = []
         for model, chosen, ids in self.by_model(belief, names):
             z = px[chosen].reshape(1, -1) if isinstance(model, MembersView) else px[chosen]
             nu, jac, cov = belief.innovations(model, z, ids)
-            which.append(chosen)
-            nus.append(nu.reshape(-1, 2))
-            jacs.append(jac.reshape(chosen.size, 2, -1))
-            covs.append(_diagonal_blocks(cov, chosen.size))
-        return np.concatenate(which), np.concatenate(nus), np.concatenate(jacs), np.concatenate(covs)
+            of_each = nu.reshape(-1, 2), jac.reshape(chosen.size, 2, -1), _diagonal_blocks(cov, chosen.size)
+            parts.append((chosen, *of_each))
+        which, nus, jacs, covs = map(np.concatenate, zip(*parts, strict=True))
+        return which, nus, jacs, covs
 
     def pose(self, belief: Belief) -> np.ndarray:
         """(7,) world_from_camera of the heaviest particle, in its world."""

@@ -13,18 +13,13 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import SearchConfig
 
+#: The patch that is kept of an appearance reaches this far from its centre: enough to be turned and shrunk.
 PATCH_HALF_PX = 15
-"""The patch that is kept of an appearance reaches this far from its centre: enough to be turned and shrunk."""
 PATCH_PX = 2 * PATCH_HALF_PX + 1
-
+#: Least inverse-depth weight of a homogeneous point for its patch to be placed in space: beyond, it is at infinity.
 MIN_WEIGHT = 1e-3
-"""Least inverse-depth weight of a homogeneous point for its patch to be placed in space: beyond, it is at infinity."""
-
-ENOUGH_TRUSTED = 6
-"""Trusted matches that determine the motion alone: three do, and half of them may be wrong."""
-
+ENOUGH_TRUSTED = 6  #: Trusted matches that determine the motion alone: three do, and half of them may be wrong.
 _OFFSETS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-
 _COLUMNS = {
     "first_patch": grey("features", PATCH_PX, PATCH_PX),
     "last_patch": grey("features", PATCH_PX, PATCH_PX),

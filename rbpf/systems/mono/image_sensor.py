@@ -22,13 +22,10 @@ from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, FeatureTable, view_change
 
+#: Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped.
 MIN_FIXED = 4
-"""Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped."""
-
-MIN_CONTRAST = 10
-"""Grey levels that are all nearer to each other are those of a lens cap."""
-MAX_REPEATS = 5
-"""Times that an image may come again: drivers repeat single images when the camera is late."""
+MIN_CONTRAST = 10  #: Grey levels that are all nearer to each other are those of a lens cap.
+MAX_REPEATS = 5  #: Times that an image may come again: drivers repeat single images when the camera is late.
 
 
 def no_features(stamp_ns: int = 0) -> FeatureFrame:
@@ -56,16 +53,11 @@ class Measurement:
     @property
     def features(self) -> FeatureFrame:
         """What was used, and what was started."""
-        return FeatureFrame(
-            self.stamp_ns,
-            np.concatenate([self.used.landmarks, self.started.landmarks]),
-            np.concatenate([self.used.z, self.started.z]),
-            np.concatenate([self.used.cov_z, self.started.cov_z]),
-        )
+        pairs = ((getattr(self.used, name), getattr(self.started, name)) for name in ("landmarks", "z", "cov_z"))
+        return FeatureFrame(self.stamp_ns, *map(np.concatenate, pairs))
 
 
-NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
-"""What a checkpoint holds where there was none."""
+NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)  #: What a checkpoint holds where there was none.
 
 
 def require_image(array: np.ndarray, camera: Pinhole) -> None:
@@ -139,8 +131,7 @@ class ImageSensor(Sensor):
         self.search = ActiveSearch(features, self.table, config, gate)
         self.detector = detector or CornerDetector()
         self.descriptor = descriptor or Sift(SiftConfig(working_scale=1.0, length=128))
-        self.bad_frames = 0
-        """Frames in a row in which too little was found."""
+        self.bad_frames = 0  #: Frames in a row in which too little was found.
         self._within = self.camera.field_of_view_mask(PATCH_HALF_PX + 1.0)
 
     @property

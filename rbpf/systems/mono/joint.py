@@ -48,20 +48,16 @@ from rbpf.systems.mono.start.adjustment import (
 from rbpf.systems.mono.start.known import world_of
 from rbpf.systems.system import Revision
 
-LINEARISATIONS = 3
-"""Of the proposal: moments of the samples hand on what a few weights cannot mend."""
+LINEARISATIONS = 3  #: Of the proposal: moments of the samples hand on what a few weights cannot mend.
+#: Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that.
 SETTLED = 0.2
-"""Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that."""
-RIGHT = 1.1
-"""Times a stated standard deviation, up to which it is right: as much as a report has for right."""
-JOINT = "joint/mean"
-"""In the checkpoint of a filter on a joint map."""
+RIGHT = 1.1  #: Times a stated standard deviation, up to which it is right: as much as a report has for right.
+JOINT = "joint/mean"  #: In the checkpoint of a filter on a joint map.
+#: Of the first frames, that take part in the hand-over's adjustment at most: it takes what they told from nothing else.
 MAX_FRAMES = 150
-"""Of the first frames, that take part in the hand-over's adjustment at most: it takes what they told from nothing else."""
+#: Of a camera that calibrates itself: constants beside the velocity (J. Civera et al. 2009).
 NUMBERS = "fx", "fy", "k1", "k2"
-"""Of a camera that calibrates itself: constants beside the velocity (J. Civera et al. 2009)."""
-KNOWN_FRACTION = 0.5
-"""Of the features in view: so many depths are known when the map becomes a joint one."""
+KNOWN_FRACTION = 0.5  #: Of the features in view: so many depths are known when the map becomes a joint one.
 
 
 @final
@@ -111,8 +107,7 @@ class HandOver:
         if wanted and velocity != "marginal":
             raise InputError(f"a joint map holds the velocity: set velocity.mode=marginal, not {velocity}")
         self.config, self.camera, self.known, self.first = config, camera, known, first
-        self.joint: JointMap | None = None
-        """The joint map; None as long as every particle has a map of its own."""
+        self.joint: JointMap | None = None  #: The joint map; None as long as every particle has a map of its own.
         self._rays: JointRays | None = None
         # What a camera that is not known yet leaves of the innovations is not noise.
         self.noise: LearntNoise | None = None

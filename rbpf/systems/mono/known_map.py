@@ -25,16 +25,13 @@ from rbpf.systems.system import Gauge
 
 NAME = "known_map.npz"
 VERSION = 1
-LEAST = 8
-"""Points that a map must hold for a camera to be found in it."""
+LEAST = 8  #: Points that a map must hold for a camera to be found in it.
 MOST_BYTES = 1 << 30
-MAX_VIEWS = 16
-"""Poses that are kept, to look from at a camera of which nothing is known."""
+MAX_VIEWS = 16  #: Poses that are kept, to look from at a camera of which nothing is known.
+#: The part of a ray that is drawn: this far to either side of its mean inverse depth, in standard deviations.
 RAY_SIGMAS = 2.0
-"""The part of a ray that is drawn: this far to either side of its mean inverse depth, in standard deviations."""
+#: How far the focal lengths of two cameras may differ for one to recognise what the other has seen.
 FOCAL_FRACTION = 0.02
-"""How far the focal lengths of two cameras may differ for one to recognise what the other has seen."""
-
 _SCHEMA = {
     "camera": numbers(10),
     "image_size": integers(2, least=1, below=1 << 16),
@@ -111,8 +108,7 @@ def known_map_arrays(found: KnownMap) -> dict[str, np.ndarray]:
 def read_known_map(path: Path) -> KnownMap:
     """Reads the file, or that of a run's folder.
 
-    Raises:
-        InputError: it is missing, damaged, of another version, or holds too few points.
+    Raises InputError: it is missing, damaged, of another version, or holds too few points.
     """
     if path.is_dir():
         path = path / NAME

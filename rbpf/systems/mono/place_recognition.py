@@ -28,25 +28,18 @@ from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.relocalisation import CORNER_PX, MIN_FITTED, SCALES, Attempt, Relocaliser, Sighting
 
-WRONG = 0.5
-"""Matches that are wrong by what is expected beforehand, as a fraction, and may be anywhere in the image."""
-BEFORE = 1e-3
-"""Probability, when it is asked, that an old sub-map is in view; with the rest the matches are chance."""
-ALIKE = 0.01
-"""Probability that another place looks like it, somewhere in a world as large as the map."""
+WRONG = 0.5  #: Matches that are wrong by what is expected beforehand, as a fraction, and may be anywhere in the image.
+BEFORE = 1e-3  #: Probability, when it is asked, that an old sub-map is in view; with the rest the matches are chance.
+ALIKE = 0.01  #: Probability that another place looks like it, somewhere in a world as large as the map.
+#: Probability of its being another place at which a loop is closed; of a camera that is lost, which has less to lose.
 RISK, RISK_LOST = 1e-3, 5e-2
-"""Probability of its being another place at which a loop is closed; of a camera that is lost, which has less to lose."""
-FURTHER = 3.0
-"""Times the standard deviation of how far a lost camera has gone: some are thrown."""
-ASKED = 2
-"""Old sub-maps that are asked in a frame."""
-VOTERS = 150
-"""Corners of an image that say which ones."""
-EXACT = 1e-4
-"""Standard deviation [rad, m] of where a lost camera is in a sub-map that begins where it is."""
+FURTHER = 3.0  #: Times the standard deviation of how far a lost camera has gone: some are thrown.
+ASKED = 2  #: Old sub-maps that are asked in a frame.
+VOTERS = 150  #: Corners of an image that say which ones.
+EXACT = 1e-4  #: Standard deviation [rad, m] of where a lost camera is in a sub-map that begins where it is.
 ROUNDS = 8
+#: Standard deviation of the range of what a single image shows, which has none, as a fraction of what is assumed.
 DEPTH_RATIO = 10.0
-"""Standard deviation of the range of what a single image shows, which has none, as a fraction of what is assumed."""
 
 
 class Place(NamedTuple):
@@ -181,17 +174,11 @@ class PlaceRecognition:
 
         An attempt was made to find it in the present one; `lost` says where it may be.
         """
-        if attempt.prior is None or attempt.sighting is None:
-            if not self._recover(filter_, joint, image, lost):
-                return False, None
-            here = joint.world(SE3.identity((filter_.n,)))
-            return True, PosePrior(here, EXACT**2 * np.eye(6), self._std_velocity)
-        present = Place.of(joint)
-        prior = Estimate(SE3.between(present.world_from_place, lost.mean), FURTHER**2 * lost.cov)
-        return self._odds(joint, present, attempt.sighting, prior)[0] >= -np.log(RISK_LOST), None
-
-    def _recover(self, filter_: Filter, joint: JointMap, image: np.ndarray, lost: Estimate) -> bool:
-        """Whether a lost camera is found in an old sub-map, and begins another one there; `lost` says where it may be."""
+        if attempt.prior is not None and attempt.sighting is not None:
+            present = Place.of(joint)
+            prior = Estimate(SE3.between(present.world_from_place, lost.mean), FURTHER**2 * lost.cov)
+            return self._odds(joint, present, attempt.sighting, prior)[0] >= -np.log(RISK_LOST), None
+        # In an old sub-map, perhaps: then another one begins there.
         y = SE3.between(joint.world(SE3.identity((1,)), slice(1))[0], lost.mean)
         for number in self._ask(joint, image) if joint.old.maps else []:
             sighting = self._look(filter_, joint, image, number)
@@ -204,8 +191,9 @@ class PlaceRecognition:
                 joint.consolidate(Particles(SE3.identity((filter_.n,)), filter_.particles.log_weights))
                 self._close(joint, again, tied=False)
                 filter_.particles = Particles(SE3.identity((filter_.n,)), uniform_log_weights(filter_.n))
-                return True
-        return False
+                here = joint.world(SE3.identity((filter_.n,)))
+                return True, PosePrior(here, EXACT**2 * np.eye(6), self._std_velocity)
+        return False, None
 
     def _close(self, joint: JointMap, again: Given, tied: bool) -> None:
         """Closes the loop; how features looked from where goes with the sub-map that they are of, or with the frame."""

@@ -36,40 +36,28 @@ from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, patch_affines
 from rbpf.systems.mono.image_sensor import NO_IMAGE, ImageSensor, require_image
 
-VIEWS_PER_FRAME = 2
-"""Views of a known map from which a lost camera is looked for in a frame, in turn."""
-
-BORDER_PX = 16.0
-"""No corner is nearer to the border."""
+VIEWS_PER_FRAME = 2  #: Views of a known map from which a lost camera is looked for in a frame, in turn.
+BORDER_PX = 16.0  #: No corner is nearer to the border.
+#: Sizes at which the lost image is described, times that at which features are seen from the last trusted pose.
 SCALES = (0.7, 1.0, 1.4)
-"""Sizes at which the lost image is described, times that at which features are seen from the last trusted pose."""
-MIN_PATCH_SCALE, MAX_PATCH_SCALE = 0.4, 1.2
-"""A patch that was kept is described at these sizes."""
+MIN_PATCH_SCALE, MAX_PATCH_SCALE = 0.4, 1.2  #: A patch that was kept is described at these sizes.
+#: Of the descriptors of one thing, seen from places that are not too different: half of all others are further.
 MAX_DISTANCE = 0.65
-"""Of the descriptors of one thing, seen from places that are not too different: half of all others are further."""
+#: Features this near to each other, in distances from the camera, may be one: they are no rivals of each other.
 SAME_POINT = 0.05
-"""Features this near to each other, in distances from the camera, may be one: they are no rivals of each other."""
-SAME_CORNER = 1.5
-"""Corners this near to each other, in least distances of corners, may show one thing."""
+SAME_CORNER = 1.5  #: Corners this near to each other, in least distances of corners, may show one thing.
+#: How well a corner is found again, per axis; the least correlation of a patch that says it better.
 CORNER_PX, MIN_CORRELATION = 2.0, 0.5
-"""How well a corner is found again, per axis; the least correlation of a patch that says it better."""
-MIN_FITTED = 3
-"""Landmarks that determine where another particle's world is."""
-MAX_ROUNDS = 10
-"""Of a pose's refinement on what is seen around it."""
-
+MIN_FITTED = 3  #: Landmarks that determine where another particle's world is.
+MAX_ROUNDS = 10  #: Of a pose's refinement on what is seen around it.
+#: Of corners of the last view: correlation of a patch that says better where it is, and how well.
 VIEW_CORRELATION, VIEW_PX = 0.8, 0.7
-"""Of corners of the last view: correlation of a patch that says better where it is, and how well."""
-VIEW_DEPTH_RATIO = 0.5
-"""Standard deviation of a corner's depth, as a fraction of that of the features around."""
-VIEW_RATIO = 0.8
-"""A corner's distance from its best match is below this fraction of that from the next (D. Lowe)."""
-VIEW_SAME_PX = 9.0
-"""Corners of another image this near to each other may show one thing."""
-MIN_VIEW_CORNERS = 30
-"""Corners that must be found again: in images of different places about ten are, by chance."""
+VIEW_DEPTH_RATIO = 0.5  #: Standard deviation of a corner's depth, as a fraction of that of the features around.
+VIEW_RATIO = 0.8  #: A corner's distance from its best match is below this fraction of that from the next (D. Lowe).
+VIEW_SAME_PX = 9.0  #: Corners of another image this near to each other may show one thing.
+MIN_VIEW_CORNERS = 30  #: Corners that must be found again: in images of different places about ten are, by chance.
+#: Of the corners of the last view that are found again, so many must show the motion that the map shows.
 MIN_VIEW_FRACTION = 0.8
-"""Of the corners of the last view that are found again, so many must show the motion that the map shows."""
 
 
 class Sighting(NamedTuple):
@@ -119,10 +107,9 @@ class TrackingLoss(Kept):
         self.relocaliser = Relocaliser(sensor, config.relocalisation)
         self.views = np.zeros((0, 7)) if views is None else views
         self.size_m = size_m
+        #: Whether the camera has not been found yet in a map that was made before.
         self.never_found = len(self.views) > 0
-        """Whether the camera has not been found yet in a map that was made before."""
-        self.stamp_ns = 0
-        """When the pose was trusted last."""
+        self.stamp_ns = 0  #: When the pose was trusted last.
         self._pose, self._cov = self.views[0] if self.never_found else SE3.identity(), np.zeros((6, 6))
         self._particles: Particles | None = None
         self._image = NO_IMAGE
@@ -284,10 +271,12 @@ class Relocaliser:
         return replace(attempt, prior=PosePrior(best.world_from_camera, cov), certain=certain)
 
     def corners(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The best corners (K, 2) of an image and their descriptors (S, K, d), kept for when it is looked at again."""
+        """The best corners (K, 2) of an image and their descriptors (S, K, d) at `SCALES`, kept for when it comes again."""
         if self._looked_at is None or self._looked_at[0] is not image:
             px = image_corners(self.sensor, image, self.config, BORDER_PX).px
-            self._looked_at = image, px, describe_corners(self.sensor, image, px)
+            scales = WINDOW_SCALE_PX * np.repeat(SCALES, px.shape[0])
+            each = self.sensor.descriptor.describe(image, Keypoints.at(np.tile(px, (len(SCALES), 1)), scales))
+            self._looked_at = image, px, each.reshape(len(SCALES), px.shape[0], each.shape[1])
         return self._looked_at[1:]
 
     def known_landmarks(self, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
@@ -416,12 +405,11 @@ class LastView:
         keypoints = image_corners(sensor, image, config, max(BORDER_PX, PATCH_HALF_PX + 1.0))
         uv = camera.unproject(keypoints.px)
         known = np.isfinite(uv).all(axis=1)
+        #: (K, S, S) around the corners.
         self.patches = np.array([cut(image, place, PATCH_HALF_PX) for place in keypoints.px[known]])
-        """(K, S, S) around the corners."""
+        #: (K, 3) of the corners, in the camera's frame.
         self.rays = np.concatenate([uv[known], np.ones((int(known.sum()), 1))], axis=1)
-        """(K, 3) of the corners, in the camera's frame."""
-        self.descriptors = sensor.descriptor.describe(image, keypoints.take(known))
-        """(K, d)."""
+        self.descriptors = sensor.descriptor.describe(image, keypoints.take(known))  #: (K, d).
 
     def match(self, descriptors: np.ndarray, px: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, Sights] | None:
         """Its corners (P,) and where another image shows them, described at px (M, 2) in S sizes; None where too few.
@@ -484,13 +472,6 @@ def image_corners(sensor: ImageSensor, image: np.ndarray, config: Relocalisation
     """The best corners of an image, inside the lens' circle."""
     mask = sensor.camera.field_of_view_mask(border_px)
     return sensor.detector.detect(image, config.max_corners, None, config.spacing_px, border_px, mask)
-
-
-def describe_corners(sensor: ImageSensor, image: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """Descriptors (S, K, d) of corners (K, 2) of an image, at `SCALES`."""
-    scales = WINDOW_SCALE_PX * np.repeat(SCALES, px.shape[0])
-    descriptors = sensor.descriptor.describe(image, Keypoints.at(np.tile(px, (len(SCALES), 1)), scales))
-    return descriptors.reshape(len(SCALES), px.shape[0], descriptors.shape[1])
 
 
 def similarities(one: np.ndarray, other: np.ndarray) -> np.ndarray:

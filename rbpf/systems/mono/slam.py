@@ -60,9 +60,7 @@ from rbpf.systems.system import (
     timing,
 )
 
-LINE_SIGMAS = 3.0
-"""An epipolar line is reported between the inverse depths that lie this far from the mean."""
-
+LINE_SIGMAS = 3.0  #: An epipolar line is reported between the inverse depths that lie this far from the mean.
 LOST = "the camera is lost, its pose is held until the map is seen again"
 FOUND_AGAIN = "the camera is found again"
 FOUND_IN_MAP = "the camera is found in the map"
@@ -92,8 +90,7 @@ class MonoSlam(System):
         wrapped: puts a sensor around the one that takes named features, to change what it observes or starts. An adjustment
             of the first frames is of what they show, and only a joint map begins with one.
 
-    Raises:
-        InputError: known points do not determine the camera, or the map was made with another one.
+    Raises InputError: known points do not determine the camera, or the map was made with another one.
     """
 
     name: ClassVar[str] = "mono"
@@ -153,8 +150,8 @@ class MonoSlam(System):
         if known_map is not None:
             known_map.require_camera(camera)
             points = known_map.points
+        #: Points that were known beforehand, under the names that features have; None where there are none.
         self.known_points = points
-        """Points that were known beforehand, under the names that features have; None where there are none."""
         group = points if config.known == "frame" and known_map is None else None
 
         rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
@@ -185,12 +182,11 @@ class MonoSlam(System):
             self.gauge = "similarity"
         elif isinstance(known, KnownPixels) and known.own_frame:
             self.gauge = "rigid"
+        #: What the sensor made of the last image; None before the first one, and for named features.
         self.measurement: Measurement | None = None
-        """What the sensor made of the last image; None before the first one, and for named features."""
+        #: How far the camera was recognised in the last frame; None where it was not lost before it.
         self.attempt: Attempt | None = None
-        """How far the camera was recognised in the last frame; None where it was not lost before it."""
-        self.report: StepReport | None = None
-        """What the filter did in the last frame."""
+        self.report: StepReport | None = None  #: What the filter did in the last frame.
 
     def track(self, image: np.ndarray | None, stamp_ns: int) -> Tracked:
         """Takes an image (H, W) uint8, grey, of the camera's size; None where there is none at this time.
@@ -198,9 +194,8 @@ class MonoSlam(System):
         Images that show nothing, or are of another kind, are passed over: the pose is then predicted, and the message
         says why.
 
-        Raises:
-            InputError: time runs backwards; the first image does not show the known points; or no particle explains
-                what was found.
+        Raises InputError: time runs backwards; the first image does not show the known points; or no particle explains what
+        was found.
         """
         return self.take(ImageFrame(stamp_ns, image))
 
@@ -391,13 +386,21 @@ class MonoSlam(System):
         lost, searched, found, landmarks = log.lost(), log["searched"], log["found"], self.map()
         tracked, looked = np.flatnonzero(~lost), searched > 0
         localised = {"localized": True, "found_at_frame": int(tracked[0]) if tracked.size else None}
+        # Of a camera that calibrates itself: px and none, with standard deviations; None as long as nothing is known.
+        calibration: dict[str, Any] = {} if self.config.calibrate == "off" else {"calibration": None}
+        if (calibrated := self.hand_over.calibration(self.filter)) is not None:
+            camera, std = calibrated
+            units = np.array([camera.fx, camera.fy, 1.0, 1.0])
+            each = zip(NUMBERS, camera.params[[0, 1, 4, 5]].tolist(), (units * std).tolist(), strict=True)
+            pairs = (pair for name, at, spread in each for pair in ((name, at), (f"std_{name}", spread)))
+            calibration["calibration"] = dict(pairs)
         return {
             "frames_tracked": int((~lost).sum()),
             "lost_frames": int(lost.sum()),
             "relocalisations": int(log["relocalised"].sum()),
             "map": "particles" if self.joint is None else "joint",
             "noise_factor": float(np.sqrt(self.features.noise_factor)),
-            **self._calibration(),
+            **calibration,
             "known_points": 0 if self.known_points is None else int(self.known_points.names.size),
             **({} if self.known_map is None else localised),
             "landmarks_full": int((~landmarks.is_ray()).sum()),
@@ -405,18 +408,6 @@ class MonoSlam(System):
             "observations_per_frame": float(found.mean()),
             "share_found": float(found[looked].sum() / searched[looked].sum()) if looked.any() else 0.0,
         }
-
-    def _calibration(self) -> dict[str, Any]:
-        """Entry of `summary`, of a camera that calibrates itself: px and none, with standard deviations."""
-        if self.config.calibrate == "off":
-            return {}
-        found = self.hand_over.calibration(self.filter)
-        if found is None:
-            return {"calibration": None}
-        camera, std = found
-        units = np.array([camera.fx, camera.fy, 1.0, 1.0])
-        pairs = zip(NUMBERS, camera.params[[0, 1, 4, 5]].tolist(), (units * std).tolist(), strict=True)
-        return {"calibration": {k: v for name, at, spread in pairs for k, v in ((name, at), (f"std_{name}", spread))}}
 
     def files(self, log: FrameLog) -> Mapping[str, dict[str, np.ndarray] | str]:
         """The particles' paths; of images, the map as a place to be found in, unless the run was localised; the camera.

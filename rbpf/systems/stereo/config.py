@@ -16,8 +16,8 @@ from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.stereo import PairConfig
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, RunConfig
 
+#: Of the pixels (u_left, v, u_right): an image, and disparities of so many pixels.
 OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0
-"""Of the pixels (u_left, v, u_right): an image, and disparities of so many pixels."""
 
 
 @dataclass(frozen=True)

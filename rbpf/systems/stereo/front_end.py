@@ -28,12 +28,12 @@ from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
 _STOOD = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
 _PIXELS = {"z": numbers("features", 3), "cov": numbers("features", 3, 3)}
+#: What the rest of `StereoFeatures` follows from.
 KEPT = _PIXELS | {
     "scale": numbers("features"),
     "orientation": numbers("features"),
     "descriptors": numbers("features", "length", dtype=np.float32),
 }
-"""What the rest of `StereoFeatures` follows from."""
 
 
 class FrontEnd(ABC, Generic[F]):
@@ -51,8 +51,7 @@ class FrontEnd(ABC, Generic[F]):
     def measure(self, frame: Any) -> tuple[Pair[F], str]:
         """What a frame shows, and in words what is wrong with it; empty where nothing is.
 
-        Raises:
-            InputError: the frame shows that the cameras are not what they should be.
+        Raises InputError: the frame shows that the cameras are not what they should be.
         """
 
     def refusal(self, frame: Any) -> str:
@@ -153,8 +152,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
         """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
 
-        Raises:
-            InputError: left and right image are swapped.
+        Raises InputError: left and right image are swapped.
         """
         if frame.image is None or frame.right is None:
             return None, frame.problem or "an image is missing"

@@ -42,10 +42,8 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.places import Places, make_room, places_of
 from rbpf.systems.system import MAP_IDS
 
-SEEN_AGAIN = 2
-"""Observations of a landmark that stands still: one that moves is not where it was seen first."""
-TINY = 1e-6
-"""Added to the variance of expected pixels, px²: a landmark may be known exactly."""
+SEEN_AGAIN = 2  #: Observations of a landmark that stands still: one that moves is not where it was seen first.
+TINY = 1e-6  #: Added to the variance of expected pixels, px²: a landmark may be known exactly.
 
 
 class FeatureKind(IntEnum):

@@ -20,12 +20,9 @@ from rbpf import gaussian
 from rbpf.lie import SE3
 from rbpf.motion.stereo_vo import CandidateMotions
 
-STATIC, UNKNOWN, MOVING = 1, 0, -1
-"""Labels of features."""
-MISTAKEN = 0.1
-"""Fraction of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features)."""
-CHANGES = 0.01
-"""Fraction of pairs in which a thing begins to move or stops."""
+STATIC, UNKNOWN, MOVING = 1, 0, -1  #: Labels of features.
+MISTAKEN = 0.1  #: Fraction of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features).
+CHANGES = 0.01  #: Fraction of pairs in which a thing begins to move or stops.
 
 
 def contradicts(inliers: np.ndarray, labels: np.ndarray, hidden: bool) -> bool:

@@ -11,8 +11,7 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.systems.stereo.config import MapConfig
 
-SIGMAS = 3.0
-"""The image is widened by so many standard deviations of the camera's direction."""
+SIGMAS = 3.0  #: The image is widened by so many standard deviations of the camera's direction.
 
 
 class Places(Kept):

@@ -268,9 +268,8 @@ class StereoSlam(System):
         one's time, is passed over: its pose is predicted, and `messages` say why. The first pair decides: images of
         another size are refused there. None is an image that is missing.
 
-        Raises:
-            InputError: left and right are swapped, time runs backwards, no particle explains the pair, or the first
-                images are not the cameras'.
+        Raises InputError: left and right are swapped, time runs backwards, no particle explains the pair, or the first images
+        are not the cameras'.
         """
         return self.take(ImageFrame(stamp_ns, left, right))
 

@@ -14,8 +14,7 @@ from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.sensors.feature_log import FeatureFrame
 
-LEAST = 2
-"""Observations of a track that is kept: a single one says nothing about the path."""
+LEAST = 2  #: Observations of a track that is kept: a single one says nothing about the path.
 
 
 def tracked_features(

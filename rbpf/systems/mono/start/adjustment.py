@@ -31,20 +31,12 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.system import Revision
 
-MIN_VIEWS = 3
-"""Frames that must see a feature for it to take part."""
-
+MIN_VIEWS = 3  #: Frames that must see a feature for it to take part.
 MIN_FRAMES = 3
-
+#: Features that two frames in a row must have in common: three determine a pose, and half of them may be wrong.
 MIN_SHARED = 6
-"""Features that two frames in a row must have in common: three determine a pose, and half of them may be wrong."""
-
-SCALE_STD = 1e-4
-"""Standard deviation to which the scale is held."""
-
-MAX_STEPS, MIN_GAIN = 30, 1e-4
-"""Steps of the adjustment at most, and the fraction of the cost that ends it."""
-
+SCALE_STD = 1e-4  #: Standard deviation to which the scale is held.
+MAX_STEPS, MIN_GAIN = 30, 1e-4  #: Steps of the adjustment at most, and the fraction of the cost that ends it.
 _HALF = CAUCHY_SCALE**2 / 2.0
 _BEYOND = float(np.exp(_HALF) * exp1(_HALF))
 LOSS_INFORMATION = (1.0 - _HALF * _BEYOND) ** 2 / ((_BEYOND + _HALF * _BEYOND - 1.0) * _HALF * _BEYOND)
@@ -54,15 +46,11 @@ The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), 
 a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
 """
 
-CHI2_MEDIAN = float(2.0 * np.log(2.0))
-"""Of χ² with two degrees of freedom."""
-
+CHI2_MEDIAN = float(2.0 * np.log(2.0))  #: Of χ² with two degrees of freedom.
+#: A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s.
 MIN_STD_VELOCITY = 1e-6
-"""A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s."""
-
+#: Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down.
 DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
-"""Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""
-
 _PREFIX = "start/frames/"
 _FRAMES = {
     "all_ns": integers("all"),

@@ -20,29 +20,22 @@ from rbpf.sensors.features.corners import corner_score
 from rbpf.sensors.readers import KnownPixels
 from rbpf.systems.map_estimate import Anchored
 
+#: A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more.
 MAX_SIGMAS, MAX_PX = 6.0, 4.0
-"""A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""
-
+#: Fraction of a known point's standard deviation along an axis across the line of sight: alike in all directions, and
+#: of a point that was located from views five degrees apart.
 ISOTROPIC, TRIANGULATED = 3.0**-0.5, 0.05
-"""Fraction of a known point's standard deviation along an axis across the line of sight: alike in all directions, and of a
-point that was located from views five degrees apart."""
-
-NOISE_PROBABILITY = 0.95
-"""Residuals that noise alone would exceed less often than this leaves are beyond the noise."""
-
-SAME_PX = 1.0
-"""Known points nearer to each other in the image are one."""
-
+NOISE_PROBABILITY = 0.95  #: Residuals that noise alone would exceed less often than this leaves are beyond the noise.
+SAME_PX = 1.0  #: Known points nearer to each other in the image are one.
+#: Slope that a known point's surroundings must have in every direction, grey levels per pixel: noise has as much.
 MIN_TEXTURE = 2.0
-"""Slope that a known point's surroundings must have in every direction, grey levels per pixel: noise has as much."""
 
 
 def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.ndarray:
     """Pose world_from_camera (7,) that best explains the known points in the first image, each of them counting alike.
 
-    Raises:
-        InputError: a point lies outside the image, two are at one place, the points do not determine the camera, or no
-            pose explains them.
+    Raises InputError: a point lies outside the image, two are at one place, the points do not determine the camera, or no pose
+    explains them.
     """
     inside = camera.inside(known.px)
     if not inside.all():

@@ -24,11 +24,11 @@ from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.start.adjustment import MIN_FRAMES, Adjusted, FirstFrames, between, gathered, optimum
 from rbpf.systems.system import Revision
 
+#: Of a start without known points that ended before depths were known.
 DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
     "camera sideways at first, or start with known points"
 )
-"""Of a start without known points that ended before depths were known."""
 
 TINY = np.finfo(float).tiny
 
@@ -50,8 +50,8 @@ class UnknownStart:
         needed: bool,
     ) -> None:
         self.config, self.features, self.first, self.new_filter = config, features, first, new_filter
+        #: Whether depths are known well enough, and the filter goes on alone.
         self.over = not (needed and config.start.batch_adjust)
-        """Whether depths are known well enough, and the filter goes on alone."""
         self._next = config.start.first_adjustment
 
     def after_frame(self, filter_: Filter, usable: bool, lost: bool) -> tuple[Adjusted | None, str | None]:
