@@ -139,8 +139,8 @@ def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n
 
 
 def log_det(chol: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
-    """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...)."""
-    return _looked_up(_log_det, chol)
+    """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...); of a single matrix a number."""
+    return _looked_up(_log_det, chol)[()]
 
 
 def log_density(

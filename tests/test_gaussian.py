@@ -35,6 +35,7 @@ def test_cholesky_equals_lapack(n, shape, rng):
     chol = gaussian.cholesky(cov)
     np.testing.assert_allclose(chol, np.linalg.cholesky(cov), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(gaussian.log_det(chol), np.linalg.slogdet(cov)[1], atol=1e-10)
+    assert isinstance(gaussian.log_det(chol), float) == (shape == ())
 
 
 @every_dimension

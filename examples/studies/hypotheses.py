@@ -161,10 +161,10 @@ def main(
     out: Path = Path("demo/hypotheses"),
     quick: bool = False,
 ) -> dict[str, float]:
-    """Prints the tables, with the fraction of right returns as the result.
+    """Prints the tables, with the fraction of right returns as the result, if there are any.
 
     Args:
-        returns: runs in the corridor, seeds 0, 1, ….
+        returns: runs in the corridor, seeds 0, 1, …; none by 0.
         runs: worlds in the plane, seeds 0, 1, …; none by 0.
         steps: of each.
         recordings: folder of the recorded logs; None leaves them out.
@@ -176,20 +176,21 @@ def main(
         returns, runs, steps = 2, 1, 30
     out.mkdir(parents=True, exist_ok=True)
     rows, results = list[list[str | int | float]](), dict[str, float]()
-    figure = Figure(figsize=(7.0, 3.0), layout="constrained")
-    axes = figure.subplots()
-    for most in (4, 1):
-        found = [come_back(seed, most) for seed in range(returns)]
-        good = float(np.mean([each.error_m < 0.5 for each in found]))
-        kept, worst = min(each.kept for each in found), max(each.error_m for each in found)
-        rows.append([most, returns, 100.0 * good, 100.0 * kept, worst])
-        results[f"{most} hypotheses"] = good
-        axes.plot([each.error_m for each in found], "o", label=f"{most} hypotheses")
-    axes.set(xlabel="seed", ylabel="error at the end [m]")
-    axes.legend()
-    figure.savefig(out / "corridor.png", dpi=110)
-    header = ["hypotheses", "runs", "end right [%]", "right one held [%]", "largest error [m]"]
-    write_table(out / "corridor.csv", header, rows)
+    if returns:
+        figure = Figure(figsize=(7.0, 3.0), layout="constrained")
+        axes = figure.subplots()
+        for most in (4, 1):
+            found = [come_back(seed, most) for seed in range(returns)]
+            good = float(np.mean([each.error_m < 0.5 for each in found]))
+            kept, worst = min(each.kept for each in found), max(each.error_m for each in found)
+            rows.append([most, returns, 100.0 * good, 100.0 * kept, worst])
+            results[f"{most} hypotheses"] = good
+            axes.plot([each.error_m for each in found], "o", label=f"{most} hypotheses")
+        axes.set(xlabel="seed", ylabel="error at the end [m]")
+        axes.legend()
+        figure.savefig(out / "corridor.png", dpi=110)
+        header = ["hypotheses", "runs", "end right [%]", "right one held [%]", "largest error [m]"]
+        write_table(out / "corridor.csv", header, rows)
     if runs:
         header = ["filter", "runs", "NEES / d", "± s.e.", "path [m]", "wrong [%]", "ms per step"]
         write_table(out / "worlds.csv", header, in_world(loops(steps), runs))
