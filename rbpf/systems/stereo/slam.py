@@ -30,6 +30,7 @@ from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.stereo.calibration import SelfCalibration
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd
 from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks, Pair
@@ -225,20 +226,14 @@ class StereoSlam(System):
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
-        joint, calibrates = None, config.calibrate == "online"
-        if calibrates and (config.map.kind != "joint" or model is not None):
-            raise InputError(
-                "calibrate=online holds the error of all disparities in a joint map of points: set map.kind=joint, and leave "
-                "out a model of your own"
-            )
+        joint, self._calibration = None, SelfCalibration(config, front_end, own_model=model is not None)
         if config.map.kind == "joint":
             if not config.likelihood.build().normalised:
                 raise InputError(
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
                     "none: begin with StereoConfig.joint(), or set likelihood.kind=outliers"
                 )
-            disparity = (np.zeros(1), np.full((1, 1), config.self_calibration.disparity_px**2)) if calibrates else None
-            joint = JointMap(SE3, disparity, config.compiled, config.map.submap, passed_on=True)
+            joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True)
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
@@ -249,8 +244,9 @@ class StereoSlam(System):
             )
         own = LandmarkMap(SE3, compiled=config.compiled)
         own.register(front_end.landmarks.landmark)
-        odometry, sensor = OdometryMotion(SE3, added, free, constants=int(calibrates)), front_end.landmarks
-        self.filter = self.new_filter(odometry, sensor, [joint or own], self._proposal.build(), config.map.window)
+        odometry = OdometryMotion(SE3, added, free, constants=int(self._calibration.is_online))
+        parts = [joint or own]
+        self.filter = self.new_filter(odometry, front_end.landmarks, parts, self._proposal.build(), config.map.window)
         self.frames = 0  #: pairs taken so far.
         self.reckoning = DeadReckoning()  #: where visual odometry has come.
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
@@ -283,10 +279,7 @@ class StereoSlam(System):
         # The first frame is refused if it is not the cameras'.
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
-        landmarks = front_end.landmarks
-        offset_px = self.calibration()[0]
-        if config.calibrate == "online":
-            front_end.tune(np.array([offset_px]))
+        landmarks, offset_px = front_end.landmarks, self._calibration.tune(self.filter)
 
         # 1. Measure the pair: features that both cameras see.
         pair, problem = front_end.measure(frame)
@@ -348,11 +341,8 @@ class StereoSlam(System):
         # 4. Remember the pair, with what stood still in it: the next one is matched with it.
         if measured:
             static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
-            self._kept = replace(pair, labels=motion.labelled(len(pair), static))
-            if config.calibrate == "online" and updated:
-                # By the same calibration as that one, else what was learnt looks like a motion in depth.
-                by_px = offset_px - self.calibration()[0]
-                self._kept = replace(self._kept, features=front_end.shifted(pair.features, by_px))
+            features = self._calibration.retuned(self.filter, pair.features, offset_px) if updated else pair.features
+            self._kept = replace(pair, features=features, labels=motion.labelled(len(pair), static))
         self.frames += 1
 
         # 5. Report: between updates the odometry moves the estimate.
@@ -420,10 +410,7 @@ class StereoSlam(System):
 
     def calibration(self) -> tuple[float, float]:
         """By how many px all disparities are too small, and its standard deviation; both 0 where `calibrate` is off."""
-        if self.joint is None or self.joint.driving() is None:
-            return 0.0, 0.0
-        mean, cov = self.joint.moments(self.filter.particles, Part.SUBSTATE)
-        return float(mean[0]), float(np.sqrt(cov[0, 0]))
+        return self._calibration.estimate(self.filter)
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
         """What the pairs showed, and the filter's figures over its updates."""
@@ -431,14 +418,12 @@ class StereoSlam(System):
         evidence = log["log_evidence"][updated]
         milliseconds = 1e3 * (log["seconds_matching"] + log["seconds_filter"])[updated] if updated.any() else 0.0
         steps = np.diff(SE3.translation(log.poses), axis=0)
-        names, found = ("disparity_offset_px", "std_disparity_offset_px"), self.calibration()
-        calibration = {} if self.config.calibrate == "off" else {"calibration": dict(zip(names, found, strict=True))}
         return {
             "frames_measured": int((log["features"] >= self.config.odometry.estimate.min_matches).sum()),
             "updates": int(updated.sum()),
             "distance_m": float(np.linalg.norm(steps, axis=1).sum()),
             "dof": self.config.dof,
-            **calibration,
+            **self._calibration.entries(self.filter),
             "ms_per_update": {
                 "median": round(float(np.median(milliseconds)), 3),
                 "p95": round(float(np.percentile(milliseconds, 95)), 3),
