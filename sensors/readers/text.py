@@ -193,15 +193,14 @@ def parse_table(
         except ValueError:
             values = None
     if values is None or values.shape != (len(rows), len(columns)) or not (np.abs(values) <= LARGEST).all():
-        values = np.array([_parse_row(path, *item, columns, separator) for item in filled])
+        values = np.empty((len(rows), len(columns)))
+        for number, (line, row) in enumerate(filled):
+            fields = [field.strip() for field in row.split(separator)]
+            if len(fields) != len(columns):
+                problem = f"expected {len(columns)} columns ({', '.join(columns)}), found {len(fields)}"
+                raise line_error(path, line, problem)
+            values[number] = [parse_number(path, line, *item) for item in zip(columns, fields, strict=True)]
     return Table(path, columns, rows, lines, values)
-
-
-def _parse_row(path: Path, line: int, row: str, columns: tuple[str, ...], separator: str | None) -> list[float]:
-    fields = [field.strip() for field in row.split(separator)]
-    if len(fields) != len(columns):
-        raise line_error(path, line, f"expected {len(columns)} columns ({', '.join(columns)}), found {len(fields)}")
-    return [parse_number(path, line, *item) for item in zip(columns, fields, strict=True)]
 
 
 def parse_number(path: Path, line: int, column: str, field: str) -> float:

@@ -24,11 +24,12 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients, read_calibration
 from rbpf.sensors.readers.images.decoding import FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
 from rbpf.sensors.readers.images.rectification import pair_stamps, rectified
-from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions, Source
+from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import read_stamped
 from rbpf.sensors.readers.yaml_files import YamlValue, read_yaml
 
@@ -50,48 +51,42 @@ class Euroc(ImageFormat):
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         mav = path / "mav0" if (path / "mav0").is_dir() else path
-        if options.stereo:
-            return self._read_pair(mav, options)
-        own, body_from_camera = _read_camera(mav / "cam0" / "sensor.yaml", self.kind)
-        rows = read_stamped(mav / "cam0" / "data.csv", self.kind, nanoseconds=True)
-        files = rows.files(mav / "cam0" / "data")
-        used = own if options.calibration is None else read_calibration(options.calibration)
-        shape = first_shape(files, rows.path)
-        used.require_shape(shape, str(mav / "cam0"))
-        source = FileImages(rows.stamps_ns, shape, files)
-        return _sequence(mav, used.camera, body_from_camera, rows.stamps_ns, source)
-
-    def _read_pair(self, mav: Path, options: ReadOptions) -> ImageSequence:
-        folders = mav / "cam0", mav / "cam1"
-        cameras = [_read_camera(folder / "sensor.yaml", self.stereo_kind) for folder in folders]
-        (left, body_from_left), (right, body_from_right) = cameras
+        names, hint = (("cam0", "cam1"), self.stereo_kind) if options.stereo else (("cam0",), self.kind)
+        folders = [mav / name for name in names]
+        cameras = [_read_camera(folder / "sensor.yaml", hint) for folder in folders]
+        (left, body_from_left), (right, body_from_right) = cameras[0], cameras[-1]
         left_from_right = SE3.between(body_from_left, body_from_right)
         sizes = [f"{one.camera.width}x{one.camera.height}" for one in (left, right)]
         if sizes[0] != sizes[1]:
             both = f"cam0 has {sizes[0]} and cam1 {sizes[1]} px, expected one size"
             raise InputError(f"{mav}: {both}; scale the images of one of the two.")
-        if not SE3.translation(left_from_right).any():
+        if options.stereo and not SE3.translation(left_from_right).any():
             problem = "T_BS puts cam1 where cam0 is, a baseline of zero; give the two cameras' own"
             raise InputError(f"{folders[1] / 'sensor.yaml'}: {problem}.")
-        listed = [read_stamped(folder / "data.csv", self.stereo_kind, nanoseconds=True) for folder in folders]
-        where = str(mav)
-        *rows, notes = pair_stamps(listed[0].stamps_ns, listed[1].stamps_ns, options.tolerance_s, where)
+        # The images of one camera, or those of both that belong together.
+        used = left if options.calibration is None else read_calibration(options.calibration)
+        listed = [read_stamped(folder / "data.csv", hint, nanoseconds=True) for folder in folders]
+        rows, notes = [np.arange(len(listed[0].stamps_ns))], tuple[str, ...]()
+        if options.stereo:
+            *rows, notes = pair_stamps(listed[0].stamps_ns, listed[1].stamps_ns, options.tolerance_s, str(mav))
         files = []
         for lines, folder, chosen in zip(listed, folders, rows, strict=True):
             paths = lines.files(folder / "data")
             files.append([paths[row] for row in chosen])
-            left.require_shape(first_shape(files[-1], folder / "data.csv"), str(folder))
-        shape, stamps_ns = (left.camera.height, left.camera.width), listed[0].stamps_ns[rows[0]]
+            shape = first_shape(files[-1], lines.path)
+            used.require_shape(shape, str(folder))
+        stamps_ns, whole = listed[0].stamps_ns[rows[0]], mav.resolve()
+        truth = _read_truth(mav, body_from_left, stamps_ns)
+        name = whole.parent.name if whole.name == "mav0" else whole.name
         source = FileImages(stamps_ns, shape, *files)
-        sequence = replace(_sequence(mav, left.camera, body_from_left, stamps_ns, source), notes=notes)
+        sequence = ImageSequence(name, used.camera, stamps_ns, truth, None, source, notes)
+        if not options.stereo:
+            return sequence
         if options.calibration is not None:
-            used = read_calibration(options.calibration)
-            used.require_shape(shape, sequence.name)
             baseline_m = used.baseline_m or float(np.linalg.norm(SE3.translation(left_from_right)))
-            return replace(sequence, camera=used.camera, baseline_m=baseline_m)
+            return replace(sequence, baseline_m=baseline_m)
         note = f"{mav}: the two cameras are not rectified; their images are, by cam0 and cam1's sensor.yaml."
-        file = str(folders[1] / "sensor.yaml")
-        return rectified(sequence, right.camera, left_from_right, file, note)
+        return rectified(sequence, right.camera, left_from_right, str(folders[1] / "sensor.yaml"), note)
 
 
 def _read_camera(path: Path, hint: str) -> tuple[Calibration, Array]:
@@ -106,16 +101,11 @@ def _read_camera(path: Path, hint: str) -> tuple[Calibration, Array]:
     return Calibration(str(path), camera), _mount(entries["T_BS"])
 
 
-def _sequence(
-    mav: Path, camera: Pinhole, body_from_camera: Array, stamps_ns: np.ndarray, source: Source
-) -> ImageSequence:
-    """Images of one camera, with its truth where there is one."""
-    folder = mav.resolve()
-    name = folder.parent.name if folder.name == "mav0" else folder.name
-    truth = None
+def _read_truth(mav: Path, body_from_camera: Array, images_ns: np.ndarray) -> Truth | None:
+    """Of a camera with images at such times; None where there is none."""
     for kind in _TRUTHS:
         file, mount = mav / kind / "data.csv", mav / kind / "sensor.yaml"
-        if truth is not None or not file.exists():
+        if not file.exists():
             continue
         rows = read_stamped(file, "poses", nanoseconds=True)
         table = rows.table(_TRUTH_COLUMNS)
@@ -128,8 +118,8 @@ def _sequence(
             hint = "a sensor.yaml with T_BS, the pose of the sensor on the body"
             sensor_from_body = SE3.inverse(_mount(read_yaml(mount, hint).entries(["T_BS"])["T_BS"]))
         poses = SE3.compose(world_from_sensor, SE3.compose(sensor_from_body, body_from_camera))
-        truth = truth_between(file, rows.stamps_ns, poses, stamps_ns)
-    return ImageSequence(name, camera, stamps_ns, truth, None, source)
+        return truth_between(file, rows.stamps_ns, poses, images_ns)
+    return None
 
 
 def _mount(value: YamlValue) -> Array:

@@ -48,7 +48,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import NAME, Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
-from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
+from rbpf.sensors.readers.images.poses import TUM_POSE, normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted, read_stamped, read_text
 
@@ -59,7 +59,6 @@ SCENES_CAMERA = Calibration("the nominal camera of 7-Scenes", Pinhole(640, 480, 
 
 _SCENES_IMAGE = re.compile(r"frame-(\d+)\.color\.\w+", re.ASCII)
 _PHOTO_CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
-_PHOTO_POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _log = logging.getLogger(__name__)
 
 
@@ -130,7 +129,7 @@ class Photos(ImageFormat):
         else:
             camera = read_calibration(options.calibration)
         photos = [row for row in rows if row[1] != "K"]
-        table = parse_table(file, _PHOTO_POSE, [(line, pose) for line, _, pose in photos])
+        table = parse_table(file, TUM_POSE, [(line, pose) for line, _, pose in photos])
         stamps_ns = evenly(len(photos), PHOTO_RATE_HZ)
         truth = Truth(stamps_ns, normalised(np.roll(table.values, 4, axis=1), table.error))
         files = [path / "images" / name for _, name, _ in photos]
@@ -171,7 +170,10 @@ def list_images(path: Path) -> list[Path]:
             found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
             if found:
                 # Numbers in a name count as such.
-                return sorted(found, key=lambda file: (_numbered(file.name), file.name))
+                parts = {file: re.split(r"(\d+)", file.name) for file in found}
+                return sorted(
+                    found, key=lambda file: ([int(p) if p.isdecimal() else p for p in parts[file]], file.name)
+                )
     return []
 
 
@@ -211,7 +213,3 @@ def _scenes_pose(path: Path) -> Array | None:
     if (problem := rigid_motion_error(matrix.reshape(4, 4))) is not None:
         raise InputError(f"{path}: {problem}.")
     return pose_of_matrix(matrix.reshape(4, 4))
-
-
-def _numbered(name: str) -> list[str | int]:
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]

@@ -13,6 +13,7 @@ from rbpf.sensors.readers.text import read_stamped
 #: How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more.
 SKEWED = 0.02
 LONGEST = 0.01  #: How far a quaternion's length may be from 1 in a file; it is then scaled to 1.
+TUM_POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")  #: Of a pose, m, behind its time in seconds.
 
 
 def rigid_motion_error(matrix: Array) -> str | None:
@@ -53,6 +54,6 @@ def read_tum_truth(path: Path, images_ns: np.ndarray) -> Truth | None:
     if not path.exists():
         return None
     rows = read_stamped(path, "poses")
-    table = rows.table(("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    table = rows.table(TUM_POSE)
     poses = normalised(np.roll(table.values, 4, axis=1), table.error)
     return truth_between(path, rows.stamps_ns, poses, images_ns)
