@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, points_from_pixels, times_pixels
+from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, projective, times_pixels
 from rbpf.ranges import Formerly, Probability, Range, Ranged
 
 REFINEMENTS = 2  #: Gauss-Newton steps on the nine pixels of a triple.
@@ -82,7 +82,7 @@ class _Search:
     def __init__(self, matches: Matches, start: Array) -> None:
         self.matches, self.start = matches, np.ascontiguousarray(start, dtype=float)
         # The points of both frames' pixels, those at infinity and beyond put far away.
-        raised = times_pixels(points_from_pixels(matches.camera), np.stack([matches.z_prev, matches.z_now]))
+        raised = times_pixels(projective(matches.camera)[1], np.stack([matches.z_prev, matches.z_now]))
         nearest = 1.0 / (FARTHEST * matches.camera.baseline_m)
         self.before, self.now = raised[..., :3] / np.maximum(raised[..., 3:], nearest)
         # W = L⁻¹ with L Lᵀ = R⁻ + R.

@@ -140,14 +140,9 @@ def intrinsics(camera: StereoCamera) -> Array:
     return np.array([one.fx, one.fy, one.cx, one.cy, one.fx * camera.baseline_m])
 
 
-def pixels_from_points(camera: StereoCamera) -> Array:
-    """Q (4, 4), which is not to be written into."""
-    return _projective(*intrinsics(camera).tolist())[0]
-
-
-def points_from_pixels(camera: StereoCamera) -> Array:
-    """Q⁻¹ (4, 4), which is not to be written into."""
-    return _projective(*intrinsics(camera).tolist())[1]
+def projective(camera: StereoCamera) -> tuple[Array, Array]:
+    """Q (4, 4), from points to pixels, and Q⁻¹ (4, 4), which are not to be written into."""
+    return _projective(*intrinsics(camera).tolist())
 
 
 @lru_cache(maxsize=16)
@@ -160,8 +155,8 @@ def _projective(fx: float, fy: float, cx: float, cy: float, shift: float) -> tup
 
 def homography(camera: StereoCamera, delta: Array) -> Array:
     """H (…, 4, 4) of motions T (…, 7)."""
-    moved = SE3.matrix(SE3.inverse(delta))
-    return np.asarray(pixels_from_points(camera) @ moved @ points_from_pixels(camera), dtype=float)
+    q, back = projective(camera)
+    return np.asarray(q @ SE3.matrix(SE3.inverse(delta)) @ back, dtype=float)
 
 
 def times_pixels(matrix: Array, pixels: Array) -> Array:
@@ -171,15 +166,14 @@ def times_pixels(matrix: Array, pixels: Array) -> Array:
 
 def reproject(camera: StereoCamera, delta: Array, pixels: Array) -> Reprojection:
     """Where points seen at `pixels` (…, k, 3) are seen after motions T (…, 7), broadcast over the leading axes."""
-    q = pixels_from_points(camera)
-    matrix = homography(camera, delta)
+    (q, back), matrix = projective(camera), homography(camera, delta)
     raised = times_pixels(matrix, pixels)
     front = raised[..., 3] > 0.0
     raised = np.where(front[..., None], raised, [0.0, 0.0, 0.0, 1.0])
     depth = raised[..., 3, None]
     seen = raised[..., :3] / depth
     # (m, 1) ~ Q X has z as its last entry, here and after the motion.
-    point = raised @ points_from_pixels(camera).T
+    point = raised @ back.T
     slope = (q[:3, :3] - seen[..., None] * np.array([0.0, 0.0, 1.0])) / depth[..., None]
     by_pixels = matrix[..., None, :3, :3] - seen[..., None] * matrix[..., None, None, 3, :3]
     by_pixels = by_pixels / depth[..., None]

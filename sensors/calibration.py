@@ -61,16 +61,21 @@ class Board:
     @classmethod
     def parse(cls, size: str, square_m: float) -> "Board":
         """A board whose inner corners are written as 9x6, else an `InputError`."""
-        found = _SIZE.fullmatch(size.strip())
-        if found is None:
-            raise InputError(f"the size of a chessboard is its inner corners as 9x6, got {size!r}")
-        return cls(int(found[1]), int(found[2]), square_m)
+        return cls(*_parsed(size, "a chessboard is its inner corners as 9x6"), square_m)
 
     @property
     def corners(self) -> np.ndarray:
         """(rows · columns, 3) inner corners in the board's frame, row by row, m."""
         y, x = np.divmod(np.arange(self.rows * self.columns), self.columns)
         return self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).astype(float)
+
+
+def _parsed(size: str, what: str) -> tuple[int, int]:
+    """Columns and rows."""
+    found = _SIZE.fullmatch(size.strip())
+    if found is None:
+        raise InputError(f"the size of {what}, got {size!r}")
+    return int(found[1]), int(found[2])
 
 
 def find_board(image: np.ndarray, board: Board) -> KnownPixels:
@@ -165,10 +170,7 @@ class MarkerBoard:
     @classmethod
     def parse(cls, size: str, side_m: float, gap_m: float, dictionary: str) -> "MarkerBoard":
         """A board whose markers are written as 5x7, columns first, else an `InputError`."""
-        found = _SIZE.fullmatch(size.strip())
-        if found is None:
-            raise InputError(f"the size of a board of markers is their number as 5x7, got {size!r}")
-        return cls(int(found[1]), int(found[2]), side_m, gap_m, dictionary.upper())
+        return cls(*_parsed(size, "a board of markers is their number as 5x7"), side_m, gap_m, dictionary.upper())
 
     @property
     def corners(self) -> np.ndarray:

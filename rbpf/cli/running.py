@@ -154,11 +154,6 @@ class ImageRunOptions(RunOptions):
     result: Group[ImageResultOptions] = ImageResultOptions()
     recording: Group[ImageOptions] = ImageOptions()
 
-    def over_images(self, recording: "Recording", config: Any, video: bool) -> None:
-        """Filters images, with what can be left out as it is asked for."""
-        more: dict[str, Any] = {"batch": self.result.batch, "most_iterations": self.result.batch_limit}
-        _run(self, recording, config, video=video, **more)
-
 
 @RUN.add("range-bearing")
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +240,7 @@ class RunMono(ImageRunOptions):
                 raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
             video = False
             say("Ctrl-C ends the recording; the results are written then")
-        self.over_images(recording, config, video)
+        _run(self, recording, config, video=video, batch=self.result.batch, most_iterations=self.result.batch_limit)
 
 
 @RUN.add("stereo")
@@ -269,7 +264,8 @@ class RunStereo(ImageRunOptions):
         config = self.settings(StereoConfig, "stereo", dof=self.dof)
         topics = Topics.parse(images.image_topic, images.truth_topic)
         recording = StereoRecording(self.sequence, images.calibration, topics, images.part(images.resize))
-        self.over_images(recording, config, self.result.video)
+        made = self.result
+        _run(self, recording, config, video=made.video, batch=made.batch, most_iterations=made.batch_limit)
 
 
 def repeated(arguments: list[str]) -> list[str]:

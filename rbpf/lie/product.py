@@ -183,23 +183,19 @@ class Product(LieGroup):
         return self._each("normalise", self.split(x))
 
     def adjoint(self, a: States) -> TangentMatrix:
-        parts = self.split(a)
-        return self._block_diagonal([group.adjoint(part) for group, part in zip(self.groups, parts, strict=True)])
+        return self._blocks("adjoint", self.split(a))
 
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        parts = self.split_tangent(xi)
-        return self._block_diagonal([group.left_jacobian(part) for group, part in zip(self.groups, parts, strict=True)])
+        return self._blocks("left_jacobian", self.split_tangent(xi))
 
     def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        parts = self.split_tangent(xi)
-        blocks = [group.left_jacobian_inverse(part) for group, part in zip(self.groups, parts, strict=True)]
-        return self._block_diagonal(blocks)
+        return self._blocks("left_jacobian_inverse", self.split_tangent(xi))
 
-    def _block_diagonal(self, blocks: list[Array]) -> Array:
-        """Matrices (…, d, d) of the factors' own, in their order."""
-        out = np.zeros((*blocks[0].shape[:-2], self.dim, self.dim))
-        for rows, block in zip(self._tangent, blocks, strict=True):
-            out[..., rows, rows] = block
+    def _blocks(self, name: str, parts: list[Array]) -> Array:
+        """Matrices (…, d, d) with what the factors' methods of this name make of their parts along the diagonal."""
+        out = np.zeros((*parts[0].shape[:-1], self.dim, self.dim))
+        for rows, group, part in zip(self._tangent, self.groups, parts, strict=True):
+            out[..., rows, rows] = getattr(group, name)(part)
         return out
 
 

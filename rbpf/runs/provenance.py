@@ -86,7 +86,10 @@ def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str |
         if not path.exists():
             return None
         whole.update(f"{name}\n".encode())
-        for file in _files(path, without):
+        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        if without is not None and path.is_dir() and without.resolve() != path.resolve():
+            files = [file for file in files if not file.resolve().is_relative_to(without.resolve())]
+        for file in files:
             relative = "" if path.is_file() else file.relative_to(path).as_posix()
             whole.update(f"{relative}\n{file.stat().st_size}\n".encode())
             try:
@@ -127,19 +130,14 @@ def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
 def require_same(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
     """Refuses to go on with a run (`path` is its checkpoint) with something else than it was begun with; names the first."""
     for name in [*before, *(name for name in now if name not in before)]:
-        was, given = (_shown(values.get(name)) for values in (before, now))
         if before.get(name) != now.get(name):
+            # Digests are cut short.
+            values = (side.get(name, "nothing") for side in (before, now))
+            was, given = (f"{v[:31]}…" if v.startswith("content of SHA-256 ") else v for v in values)
             raise InputError(
                 f"{path} belongs to a run with {name} = {was}, this one has {given}: go on with the same settings and "
                 "the same recording, or start without --resume"
             )
-
-
-def _shown(value: str | None) -> str:
-    """As a message says it: digests are cut short."""
-    if value is None:
-        return "nothing"
-    return f"{value[:31]}…" if value.startswith("content of SHA-256 ") else value
 
 
 def read_origin(config: Path) -> list[str]:
@@ -187,13 +185,3 @@ def command_of(entries: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[
             value = value.strip('"')
             words += [f"--{name}", value] if name in ("particles", "seed") else ["--set", f"{name}={value}"]
     return words
-
-
-def _files(path: Path, without: Path | None) -> list[Path]:
-    if path.is_file():
-        return [path]
-    found = sorted(file for file in path.rglob("*") if file.is_file())
-    if without is None or without.resolve() == path.resolve():
-        return found
-    inside = without.resolve()
-    return [file for file in found if not file.resolve().is_relative_to(inside)]

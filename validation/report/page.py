@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.colors import to_hex
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -225,15 +226,7 @@ PATH_POINTS, FRUSTUMS, LANDMARKS, ELLIPSOIDS, CELLS = 4000, 60, 20_000, 400, 40_
 #: Half the width and height of a frustum, and its depth, of its size; its size as a fraction of the scene's.
 _CORNERS = np.array([[-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
 _SIZE = 0.02
-_HEX = {
-    "blue": "#1f77b4",
-    "orange": "#ff7f0e",
-    "grey": "#7f7f7f",
-    "red": "#d62728",
-    "green": "#2ca02c",
-    "black": "#222",
-}
-_COLOURS = {name: _HEX[colour.removeprefix("tab:")] for name, colour in COLOURS.items()}
+_COLOURS = {name: to_hex(colour) for name, colour in COLOURS.items()}
 
 
 @cache

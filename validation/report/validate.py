@@ -30,14 +30,6 @@ Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folde
 TRUTH = "groundtruth"
 
 
-def _groundtruth(record: RunFolder, precision: Precision) -> Comparison:
-    from rbpf.validation.consistency.against_groundtruth import compare_with_truth, truth_errors
-    from rbpf.validation.report.comparison_pictures import draw_truth
-
-    errors = truth_errors(record, precision)
-    return replace(compare_with_truth(record, errors), pictures=draw_truth(record, errors))
-
-
 def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Comparison:
     """A run beside the batch posterior, see `compare_with_batch`: written into its folder, with pictures."""
     from rbpf.validation.consistency.against_batch import compare_with_batch
@@ -115,7 +107,11 @@ def validate(
         if file is not None:
             comparison = WITH_A_FILE[against](record, file)
         elif against == TRUTH:
-            comparison = _groundtruth(record, truth)
+            from rbpf.validation.consistency.against_groundtruth import compare_with_truth, truth_errors
+            from rbpf.validation.report.comparison_pictures import draw_truth
+
+            errors = truth_errors(record, truth)
+            comparison = replace(compare_with_truth(record, errors), pictures=draw_truth(record, errors))
         elif against not in COMPARISONS:
             raise InputError(f"a run is compared with {', '.join([TRUTH, *COMPARISONS])}, not with {against}")
         elif record.system not in COMPARISONS[against]:
