@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from typing import Literal, NamedTuple, final
 
 import numpy as np
@@ -85,10 +86,7 @@ class InitialEstimate(NamedTuple):
 
 def dead_reckoning(m: Measurements) -> Array:
     """(T, E) world_from_robot by odometry alone."""
-    path = [m.start]
-    for delta in m.deltas:
-        path.append(m.space.compose(path[-1], delta))
-    return np.array(path)
+    return np.array(list(accumulate(m.deltas, m.space.compose, initial=m.start)))
 
 
 def initial_estimate(m: Measurements) -> InitialEstimate:

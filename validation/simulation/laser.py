@@ -6,6 +6,7 @@ near in time and between poses at one place in different rounds (`rbpf.validatio
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated
 
@@ -81,10 +82,7 @@ class WheelOdometer(Ranged):
 
 def dead_reckoning(delta: np.ndarray) -> np.ndarray:
     """(T, 3) poses by motions (T - 1, 3), elements of SE(2); the first is the identity."""
-    poses = np.zeros((len(delta) + 1, 3))
-    for k, step in enumerate(delta):
-        poses[k + 1] = SE2.compose(poses[k], step)
-    return poses
+    return np.array(list(accumulate(delta, SE2.compose, initial=SE2.identity())))
 
 
 @dataclass(frozen=True)
