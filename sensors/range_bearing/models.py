@@ -8,29 +8,45 @@ For a right perturbation of world_from_robot, p_robot moves by −ω × p_robot 
 """
 
 from abc import abstractmethod
-from typing import final
+from copy import copy
+from typing import Self, final
 
 import numpy as np
 
-from rbpf.core.models import FusedKernel, Given, Jacobians, ObservationModel
-from rbpf.lie import Array, SE2Group, SE3Group, skew
+from rbpf.core.models import FusedKernel, Given, Jacobians, ObservationModel, Part
+from rbpf.lie import Array, SE2Group, SE3Group
 
 
 class RigidPointModel(ObservationModel):
     """A sensor mounted on a robot that measures points; a subclass says what is measured in the sensor's frame.
 
     A landmark's mean is taken as a world point and its constants are not read: anchored ones need a model of their own.
-    The mounting pose robot_from_sensor (E,) in SE2 or SE3 is fixed from then on; by default the robot's origin.
+    The mounting pose robot_from_sensor (E,) in SE2 or SE3 is by default the robot's origin; where it is not known for certain
+    see `tuned`.
     """
+
+    _by_about: Array
 
     def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None) -> None:
         self.space = space
-        mounting = space.identity() if robot_from_sensor is None else robot_from_sensor
-        self.robot_from_sensor = np.array(mounting, dtype=float)
+        self._mount(space.identity() if robot_from_sensor is None else robot_from_sensor)
+
+    def _mount(self, robot_from_sensor: Array) -> None:
+        self.robot_from_sensor = np.array(robot_from_sensor, dtype=float)
         self.robot_from_sensor.flags.writeable = False
-        rotation = space.rotation(self.robot_from_sensor)
+        rotation = self.space.rotation(self.robot_from_sensor)
         #: Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation.
-        self.mounting = np.concatenate([rotation.ravel(), space.translation(self.robot_from_sensor)])
+        self.mounting = np.concatenate([rotation.ravel(), self.space.translation(self.robot_from_sensor)])
+
+    def tuned(self, about: Array, free: Array) -> Self:
+        """Of a sensor that a substate s (m,), which is `about` (m,), moves to robot_from_sensor Exp(free s), free (d, m)."""
+        moved = self.space.exp(free @ about)
+        tuned = copy(self)
+        tuned._mount(self.space.compose(self.robot_from_sensor, moved))
+        tuned.about, tuned.reads = about, self.reads | {Part.SUBSTATE}
+        # How its pose moves with s, in the right chart there.
+        tuned._by_about = self.space.right_jacobian(free @ about) @ free
+        return tuned
 
     @abstractmethod
     def measure(self, point: Array) -> Array:
@@ -46,8 +62,24 @@ class RigidPointModel(ObservationModel):
 
     def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         assert landmark is not None
-        in_robot = self.space.inverse_transform(state, landmark)
-        return self.measure(self.space.inverse_transform(self.robot_from_sensor, in_robot))
+        z = self.measure(self._in_sensor(state, landmark))
+        if self.about is None or substate is None:
+            return z
+        return z + (self.by_substate(state, landmark) @ (substate - self.about)[..., None])[..., 0]
+
+    def _in_sensor(self, state: Array, landmark: Array) -> Array:
+        return self.space.inverse_transform(self.robot_from_sensor, self.space.inverse_transform(state, landmark))
+
+    def by_substate(self, state: Array, landmark: Array, const: Given = None) -> Array:
+        """As p_robot moves with the robot, so does p_sensor with the sensor: D [−ω × p | −I] of its own frame."""
+        at = self._in_sensor(state, landmark)
+        return -self.measure_jacobian(at) @ self.space.transform_jacobian(at) @ self._by_about
+
+    def new_by_substate(self, z: Array) -> Array | None:
+        if self.about is None:
+            return None
+        turned = self.space.rotation(self.robot_from_sensor) @ self.space.transform_jacobian(self.locate(z))
+        return turned @ self._by_about
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
         """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D taken to the robot's frame."""
@@ -56,13 +88,8 @@ class RigidPointModel(ObservationModel):
         slope = self.measure_jacobian(self.space.inverse_transform(self.robot_from_sensor, in_robot))
         slope = slope @ np.swapaxes(self.space.rotation(self.robot_from_sensor), -1, -2)
         by_landmark = slope @ np.swapaxes(self.space.rotation(state), -1, -2)
-        # ∂p/∂ω is (y, −x) in the plane and [p]× in space.
-        if in_robot.shape[-1] == 2:
-            turned = np.stack([in_robot[..., 1], -in_robot[..., 0]], axis=-1)
-            by_rotation = (slope @ turned[..., None])[..., :1]
-        else:
-            by_rotation = slope @ skew(in_robot)
-        return Jacobians(np.concatenate([by_rotation, -slope], axis=-1), by_landmark)
+        by_substate = None if self.about is None or substate is None else self.by_substate(state, landmark)
+        return Jacobians(-slope @ self.space.transform_jacobian(in_robot), by_landmark, by_substate)
 
     def invert(self, state: Array, z: Array) -> Array:
         in_robot = self.space.transform(self.robot_from_sensor, self.locate(z))
@@ -136,7 +163,9 @@ class RangeBearing(RigidPointModel):
         z = self.predict(state, landmark)
         return (z[..., 0] <= self.max_range) & (np.abs(z[..., 1]) <= self.half_field_of_view)
 
-    def kernel(self) -> FusedKernel:
+    def kernel(self) -> FusedKernel | None:
+        if self.about is not None:
+            return None
         from rbpf.sensors.range_bearing import kernels as compiled
 
         if self.dim == 2:
@@ -167,7 +196,9 @@ class RelativePosition(RigidPointModel):
     def visible(self, state: Array, landmark: Array, const: Array | None = None) -> np.ndarray:
         return np.linalg.norm(self.predict(state, landmark), axis=-1) <= self.max_range
 
-    def kernel(self) -> FusedKernel:
+    def kernel(self) -> FusedKernel | None:
+        if self.about is not None:
+            return None
         from rbpf.sensors.range_bearing import kernels as compiled
 
         function = compiled.position_planar if self.dim == 2 else compiled.position_spatial

@@ -77,22 +77,14 @@ def test_where_clutter_is_impossible_nothing_is_forced_on_a_landmark():
     assert chosen.tolist() == [[NULL, 0, NULL]]
 
 
-@pytest.mark.parametrize(
-    ("log_odds", "seen", "expected", "after"),
-    [
-        (0.0, True, True, 1.0),
-        (0.0, True, False, 1.0),
-        (0.0, False, True, -0.5),
-        (0.0, False, False, 0.0),
-        (2.7, True, True, 3.0),  # the limit
-        (-0.5, False, True, -1.0),
-        (-0.6, False, True, -np.inf),  # dropped
-        (-np.inf, True, True, -np.inf),  # what has left stays away
-    ],
-)
-def test_log_odds_of_existence(log_odds, seen, expected, after):
+def test_log_odds_of_existence():
+    """They grow up to the limit; what is dropped has left, and stays away."""
     model = ExistenceModel(hit=1.0, miss=0.5, limit=3.0, drop=-1.0)
-    assert model.updated(np.array([[log_odds]]), np.array([[seen]]), np.array([[expected]])) == after
+    log_odds = np.array([[0.0, 0.0, 0.0, 0.0, 2.7, -0.5, -0.6, -np.inf]])
+    seen = np.array([[True, True, False, False, True, False, False, True]])
+    expected = np.array([[True, False, True, False, True, True, True, True]])
+    after = [[1.0, 1.0, -0.5, 0.0, 3.0, -1.0, -np.inf, -np.inf]]
+    np.testing.assert_array_equal(model.updated(log_odds, seen, expected), after)
 
 
 # A small world without names, with and without clutter, against the run that knows the names.
@@ -104,20 +96,6 @@ NOTHING = Sightings(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)
 def position_error(world: World, reports) -> float:
     means = np.array([report.estimate.mean for report in reports])
     return float(np.sqrt(np.square(means[:, 1:] - world.truth[:, 1:]).sum(axis=1).mean()))
-
-
-def held(filter_: Filter) -> dict[int, float]:
-    """Share of the weight in which each landmark more probably exists than not."""
-    landmark_map = filter_.belief().map
-    present = landmark_map.log_odds(landmark_map.ids) > 0
-    return dict(zip(landmark_map.ids.tolist(), filter_.particles.weights @ present, strict=True))
-
-
-def nearest(filter_: Filter, world: World, ids: list[int]) -> np.ndarray:
-    """Distance of each landmark's mean to the nearest true one."""
-    records = filter_.belief().map.read(np.array(ids))
-    mean = np.einsum("n,nkd->kd", filter_.particles.weights, records.mean)
-    return np.linalg.norm(mean[:, None] - world.landmarks, axis=-1).min(axis=1)
 
 
 @pytest.mark.parametrize("clutter", [0.0, 1.0])
@@ -135,9 +113,11 @@ def test_map_and_accuracy_are_those_of_the_run_that_knows_the_names(clutter):
     error = position_error(world, drive(filter_, world, after=count))
     assert error < 1.5 * position_error(world, drive(reference, named)) + 0.01
     seen = {name for frame in named.frames for name in frame.landmarks.tolist()}
-    accepted = [landmark for landmark, fraction in held(filter_).items() if fraction > 0.5]
+    landmark_map, weights = filter_.belief().map, filter_.particles.weights
+    accepted = landmark_map.ids[weights @ (landmark_map.log_odds(landmark_map.ids) > 0) > 0.5]
     assert len(accepted) == len(seen)
-    assert nearest(filter_, world, accepted).max() < 0.3
+    mean = np.einsum("n,nkd->kd", weights, landmark_map.read(accepted).mean)
+    assert np.linalg.norm(mean[:, None] - world.landmarks, axis=-1).min(axis=1).max() < 0.3
     assert (len(started) > 0.8 * STEPS) == (clutter > 0.0)
     assert max(sizes) < 3 * LANDMARKS
     assert np.mean(sizes[-20:]) < 1.1 * np.mean(sizes[40:60])
@@ -148,21 +128,15 @@ def without_clutter(frame: Sightings) -> Sightings:
     return Sightings(frame.landmarks[true], frame.z[true], frame.cov_z[true])
 
 
-@pytest.fixture
-def filter_() -> Filter:
-    """Five particles that are never resampled."""
-    sensor = anonymous(RangeBearing(SE2, max_range=MAX_RANGE - 0.5))
-    never, held = EssTriggered(Systematic(), 0.0), LandmarkMap(SE2, evidence=True)
-    return Filter(OdometryMotion(SE2), sensor, held, resampler=never, n=5, rng=np.random.default_rng(0))
-
-
 def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> Sightings:
     return Sightings(np.zeros(1, dtype=int), np.array([[distance, bearing]]), np.diag([0.01, 0.001])[None])
 
 
-def test_life_of_a_landmark(filter_):
-    """Sightings and misses are counted; nothing seen of nothing is no miss."""
-    landmark_map = filter_.belief().map
+def test_life_of_a_landmark():
+    """Sightings and misses are counted; nothing seen of nothing is no miss, nor is what is out of sight."""
+    sensor = anonymous(RangeBearing(SE2, max_range=MAX_RANGE - 0.5))
+    never, landmark_map = EssTriggered(Systematic(), 0.0), LandmarkMap(SE2, evidence=True)
+    filter_ = Filter(OdometryMotion(SE2), sensor, landmark_map, resampler=never, n=5, rng=np.random.default_rng(0))
     report = filter_.step(NOTHING)
     assert report.new_landmarks.size == 0 and report.log_evidence == pytest.approx(0.0)
     report = filter_.step(one_sighting())
@@ -179,16 +153,11 @@ def test_life_of_a_landmark(filter_):
     for misses in (1, 2, 3):
         filter_.step(NOTHING)
         np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), before - 0.5 * misses)
+    filter_.step(one_sighting(distance=MAX_RANGE - 0.3))
     for _ in range(3):
         filter_.step(NOTHING)
-    assert landmark_map.ids.size == 0
-
-
-def test_what_is_out_of_sight_is_not_missed(filter_):
-    filter_.step(one_sighting(distance=MAX_RANGE - 0.3))
-    for _ in range(5):
-        filter_.step(NOTHING)
-    np.testing.assert_array_equal(filter_.belief().map.log_odds(np.array([0])), 0.0)
+    assert landmark_map.ids.tolist() == [1]
+    np.testing.assert_array_equal(landmark_map.log_odds(np.array([1])), 0.0)
 
 
 class Fixed(Resampler):

@@ -123,16 +123,11 @@ def test_an_update_by_other_groups_than_the_refinement_is_by_the_groups_it_is_gi
         found.append((densities.all, landmark_map.read(np.arange(2)).mean))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     np.testing.assert_array_equal(found[0][1], found[1][1])
-
-
-def test_a_landmark_removed_after_the_refinement_is_missed_by_the_update():
-    state, groups = np.zeros((N, 3)), sighting(1)
-    landmark_map, _ = filled()
-    landmark_map.add_records(points(np.random.default_rng(1), 2), Point(2))
-    landmark_map.information(state, groups, Prior.exactly(SE2, state))
+    # A landmark that is removed after the refinement is missed by the update.
+    landmark_map.information(state, sighting(1), Prior.exactly(SE2, state))
     landmark_map.remove(np.array([1]))
     with pytest.raises(InputError, match="names landmark 1, which the map does not hold"):
-        landmark_map.correct(state, np.zeros((N, 3)), groups)
+        landmark_map.correct(state, increment, sighting(1))
 
 
 def numbered(*ids: int) -> NewLandmarks:

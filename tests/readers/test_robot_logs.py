@@ -76,12 +76,17 @@ def test_covariance_of_mrclam_is_that_of_white_noise(tmp_path):
     np.testing.assert_array_equal(open_log(tmp_path, noise).frames[1].cov_delta, 0)
 
 
-def test_one_of_several_robots_is_read_by_its_measurements(tmp_path):
+def test_of_several_recordings_in_a_folder_one_is_named(tmp_path):
     write(tmp_path, MRCLAM | {"Robot4_Measurement.dat": MRCLAM[SEEN]})
     with pytest.raises(InputError, match=r"those of 2 robots; name one, such as .*Robot3_Measurement\.dat\."):
         open_log(tmp_path)
     log = open_log(tmp_path / SEEN)
     assert (log.name, len(log.frames)) == (f"{tmp_path.name}_Robot3", 2)
+    graphs = write(tmp_path / "graphs", GRAPH | {"notes.txt": "nothing\n"})
+    assert open_log(graphs).name == "graph"
+    write(graphs, {"other.txt": GRAPH["graph.txt"]})
+    with pytest.raises(InputError, match=r"found 2; name one, such as .*graph\.txt\."):
+        open_log(graphs)
 
 
 def test_mrpt_in_the_plane(tmp_path):
@@ -138,14 +143,6 @@ def test_every_pose_of_a_graph_is_a_frame(tmp_path):
     np.testing.assert_allclose(log.frames[1].delta, [QUARTER, 1, 2])
     np.testing.assert_allclose(log.frames[1].cov_delta, TURNED, atol=1e-15)
     np.testing.assert_array_equal(log.frames[2].cov_delta, np.diag([1, 1, 0]))
-
-
-def test_a_folder_with_one_graph(tmp_path):
-    write(tmp_path, GRAPH | {"notes.txt": "nothing\n"})
-    assert open_log(tmp_path).name == "graph"
-    write(tmp_path, {"other.txt": GRAPH["graph.txt"]})
-    with pytest.raises(InputError, match=r"found 2; name one, such as .*graph\.txt\."):
-        open_log(tmp_path)
 
 
 @pytest.mark.parametrize(

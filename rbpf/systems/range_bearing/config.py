@@ -1,13 +1,15 @@
 """Every setting of a range-bearing run, with its default, its unit and what it does."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.core.models import Likelihood
+from rbpf.lie import SE2Group, SE3Group
 from rbpf.ranges import Count, NotNegative, Positive, Probability, Range, Ranged
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, RunConfig
@@ -42,6 +44,24 @@ class AssociationConfig(Ranged):
 
 
 @dataclass(frozen=True)
+class CalibrationConfig(Ranged):
+    """A robot that calibrates itself: how far its sensor may be from where it is said to be, as standard deviations.
+
+    In the sensor's own directions; 0 is known for certain.
+    """
+
+    x_m: NotNegative = 0.1  #: ahead.
+    y_m: NotNegative = 0.1  #: to the left.
+    z_m: NotNegative = 0.1  #: up, in space.
+    yaw_deg: NotNegative = 0.0  #: turned to the left.
+
+    def std(self, space: SE2Group | SE3Group) -> np.ndarray:
+        """(d,) in the right chart of the sensor's pose."""
+        yaw, shift = np.deg2rad(self.yaw_deg), (self.x_m, self.y_m, self.z_m)
+        return np.array([yaw, *shift[:2]] if isinstance(space, SE2Group) else [0.0, 0.0, yaw, *shift])
+
+
+@dataclass(frozen=True)
 class RangeBearingConfig(RunConfig):
     """A run of range-bearing SLAM."""
 
@@ -52,11 +72,16 @@ class RangeBearingConfig(RunConfig):
     #: (auto) joint, but particles where a lag is set.
     map: Literal["auto", "joint", "particles"] = "auto"
     #: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample size
-    #: falls below the threshold of resampling, which does not take place.
+    #: falls below the threshold of resampling, which does not take place. 1 is best of a robot that calibrates itself, and
+    #: its default then.
     window: Count = 5
     #: of a joint map: landmarks with which a sub-map ends and the next begins, so that a step costs the same however large
     #: the map becomes; with 20 it ends where it reaches three times as far as the sensor. None keeps one Gaussian of all.
     submap: Count | None = 150
+    #: of a joint map: the robot calibrates itself, its sensor's place on it being estimated with everything else.
+    calibrate: Literal["off", "online"] = "off"
+    #: what is known of a robot that calibrates itself.
+    self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
     proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
@@ -65,6 +90,11 @@ class RangeBearingConfig(RunConfig):
     #: chosen among by the first wrong one.
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
     unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> Self:
+        """The defaults that go with settings that are given, by name: sampled poses tell a calibration more than is known."""
+        return cls(window=1) if given.get("calibrate") == "online" else cls()
 
     def kept_map(self) -> tuple[Literal["joint", "particles"], str]:
         """The map of a run, and in one sentence why it is this one."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import elements, integers, read_one
 from rbpf.core.diagnostics import motion_correction
-from rbpf.core.models import NULL
+from rbpf.core.models import NULL, Part
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
@@ -77,15 +77,25 @@ class RangeBearingSlam(System):
                 "AnonymousLandmarkSensor associates in every particle"
             )
         landmark_map: JointMap | LandmarkMap
+        calibrates = config.calibrate == "online"
+        if calibrates and (is_unnamed or not is_joint):
+            raise InputError(
+                "calibrate=online holds the sensor's place in a joint map of landmarks with names: leave out map=particles, "
+                "lag and association=ml"
+            )
+        std = config.self_calibration.std(space) if calibrates else np.zeros(space.dim)
+        # (d, m) what is estimated of the sensor's place.
+        self._free = np.eye(space.dim)[:, std > 0.0]
+        place = np.zeros(self._free.shape[1]), np.diag(std[std > 0.0] ** 2)
         if is_joint:
             unnamed = is_unnamed and config.submap is not None
-            landmark_map = JointMap(space, compiled=config.compiled, submap=config.submap, unnamed=unnamed)
+            landmark_map = JointMap(space, place, config.compiled, config.submap, unnamed=unnamed)
         else:
             landmark_map = LandmarkMap(space, compiled=config.compiled)
             landmark_map.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
-        motion = OdometryMotion(space)
+        motion = OdometryMotion(space, constants=place[0].size)
         self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
         self.hypotheses: Hypotheses | None = None
         if is_unnamed:
@@ -136,6 +146,8 @@ class RangeBearingSlam(System):
         Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
+        if self.joint is not None and (own := self.joint.driving()) is not None:
+            self._prepare(self.joint, own, np.unique(names[names != NULL]))
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
             # One that comes a second time in the frame that starts its landmark is not used.
@@ -172,6 +184,28 @@ class RangeBearingSlam(System):
             {"landmarks": used, "z": z, "cov_z": cov_z},
         )
 
+    def _prepare(self, joint: JointMap, own: np.ndarray, seen: np.ndarray) -> None:
+        """Before landmarks (K,) are seen: the sensor is taken to be where the particles (N, m) have it on average.
+
+        A sub-map that is full lets go of the farthest landmarks, and what was put away is held again.
+        """
+        self.sensor.model = self.model.tuned(self.filter.particles.weights @ own, self._free)
+        if joint.is_full:
+            others = np.setdiff1d(np.setdiff1d(joint.ids, joint.leaving), seen)
+            away = np.linalg.norm(joint.mean[0, joint.held.of_one_kind(others).columns], axis=1)
+            joint.make_room(others[np.argsort(-away, kind="stable")])
+        if joint.old.maps and joint.bring_back(seen):
+            self.filter.consolidate()
+
+    def sensor_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Robot_from_sensor (E,) as it is given or found, and its covariance (d, d) in the right chart."""
+        d, joint = self.space.dim, self.joint
+        if joint is None or joint.driving() is None:
+            return self.robot_from_sensor, np.zeros((d, d))
+        mean, cov = joint.moments(self.filter.particles, Part.SUBSTATE)
+        slope = self.space.right_jacobian(self._free @ mean) @ self._free
+        return self.model.tuned(mean, self._free).robot_from_sensor, slope @ cov @ slope.T
+
     def take(self, frame: Frame) -> Tracked:
         odometry = None
         if frame.delta is not None and frame.cov_delta is not None:
@@ -201,7 +235,7 @@ class RangeBearingSlam(System):
             space=self.space,
             measurement=self.measurement,
             pitch_sign=self.pitch_sign,
-            robot_from_sensor=self.robot_from_sensor,
+            robot_from_sensor=self.sensor_pose()[0],
             start=self.space.identity(),
             stamps_ns=log.stamps_ns,
             deltas=log["delta"][1:],
@@ -219,8 +253,26 @@ class RangeBearingSlam(System):
             "landmarks": int(self.map().ids.size),
             "observations": int(sum((ids >= 0).sum() for ids in self._final(log))),
             "map": self.kept_map,
+            **self._calibration(),
             **({} if self.joint else distinct),
             "map_share_of_dense": round(self.filter.belief().map.stored_fraction, 4),
+        }
+
+    def _calibration(self) -> dict[str, Any]:
+        """Entry of `summary`, of a robot that calibrates itself: where its sensor is, with standard deviations."""
+        config = self.config
+        if config.calibrate == "off":
+            return {}
+        (mean, cov), space, dim = self.sensor_pose(), self.space, self.point.dim
+        turn = space.rotation(mean)
+        names, at = ["x_m", "y_m", "z_m"][:dim], space.translation(mean).tolist()
+        std = np.sqrt(np.diagonal(turn @ cov[-dim:, -dim:] @ turn.T)).tolist()
+        if config.self_calibration.yaw_deg:
+            names.append("yaw_deg")
+            at.append(float(np.rad2deg(np.arctan2(turn[1, 0], turn[0, 0]))))
+            std.append(float(np.rad2deg(np.sqrt(cov[-dim - 1, -dim - 1]))))
+        return {
+            "calibration": dict(zip(names, at, strict=True)) | {f"std_{k}": v for k, v in zip(names, std, strict=True)}
         }
 
     def _final(self, log: FrameLog) -> list[np.ndarray]:
