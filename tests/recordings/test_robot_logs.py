@@ -37,6 +37,7 @@ PATH, ATE, LANDMARKS, ALIGNED = range(4)
         ("mrpt_kf_slam_2d", 1, "map=auto", {PATH: 0.0046, LANDMARKS: 0.0030}),
         ("mrpt_kf_slam_6d", 1, "map=auto", {PATH: 0.0125, LANDMARKS: 0.0050}),
         ("mrclam6_robot1", 1, "window=5", {ATE: 0.13, ALIGNED: 0.08}),
+        ("mrclam6_robot1", 1, "calibrate=online", {ATE: 0.14, ALIGNED: 0.02}),
         ("mrpt_kf_slam_6d", 3, "map=particles", {PATH: 0.030, LANDMARKS: 0.030}),
         ("mrclam6_robot1", 2, "map=particles", {ATE: 0.16}),
         ("mrclam6_robot1", 2, "association=ml", {ATE: 0.19}),

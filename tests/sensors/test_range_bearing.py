@@ -19,7 +19,7 @@ from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel, wrap_angle
 from rbpf.sensors.readers import RobotLog
-from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.config import CalibrationConfig, RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.system import FrameLog
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
@@ -210,4 +210,6 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     again = RangeBearingSlam.of_log(log, config)
     again.load(tmp_path / "checkpoint.npz")
     np.testing.assert_array_equal(again.sensor_pose()[0], pose)
+    turned = RangeBearingSlam.of_log(log, replace(ONLINE, self_calibration=CalibrationConfig(yaw_deg=2.0)))
+    assert turned.summary(steps)["calibration"]["std_yaw_deg"] == pytest.approx(2.0)
     assert run(there, ONLINE)[0] < 1.5 * run(there, off)[0]
