@@ -202,8 +202,10 @@ class Proposed:
         if self._is_prior:
             return noise, np.zeros(1)
         u = self.mean + np.einsum("nab,nb->na", self.root, noise)
-        log_root = np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1)
-        return u, 0.5 * (noise * noise - u * u).sum(axis=1) + log_root
+        # Field by field: NumPy takes twice as long to add up many short rows.
+        roots = np.ascontiguousarray(np.diagonal(self.root, axis1=1, axis2=2).T)
+        squares = np.ascontiguousarray((noise * noise - u * u).T)
+        return u, 0.5 * squares.sum(axis=0) + np.log(roots).sum(axis=0)
 
 
 def balanced(

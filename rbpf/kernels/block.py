@@ -65,6 +65,17 @@ def load_states(state, start, count, x):
 def load_record(pool, slab, rows, start, count, mean, cov, const):
     """Gathers one landmark's record for the `count` particles from `start` on: mean, packed covariance, constants."""
     dim, size_cov, size_const = mean.shape[0], cov.shape[0], const.shape[0]
+    first, apart = rows[start], False
+    for i in range(count):
+        apart |= rows[start + i] != first + i
+    if not apart:  # as before the first resampling after it was written
+        for f in range(dim):
+            mean[f, :count] = pool[slab, f, first : first + count]
+        for f in range(size_cov):
+            cov[f, :count] = pool[slab, dim + f, first : first + count]
+        for f in range(size_const):
+            const[f, :count] = pool[slab, dim + size_cov + f, first : first + count]
+        return
     for f in range(dim):
         for i in range(count):
             mean[f, i] = pool[slab, f, rows[start + i]]
