@@ -17,8 +17,7 @@ from tests.exactness.models import known
 from tests.exactness.scenes import Scene, sensors
 
 TOLERANCE = 1e-9
-PARTICLES = BLOCK + 45
-"""More than one block of the kernels, and not a multiple of it."""
+PARTICLES = BLOCK + 45  #: More than one block of the kernels, and not a multiple of it.
 every_sensor = pytest.mark.parametrize(
     ("space", "which"), [(space, which) for space in (SE2, SE3) for which in (0, 1)], ids=str
 )
@@ -36,10 +35,7 @@ def rng() -> np.random.Generator:
 
 def with_outliers(group: Observations) -> Observations:
     """The second measurement far off, the third at the edge of the gate."""
-    z = group.z.copy()
-    z[1] += 0.9
-    z[2] += 0.25
-    return Observations(z, group.cov, group.model, group.likelihood, group.ids, group.log_new, group.log_clutter)
+    return replace(group, z=group.z + np.array([0.0, 0.9, 0.25, 0.0, 0.0])[:, None])
 
 
 def associations(kind: str, rng: np.random.Generator) -> np.ndarray:
