@@ -1,5 +1,6 @@
 """Motion by odometry, of wheels or of a camera: each control is a measured increment with its covariance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 from rbpf import gaussian
 from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
-from rbpf.lie import SE3, LieGroup
+from rbpf.lie import SE2, SE3, LieGroup
 
 #: Of [ω, v] of a camera: the turn about its y axis, which points down, and the shift along x and z.
 CAMERA_PLANE = (False, True, False, True, False, True)
@@ -73,13 +74,20 @@ class OdometryMotion(MotionModel):
             injects some and names no figure; none is the default, for covariances are tested.
         free: (d,) bool: the components of Log(delta) and of the noise that are kept, as `CAMERA_PLANE`, which keeps a
             camera in the x–z plane of its first pose (S05); the others are dropped. None keeps all.
-        constants: numbers of a substate that stay what they are and do not move the robot, as of a calibration.
+        constants: numbers k of a substate that stay what they are, as of a calibration.
+        by_constants: how an increment (E,) moves with these, (d, k) in the right chart at its end, as by `wheel_errors`;
+            None for constants that do not move the robot.
     """
 
     def __init__(
-        self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None, constants: int = 0
+        self,
+        space: LieGroup,
+        std_added: ArrayLike = 0.0,
+        free: tuple[bool, ...] | None = None,
+        constants: int = 0,
+        by_constants: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        self.space, self.constants = space, constants
+        self.space, self.constants, self.by_constants = space, constants, by_constants
         self.cov_added = np.diag(deviations(std_added, space.dim, "std_added") ** 2)
         self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
@@ -87,7 +95,7 @@ class OdometryMotion(MotionModel):
         """The increment, the same for all particles; refused is one that is not finite, or whose covariance is none."""
         d = self.space.dim
         if control is None:
-            return self._with_constants(state, np.zeros((d, d)))
+            return self._with_constants(state, np.zeros((d, d)), self.space.identity())
         if control.delta.shape != (self.space.size,) or control.cov.shape != (d, d):
             raise InputError(
                 f"odometry needs delta ({self.space.size},) and cov ({d}, {d}), "
@@ -100,14 +108,15 @@ class OdometryMotion(MotionModel):
             factor = gaussian.psd_factor(moved.cov)
         except InputError as error:
             raise InputError(f"the covariance of the odometry is not one: {error}") from error
-        return self._with_constants(self.space.compose(state, moved.delta), factor)
+        return self._with_constants(self.space.compose(state, moved.delta), factor, moved.delta)
 
-    def _with_constants(self, mean: np.ndarray, factor: np.ndarray) -> Transition:
+    def _with_constants(self, mean: np.ndarray, factor: np.ndarray, delta: np.ndarray) -> Transition:
         d, k = self.space.dim, self.constants
         if not k:
             return Transition(mean, factor[None])
+        coupling = np.zeros((d, k)) if self.by_constants is None else self.by_constants(delta)
         factor = np.pad(factor, ((0, k), (0, 0)))
-        return Transition(mean, factor[None], np.zeros((1, d, k)), np.eye(k)[None], np.zeros((1, k)))
+        return Transition(mean, factor[None], coupling[None], np.eye(k)[None], np.zeros((1, k)))
 
     def constrained(self, measured: Odometry) -> Odometry:
         """The increment and the covariance that particles are moved by, of a measured one."""
@@ -116,6 +125,19 @@ class OdometryMotion(MotionModel):
             return Odometry(measured.delta, cov)
         delta = self.space.exp(self._free @ self.space.log(measured.delta))
         return Odometry(delta, self._free @ cov @ self._free)
+
+
+def wheel_errors(delta: np.ndarray) -> np.ndarray:
+    """How an increment (…, 3) in the plane moves with what wheels get wrong alike in all steps: (…, 3, 3).
+
+    In the chart at its end the heading is off, in this order: per metre ahead [rad/m], as by wheels of unequal size or a
+    steering that is not straight, and by fractions of what is turned to the left and to the right, as by a track or a
+    steering ratio that is wrong (J. Borenstein and L. Feng 1996).
+    """
+    turn, ahead = np.moveaxis(SE2.log(delta), -1, 0)[:2]
+    by_errors = np.zeros((*np.shape(delta), 3))
+    by_errors[..., 0, :] = np.stack([ahead, np.maximum(turn, 0.0), np.minimum(turn, 0.0)], axis=-1)
+    return by_errors
 
 
 def deviations(std: ArrayLike, dim: int, name: str) -> np.ndarray:

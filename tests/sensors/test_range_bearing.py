@@ -14,7 +14,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.motion.odometry import OdometryMotion
+from rbpf.motion.odometry import OdometryMotion, wheel_errors
 from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel, wrap_angle
@@ -164,7 +164,7 @@ def test_other_names_are_refused(name, message):
 
 # A sensor whose place on the robot is not known for certain: a member of the joint map.
 
-ONLINE = RangeBearingConfig(particles=30, window=1, calibrate="online")
+SENSOR = RangeBearingConfig(particles=30, window=1, calibrate="sensor")
 
 
 def elsewhere(log: RobotLog, mount: np.ndarray) -> RobotLog:
@@ -178,6 +178,13 @@ def elsewhere(log: RobotLog, mount: np.ndarray) -> RobotLog:
     return replace(log, frames=frames, truth=replace(log.truth, poses=poses))
 
 
+def run(log: RobotLog, config: RangeBearingConfig) -> tuple[float, RangeBearingSlam, FrameLog]:
+    """Error of the path, not aligned, and what made it."""
+    done = filter_opened(open_robot_log(log, config))
+    shift = log.space.translation(done.log.poses) - log.space.translation(log.truth.poses)
+    return np.sqrt(np.square(shift).sum(axis=1).mean()), done.system, done.log
+
+
 @pytest.mark.parametrize("spatial", [False, True])
 def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     """To within what is stated, with sub-maps, too; a run that does not ask is off by more, one that need not by little."""
@@ -187,14 +194,9 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     mount = space.exp(np.append(np.zeros(space.dim - dim), [0.15, -0.1, 0.05][:dim]))
     log = elsewhere(there, mount)
 
-    def run(log: RobotLog, config: RangeBearingConfig) -> tuple[float, RangeBearingSlam, FrameLog]:
-        done = filter_opened(open_robot_log(log, config))
-        shift = space.translation(done.log.poses) - space.translation(log.truth.poses)
-        return np.sqrt(np.square(shift).sum(axis=1).mean()), done.system, done.log
-
-    off, given = replace(ONLINE, calibrate="off"), []
+    off, given = replace(SENSOR, calibrate="off"), []
     for submap in (150, 10):
-        config = replace(ONLINE, submap=submap)
+        config = replace(SENSOR, submap=submap)
         path, slam, steps = run(log, config)
         assert path < 0.7 * run(log, off)[0] and bool(slam.joint.old.maps) == (submap == 10)
         pose, cov = slam.sensor_pose()
@@ -202,7 +204,7 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
         assert error @ np.linalg.solve(within, error) < 4.0 * dim and np.trace(within) < dim * 0.01**2
         given.append(pose)
     np.testing.assert_allclose(*given, atol=0.002)
-    assert RangeBearingConfig.defaults({"calibrate": "online"}).window == ONLINE.window
+    assert RangeBearingConfig.defaults({"calibrate": "online"}).window == SENSOR.window
     entries = slam.summary(steps)["calibration"]
     assert entries["x_m"] == space.translation(pose)[0] and entries["std_x_m"] == np.sqrt(within[0, 0])
     np.testing.assert_array_equal(slam.measurements("log", steps).robot_from_sensor, pose)
@@ -210,6 +212,29 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     again = RangeBearingSlam.of_log(log, config)
     again.load(tmp_path / "checkpoint.npz")
     np.testing.assert_array_equal(again.sensor_pose()[0], pose)
-    turned = RangeBearingSlam.of_log(log, replace(ONLINE, self_calibration=CalibrationConfig(yaw_deg=2.0)))
+    turned = RangeBearingSlam.of_log(log, replace(SENSOR, self_calibration=CalibrationConfig(yaw_deg=2.0)))
     assert turned.summary(steps)["calibration"]["std_yaw_deg"] == pytest.approx(2.0)
-    assert run(there, ONLINE)[0] < 1.5 * run(there, off)[0]
+    assert run(there, SENSOR)[0] < 1.5 * run(there, off)[0]
+
+
+@pytest.mark.parametrize("submap", [150, 10])
+def test_what_wheels_get_wrong_is_found_while_running(submap):
+    """To within what is stated, with sub-maps, too; a robot whose wheels are right is hardly the worse for asking."""
+    right, wrong = (
+        simulated_log(RobotWorld(300, 40, std_translation_m=0.01, std_rotation_deg=0.1), 1),
+        [0.02, 0.04, 0.0],
+    )
+    frames = right.frames[:1]
+    for each in right.frames[1:]:
+        frames.append(replace(each, delta=SE2.compose(each.delta, SE2.exp(-wheel_errors(each.delta) @ wrong))))
+    log, config = replace(right, frames=frames), replace(SENSOR, window=5, calibrate="odometry", submap=submap)
+    off = replace(config, calibrate="off")
+    path, slam, steps = run(log, config)
+    found, std = slam.wheels()
+    # On a circle only how far the heading drifts in all is told, and nothing of turns to the right.
+    told = wheel_errors(right.frames[1].delta)[0]
+    assert abs(told @ (found - wrong)) < 0.1 * told @ wrong and std[2] == pytest.approx(0.05)
+    assert path < 0.5 * run(log, off)[0] and run(right, config)[0] < 1.3 * run(right, off)[0]
+    assert slam.summary(steps)["calibration"]["turn_left"] == found[1]
+    before, after = np.array([each.delta for each in frames[1:]]), slam.measurements("log", steps).deltas
+    np.testing.assert_allclose(SE2.local(before, after), wheel_errors(before) @ found, atol=1e-12)

@@ -80,7 +80,7 @@ ONLINE, OWN = {"calibrate": "online"}, {"map": "particles"}
 
 @pytest.mark.parametrize("setting", [OWN, {"map": "auto", "lag": 5}, ONLINE, {"association": "known"} | ONLINE | OWN])
 def test_what_takes_a_joint_map_or_names_is_refused_without(setting):
-    told = r"(calibrate=online holds .*|association=ml needs a joint map): leave out map=particles(,| and) lag"
+    told = r"(calibrate=online takes .*|association=ml needs a joint map): leave out map=particles(,| and) lag"
     with pytest.raises(InputError, match=told):
         RangeBearingSlam(replace(CONFIG, **setting))
 

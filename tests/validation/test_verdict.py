@@ -19,6 +19,7 @@ from rbpf.validation.consistency.comparison import (
     grade_path,
     innovation_statistics,
     judge,
+    motion_advice,
     noise_advice,
     verdict_of,
 )
@@ -123,15 +124,22 @@ def innovations(value: float):
     return [variance_ratio(INNOVATIONS, value, 5000.0, 1.1)]
 
 
-def test_where_no_setting_holds_it_the_factor_is_told():
+def test_where_no_setting_holds_it_the_factor_is_told_and_nothing_where_nothing_contradicts():
     assert "measurements 3 times as large" in noise_advice(record("range-bearing"), innovations(9.0))
     assert "times as large" in noise_advice(record("mono", search="damaged"), innovations(9.0))
-
-
-def test_nothing_is_advised_where_nothing_contradicts():
     assert noise_advice(record("mono"), innovations(1.0)) == ""
     assert noise_advice(record("mono"), [variance_ratio("poses", 9.0, 500.0, 2.0)]) == ""
     assert noise_advice(record("mono"), []) == ""
+
+
+def test_odometry_that_errs_alike_in_all_steps_should_be_learnt():
+    """Told by many steps, none of which tells anything by itself; not where it is learnt."""
+    cov, rng = np.full((3000, 1, 1), 0.01), np.random.default_rng(0)
+    for bias, calibrate, advised in ((1.0, "off", True), (0.0, "off", False), (1.0, "odometry", False)):
+        correction = 0.01 * bias + 0.1 * rng.normal(size=(3000, 1))
+        _, found = innovation_statistics(np.ones(3000), np.ones(3000), correction, cov)
+        own = record("range-bearing", calibrate=calibrate, association="known")
+        assert found.kind == "bias" and ("--set calibrate=odometry" in motion_advice(own, [found])) == advised
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
-from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
+from rbpf.validation.consistency.comparison import RESIDUALS, Comparison, distance
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
 from rbpf.validation.gtsam.batch_problem import OnIteration, Optimum, Problem, fit_of, floats_in_scale, solve_problem
 from rbpf.validation.gtsam.observations import HUBER
@@ -198,7 +198,7 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
                 f"; that posterior is not Gaussian (of {DRAWS} draws from its Gaussian {draws.ess:.0f} count), so that it is "
                 "no witness of the uncertainty"
             )
-    accuracy = f"The path is {1e3 * found.path.rmse:.3g} mm (rms) from the batch optimum of the same measurements"
+    accuracy = f"The path is {distance(found.path.rmse)} (rms) from the batch optimum of the same measurements"
     # Single numbers of the Gaussians for the page; the rows behind them are `AgainstBatch.as_dict`'s.
     for name, rows in (("landmarks", found.landmarks), ("poses", found.poses)):
         figures |= {f"{name}_{key}": value for key, value in rows.as_dict().items() if not isinstance(value, list)}

@@ -31,7 +31,7 @@ from rbpf.errors import InputError
 from rbpf.runs.files import write_text
 from rbpf.runs.plots import lost_frames
 from rbpf.runs.reading import RunFolder
-from rbpf.validation.consistency.statistic import Statistic, motion_statistics, step_ratio
+from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, Statistic, motion_statistics, step_ratio
 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 #: By system, where its configuration holds the one standard deviation of all measurements, px.
@@ -131,6 +131,16 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     return (
         f"Innovations would be about as large as expected with {how}; judge such a run beside the truth or a batch "
         "optimum, because errors that repeat from step to step do not show in innovations."
+    )
+
+
+def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
+    """One sentence where a robot's odometry errs alike in all steps, and the run has not learnt what its wheels get wrong."""
+    biased = any(s.name == BIAS_OF_MOTION and s.outcome == "contradicts" for s in statistics)
+    if not biased or record.config.get("calibrate") != "off" or record.config.get("association") != "known":
+        return ""
+    return (
+        "The odometry errs alike in all steps: in the plane --set calibrate=odometry learns what the wheels get wrong."
     )
 
 
@@ -266,7 +276,8 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
     # Those that compare poses or landmarks with what the filter did not compute itself.
     independent = [s.name for c in comparisons if c.accuracy for s in c.statistics if s.name != RESIDUALS]
     verdict = judge(statistics, independent, path)
-    return replace(verdict, advice=noise_advice(record, statistics))
+    advice = motion_advice(record, statistics), noise_advice(record, statistics)
+    return replace(verdict, advice=" ".join(filter(None, advice)))
 
 
 def described(statistic: Statistic) -> str:
@@ -303,6 +314,11 @@ def _distance(statistic: Statistic) -> float:
     if statistic.low > high:
         return statistic.low / max(high, 1e-9)
     return max(low, 1e-9) / max(statistic.high, 1e-9)
+
+
+def distance(metres: float) -> str:
+    """In the unit in which it is read at a glance."""
+    return f"{1e3 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"
 
 
 def _number(value: float) -> str:

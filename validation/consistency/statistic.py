@@ -37,6 +37,7 @@ NOISE_FACTOR = 1.1
 #: A motion's bias per step may have this many of its standard deviations: over 16 steps it adds up to as much as the
 #: noise does.
 BIAS = 0.25
+BIAS_OF_MOTION = "bias of the motion"
 INFORMED = 0.05  #: A direction of the motion that the observations inform by less than this fraction is left out.
 PROBABILITIES = 0.5, 0.9, 0.95  #: Of credible regions.
 _NOTHING = 1e-12  #: Variances below this fraction of the largest, or of one, are none.
@@ -231,16 +232,17 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
     # The constant b that explains the corrections best, û = cov b: its clearest component that is informed.
     values, vectors = np.linalg.eigh(cov.sum(axis=0))
     informed = values > 1.0
-    if size is None or not informed.any():
-        return [] if size is None else [size]
+    sizes = [] if size is None else [size]  # no single step need tell anything for all together to do
+    if not informed.any():
+        return sizes
     along = (vectors.T @ correction.sum(axis=0))[informed] / values[informed]
-    std = np.sqrt(max(size.value, 1.0) / values[informed])
+    std = np.sqrt(max([1.0, *(s.value for s in sizes)]) / values[informed])
     margin = float(ndtri(0.5 + 0.5 * LEVEL ** (1.0 / along.size)))  # all components together
     lows = np.maximum(np.abs(along) - margin * std, 0.0)
     worst = int(np.argmax(lows)) if lows.any() else int(np.argmax(np.abs(along) + margin * std))
     bias, top = float(np.abs(along[worst])), float((np.abs(along) + margin * std).max())
     zone, samples = (-np.inf, BIAS), len(correction)
-    return [size, Statistic("bias of the motion", bias, float(lows[worst]), top, zone, samples, "bias")]
+    return [*sizes, Statistic(BIAS_OF_MOTION, bias, float(lows[worst]), top, zone, samples, "bias")]
 
 
 def coverage(nees: np.ndarray, dim: int, samples: float) -> list[Statistic]:

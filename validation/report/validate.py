@@ -51,7 +51,7 @@ def _camera_colmap(record: RunFolder) -> Comparison:
     figures = {f"run_{name}": value for name, value in run.as_dict().items()}
     if truth is not None:
         figures |= {f"truth_{name}": value for name, value in truth.as_dict().items()}
-    accuracy = f"The path is {1e3 * run.path.rmse:.3g} mm (rms) from COLMAP's reconstruction of the same images."
+    accuracy = f"The path is {verdicts.distance(run.path.rmse)} (rms) from COLMAP's reconstruction of the same images."
     pictures = plot_against_colmap(run, record.estimate, record.folder)
     return Comparison("colmap", accuracy, figures, pictures=pictures)
 

@@ -45,20 +45,26 @@ class AssociationConfig(Ranged):
 
 @dataclass(frozen=True)
 class CalibrationConfig(Ranged):
-    """A robot that calibrates itself: how far its sensor may be from where it is said to be, as standard deviations.
+    """What a robot that calibrates itself may be wrong about, as standard deviations; 0 is known for certain.
 
-    In the sensor's own directions; 0 is known for certain.
+    How far its sensor is from where it is said to be, in the sensor's own directions, and what its wheels get wrong.
     """
 
     x_m: NotNegative = 0.1  #: ahead.
     y_m: NotNegative = 0.1  #: to the left.
     z_m: NotNegative = 0.1  #: up, in space.
     yaw_deg: NotNegative = 0.0  #: turned to the left.
+    heading_deg_per_m: NotNegative = 1.0  #: the odometry's heading drifts for every metre ahead, in the plane.
+    turn: NotNegative = 0.05  #: fraction by which its turns are wrong, those to the left and those to the right.
 
-    def std(self, space: SE2Group | SE3Group) -> np.ndarray:
+    def of_sensor(self, space: SE2Group | SE3Group) -> np.ndarray:
         """(d,) in the right chart of the sensor's pose."""
         yaw, shift = np.deg2rad(self.yaw_deg), (self.x_m, self.y_m, self.z_m)
         return np.array([yaw, *shift[:2]] if isinstance(space, SE2Group) else [0.0, 0.0, yaw, *shift])
+
+    def of_wheels(self) -> np.ndarray:
+        """(3,) of `wheel_errors`."""
+        return np.array([np.deg2rad(self.heading_deg_per_m), self.turn, self.turn])
 
 
 @dataclass(frozen=True)
@@ -72,14 +78,15 @@ class RangeBearingConfig(RunConfig):
     #: (auto) joint, but particles where a lag is set.
     map: Literal["auto", "joint", "particles"] = "auto"
     #: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample size
-    #: falls below the threshold of resampling, which does not take place. 1 is best of a robot that calibrates itself, and
-    #: its default then.
+    #: falls below the threshold of resampling, which does not take place. 1 is best where the sensor's place is
+    #: estimated, and the default then.
     window: Count = 5
     #: of a joint map: landmarks with which a sub-map ends and the next begins, so that a step costs the same however large
     #: the map becomes; with 20 it ends where it reaches three times as far as the sensor. None keeps one Gaussian of all.
     submap: Count | None = 150
-    #: of a joint map: the robot calibrates itself, its sensor's place on it being estimated with everything else.
-    calibrate: Literal["off", "online"] = "off"
+    #: of a joint map: what is estimated with everything else: in the plane what the wheels get wrong alike in all steps
+    #: (odometry), or the sensor's place on the robot (sensor), or both (online).
+    calibrate: Literal["off", "odometry", "sensor", "online"] = "off"
     #: what is known of a robot that calibrates itself.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
@@ -94,7 +101,16 @@ class RangeBearingConfig(RunConfig):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Self:
         """The defaults that go with settings that are given, by name: sampled poses tell a calibration more than is known."""
-        return cls(window=1) if given.get("calibrate") == "online" else cls()
+        return cls(window=1) if given.get("calibrate") in ("sensor", "online") else cls()
+
+    def uncertain(self, space: SE2Group | SE3Group) -> np.ndarray:
+        """Standard deviations (d + 3,) of what a robot may estimate of itself: its sensor's place, then its wheels."""
+        sensor, wheels = self.self_calibration.of_sensor(space), self.self_calibration.of_wheels()
+        if self.calibrate not in ("sensor", "online"):
+            sensor[:] = 0.0
+        if self.calibrate not in ("odometry", "online") or not isinstance(space, SE2Group):
+            wheels[:] = 0.0
+        return np.concatenate([sensor, wheels])
 
     def kept_map(self) -> tuple[Literal["joint", "particles"], str]:
         """The map of a run, and in one sentence why it is this one."""

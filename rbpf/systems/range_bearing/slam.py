@@ -16,7 +16,7 @@ from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.motion.odometry import Odometry, OdometryMotion, wheel_errors
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
@@ -77,25 +77,30 @@ class RangeBearingSlam(System):
                 "AnonymousLandmarkSensor associates in every particle"
             )
         landmark_map: JointMap | LandmarkMap
-        calibrates = config.calibrate == "online"
-        if calibrates and (is_unnamed or not is_joint):
+        # What is estimated: the sensor's place, which moves by free (d, m) s, and what the wheels get wrong.
+        std = config.uncertain(space)
+        self._learnt = np.flatnonzero(std)
+        self._free = np.eye(space.dim, std.size)[:, self._learnt]
+        if config.calibrate != "off" and (is_unnamed or not is_joint):
             raise InputError(
-                "calibrate=online holds the sensor's place in a joint map of landmarks with names: leave out map=particles, "
-                "lag and association=ml"
+                f"calibrate={config.calibrate} takes a joint map of landmarks with names: leave out map=particles, lag and "
+                "association=ml"
             )
-        std = config.self_calibration.std(space) if calibrates else np.zeros(space.dim)
-        # (d, m) what is estimated of the sensor's place.
-        self._free = np.eye(space.dim)[:, std > 0.0]
-        place = np.zeros(self._free.shape[1]), np.diag(std[std > 0.0] ** 2)
+        if config.calibrate != "off" and not self._learnt.size:
+            raise InputError(
+                f"calibrate={config.calibrate} leaves nothing to estimate: ask for calibrate=sensor in space, and for a "
+                "self_calibration above 0"
+            )
+        constants = np.zeros(self._learnt.size), np.diag(std[self._learnt] ** 2)
         if is_joint:
             unnamed = is_unnamed and config.submap is not None
-            landmark_map = JointMap(space, place, config.compiled, config.submap, unnamed=unnamed)
+            landmark_map = JointMap(space, constants, config.compiled, config.submap, unnamed=unnamed)
         else:
             landmark_map = LandmarkMap(space, compiled=config.compiled)
             landmark_map.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
-        motion = OdometryMotion(space, constants=place[0].size)
+        motion = OdometryMotion(space, constants=self._learnt.size, by_constants=self._by_learnt)
         self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
         self.hypotheses: Hypotheses | None = None
         if is_unnamed:
@@ -189,13 +194,29 @@ class RangeBearingSlam(System):
 
         A sub-map that is full lets go of the farthest landmarks, and what was put away is held again.
         """
-        self.sensor.model = self.model.tuned(self.filter.particles.weights @ own, self._free)
+        if self._free.any():
+            self.sensor.model = self.model.tuned(self.filter.particles.weights @ own, self._free)
         if joint.is_full:
             others = np.setdiff1d(np.setdiff1d(joint.ids, joint.leaving), seen)
             away = np.linalg.norm(joint.mean[0, joint.held.of_one_kind(others).columns], axis=1)
             joint.make_room(others[np.argsort(-away, kind="stable")])
         if joint.old.maps and joint.bring_back(seen):
             self.filter.consolidate()
+
+    def _by_learnt(self, delta: np.ndarray) -> np.ndarray:
+        """How odometry (E,) moves with what is estimated, (d, m) in the right chart at its end."""
+        d = self.space.dim
+        by_wheels = wheel_errors(delta) if isinstance(self.space, SE2Group) else np.zeros((d, 3))
+        return np.concatenate([np.zeros((d, d)), by_wheels], axis=1)[:, self._learnt]
+
+    def wheels(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the wheels get wrong as far as it is found (3,), as in `wheel_errors`, and its standard deviations (3,)."""
+        found, std, d = np.zeros(3), np.zeros(3), self.space.dim
+        own = self._learnt >= d
+        if self.joint is not None and own.any():
+            mean, cov = self.joint.moments(self.filter.particles, Part.SUBSTATE)
+            found[self._learnt[own] - d], std[self._learnt[own] - d] = mean[own], np.sqrt(np.diagonal(cov))[own]
+        return found, std
 
     def sensor_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Robot_from_sensor (E,) as it is given or found, and its covariance (d, d) in the right chart."""
@@ -238,13 +259,18 @@ class RangeBearingSlam(System):
             robot_from_sensor=self.sensor_pose()[0],
             start=self.space.identity(),
             stamps_ns=log.stamps_ns,
-            deltas=log["delta"][1:],
+            deltas=self._corrected(log["delta"][1:]),
             covs=log["cov_delta"][1:],
             steps=np.repeat(np.arange(len(used)), [rows.size for rows in used]),
             landmarks=np.concatenate([np.zeros(0, dtype=np.int64), *(ids[ids >= 0] for ids in landmarks)]),
             z=gathered("z", (p,)),
             cov_z=gathered("cov_z", (p, p)),
         )
+
+    def _corrected(self, deltas: np.ndarray) -> np.ndarray:
+        """Odometry (T, E) without what is found to be wrong with it."""
+        wrong = self.wheels()[0]
+        return self.space.compose(deltas, self.space.exp(wheel_errors(deltas) @ wrong)) if wrong.any() else deltas
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
         """How much was observed and kept, and how far the particles have forgotten the past, if they sample it."""
@@ -259,21 +285,26 @@ class RangeBearingSlam(System):
         }
 
     def _calibration(self) -> dict[str, Any]:
-        """Entry of `summary`, of a robot that calibrates itself: where its sensor is, with standard deviations."""
+        """Entry of `summary`, of a robot that calibrates itself: what was found, with standard deviations."""
         config = self.config
         if config.calibrate == "off":
             return {}
         (mean, cov), space, dim = self.sensor_pose(), self.space, self.point.dim
-        turn = space.rotation(mean)
-        names, at = ["x_m", "y_m", "z_m"][:dim], space.translation(mean).tolist()
-        std = np.sqrt(np.diagonal(turn @ cov[-dim:, -dim:] @ turn.T)).tolist()
-        if config.self_calibration.yaw_deg:
-            names.append("yaw_deg")
-            at.append(float(np.rad2deg(np.arctan2(turn[1, 0], turn[0, 0]))))
-            std.append(float(np.rad2deg(np.sqrt(cov[-dim - 1, -dim - 1]))))
-        return {
-            "calibration": dict(zip(names, at, strict=True)) | {f"std_{k}": v for k, v in zip(names, std, strict=True)}
-        }
+        turn, entries = space.rotation(mean), dict[str, tuple[float, float]]()
+        if config.calibrate != "odometry":
+            within = np.sqrt(np.diagonal(turn @ cov[-dim:, -dim:] @ turn.T))
+            entries |= dict(zip(["x_m", "y_m", "z_m"], zip(space.translation(mean), within, strict=True), strict=False))
+            if config.self_calibration.yaw_deg:
+                entries["yaw_deg"] = (
+                    np.rad2deg(np.arctan2(turn[1, 0], turn[0, 0])),
+                    np.rad2deg(np.sqrt(cov[-dim - 1, -dim - 1])),
+                )
+        if (self._learnt >= space.dim).any():
+            (drift, left, right), (std_drift, std_left, std_right) = self.wheels()
+            entries["heading_deg_per_m"] = np.rad2deg(drift), np.rad2deg(std_drift)
+            entries |= {"turn_left": (left, std_left), "turn_right": (right, std_right)}
+        stds = {f"std_{name}": float(std) for name, (_, std) in entries.items()}
+        return {"calibration": {name: float(value) for name, (value, _) in entries.items()} | stds}
 
     def _final(self, log: FrameLog) -> list[np.ndarray]:
         """The landmark of every observation, one array (K,) per step, as known now: by the heaviest hypothesis, if kept."""
