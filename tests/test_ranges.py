@@ -133,12 +133,9 @@ def test_the_rest_of_a_group_keeps_the_systems_defaults():
     assert found.proposal.iterations == MonoConfig().proposal.iterations != ProposalConfig().iterations
 
 
-def test_nothing_given_is_the_default():
+def test_nothing_given_is_the_default_a_joint_map_of_two_cameras_brings_its_own_and_what_is_set_wins():
     for kind in (MonoConfig, StereoConfig):
         assert asdict(load_settings(kind, "any", None, [], {})) == asdict(kind())
-
-
-def test_a_joint_map_of_two_cameras_brings_its_own_defaults_and_what_is_set_wins():
     joint = load_settings(StereoConfig, "stereo", None, ["map.kind=joint"], {"particles": 20})
     assert joint == replace(StereoConfig.joint(), particles=20) and joint.likelihood.build().normalised
     assert not load_settings(StereoConfig, "stereo", None, ["map.window=3"], {}).likelihood.build().normalised

@@ -311,12 +311,11 @@ def test_a_bag_that_was_cut_off_is_refused(as_bag, tmp_path, capsys, kind):
     assert path.name in said and ("reindex" in said or "none of" in said)
 
 
-def test_two_topics_are_not_one_camera(as_bag, tmp_path, capsys):
-    said = refused(capsys, as_bag(KINDS[0]), tmp_path / "run", "--image-topic", "/left,/right")
-    assert "one camera has one topic of images" in said
-
-
-def test_without_the_library_a_sentence_says_how_to_get_it(as_bag, tmp_path, capsys, monkeypatch):
+def test_two_topics_are_not_one_camera_and_without_the_library_it_is_said_how_to_get_it(
+    as_bag, tmp_path, capsys, monkeypatch
+):
     path = as_bag(KINDS[0])
+    said = refused(capsys, path, tmp_path / "run", "--image-topic", "/left,/right")
+    assert "one camera has one topic of images" in said
     monkeypatch.setitem(sys.modules, "rosbags", None)
     assert "pip install 'rbpf[bags]'" in refused(capsys, path, tmp_path / "run")

@@ -89,21 +89,15 @@ def cited_labels() -> set[str]:
     return set(re.findall(r"Mathematics\s+\(([\w-]+)\)", text))
 
 
-def test_numbered_equations_have_one_name_each():
+def test_numbered_equations_have_one_name_each_and_the_code_cites_all_of_them_and_no_other():
     assert len(LABELS) == len(set(LABELS)) > 20
     unnumbered = re.findall(r"^ *\$\$ *$", PAGE, re.MULTILINE)
     assert len(unnumbered) == len(LABELS), "an equation has no name"
-
-
-def test_the_code_cites_every_numbered_equation_and_no_other():
     assert cited_labels() == set(LABELS)
 
 
-def test_every_equation_of_a_paper_that_the_code_cites_is_listed():
+def test_the_equations_of_the_papers_that_code_and_page_cite_are_listed():
     cited = {path.name: cited_equations(path.read_text(encoding="utf-8")) for path in SOURCES}
     assert {name: found - listed_equations() for name, found in cited.items() if found - listed_equations()} == {}
-
-
-def test_the_page_cites_no_equation_that_it_does_not_list():
     assert cited_equations(PAGE) <= listed_equations()
     assert listed_equations() == {("E06", n) for n in range(1, 19)} | {("S05", n) for n in range(1, 17)}

@@ -61,7 +61,7 @@ def test_arctan2_is_within_an_ulp_of_pi_at_all_magnitudes(rng):
     assert np.abs(arctan2_of(y, x) - np.arctan2(y, x)).max() <= ULP_OF_PI
 
 
-def test_arctan2_of_a_small_angle_keeps_its_digits(rng):
+def test_arctan2_of_a_small_angle_keeps_its_digits_and_at_the_origin_the_sign_of_y(rng):
     y, x = rng.normal(size=MANY) * 1e-9, rng.uniform(0.1, 10.0, MANY)
     expected = np.arctan2(y, x)
     assert (np.abs(arctan2_of(y, x) - expected) <= 3 * np.spacing(np.abs(expected))).all()
@@ -76,9 +76,6 @@ def test_arctan2_on_the_axes_the_diagonals_and_at_the_limits():
     found, expected = arctan2_of(y, x), np.arctan2(y, x)
     assert np.abs(found - expected).max() <= ULP_OF_PI
     np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
-
-
-def test_arctan2_at_the_origin_is_zero_of_the_sign_of_y():
     found = arctan2_of(np.array([0.0, -0.0, 0.0, -0.0]), np.array([0.0, 0.0, -0.0, -0.0]))
     np.testing.assert_array_equal(found, 0.0)
     np.testing.assert_array_equal(np.signbit(found), [False, True, False, True])

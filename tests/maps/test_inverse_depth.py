@@ -30,14 +30,11 @@ def euclidean(mean: np.ndarray, const: np.ndarray) -> np.ndarray:
     return SE3.transform(const, ray / mean[..., 2:])
 
 
-def test_homogeneous_is_the_point():
+def test_homogeneous_is_the_point_and_at_infinity_the_direction():
     records = scattered(4, 3, 0.01)
     world = LANDMARK.homogeneous(records.mean, records.const)
     np.testing.assert_array_equal(world[..., 3], records.mean[..., 2])
     np.testing.assert_allclose(world[..., :3] / world[..., 3:], euclidean(records.mean, records.const), atol=1e-12)
-
-
-def test_at_infinity_only_the_direction_is_left():
     direction = LANDMARK.homogeneous(np.array([0.3, -0.2, 0.0]), ANCHOR)
     np.testing.assert_allclose(direction, [*SE3.rotation(ANCHOR) @ [0.3, -0.2, 1.0], 0.0], atol=1e-15)
 

@@ -95,14 +95,11 @@ def test_the_second_scanner_by_its_name(tmp_path, caplog):
         log_of(tmp_path, TEXT, LaserOptions("ROBOTLASER1"))
 
 
-def test_scans_that_come_late_are_left_out(tmp_path, caplog):
+def test_scans_that_come_late_are_left_out_and_odometry_that_jumps_is_kept(tmp_path, caplog):
     times = [1.0, 1.4, 1.2, 1.4, 1.5]
     log = log_of(tmp_path, "".join(f"FLASER 1 {k + 1} {POSE} {t}\n" for k, t in enumerate(times)))
     assert log.ranges[:, 0].tolist() == [1, 2, 5]
     assert "left out 2 scans whose time is not after that of the scan before" in caplog.text
-
-
-def test_odometry_that_jumps_is_kept(tmp_path):
     lines = "".join(f"FLASER 1 2 0 0 0 {x} 0 0 {t}.0\n" for t, x in enumerate([0, 0.5, 100.5, 101]))
     assert log_of(tmp_path, lines).odometry[:, 1].tolist() == [0, 0.5, 100.5, 101]
 

@@ -33,13 +33,10 @@ def test_stereo_measures_three_numbers():
         log(frame(0, 4), camera=STEREO)
 
 
-def test_a_covariance_may_be_singular():
+def test_a_covariance_may_be_singular_and_there_must_be_frames_in_order():
     good = frame(0, 2)
     exact = replace(good, cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
     assert log(exact).frames == [exact]
-
-
-def test_no_frame_and_frames_out_of_order():
     with refused("walk holds no frame, expected at least one image"):
         log()
     with refused("frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"):

@@ -38,20 +38,15 @@ def chosen(found: CandidateMotions, support=(0.0, 0.0, 0.0), informed: bool = Fa
     return camera_motion(found, labels, False, np.array(support), informed)
 
 
-def test_the_many_where_nothing_is_known():
+def test_the_group_that_is_the_camera():
+    # Where nothing is known the many.
     assert chosen(candidates(20, 30)) == 1
     assert chosen(candidates(30, 20)) == 0
-
-
-def test_a_velocity_that_was_measured():
-    """Three standard deviations are exp(4.5) = 90 to one; a group of twice as many does not make up for it."""
+    # Three standard deviations of a velocity that was measured are exp(4.5) = 90 to one; twice as many do not make up for it.
     assert chosen(candidates(20, 40), informed=True) == 0
     assert chosen(candidates(20, 40), informed=False) == 1
     assert chosen(candidates(2, 400), informed=True) == 1
-
-
-def test_none_of_them_is_believed_of_the_map_alone():
-    """Landmarks that no motion explains, and a wide prior does: as likely as one match more, whatever was expected."""
+    # Landmarks that no motion explains, and a wide prior does: as likely as one match more, whatever was expected.
     assert chosen(candidates(10, 200), (0.0, 0.0, np.log(201) + 0.1)) == -1
     assert chosen(candidates(10, 200), (0.0, 0.0, np.log(201) - 0.1)) == 1
     assert chosen(candidates(10, 2), informed=True) >= 0

@@ -66,14 +66,11 @@ def test_it_does_not_hang_on_where_the_filter_went(log):
     assert adjusted(log, path).error == pytest.approx(good.error, rel=1e-4)
 
 
-def test_blind_frames_are_left_out(log):
+def test_blind_frames_and_those_that_share_nothing_with_the_known_points_or_the_first_frame_are_left_out(log):
     blind = {4: kept(log.frames[4], np.arange(0)), 9: kept(log.frames[9], np.arange(3))}
     batch = adjusted(changed(log, blind), rough(log))
     assert set(range(FRAMES)) - set(batch.steps.tolist()) == {4, 9}
     assert batch.estimate.trajectory.stamps_ns.tolist() == [log.frames[t].stamp_ns for t in batch.steps]
-
-
-def test_frames_that_share_nothing_with_the_known_points_or_the_first_frame_are_left_out(log):
     away = changed(log, {t: renamed(log.frames[t], 10_000) for t in range(20, FRAMES)})
     for one in (away, replace(away, known=None)):
         assert connected_frames(one).tolist() == list(range(20))

@@ -106,14 +106,11 @@ def test_such_a_video_is_written_and_read(tmp_path, monkeypatch, name):
     assert found and image.shape == (64, 64, 3)
 
 
-def test_another_protocol_is_not_followed(tmp_path):
-    """A playlist that names another file."""
+def test_another_protocol_is_not_followed_and_a_name_that_is_no_text_is_refused(tmp_path):
+    # A playlist that names another file.
     write_video(iter(PICTURES), STAMPS, tmp_path / "base.mp4")
     (tmp_path / "list.mp4").write_text("#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/base.ts\n#EXT-X-ENDLIST\n")
     with pytest.raises(InputError), opened(tmp_path / "list.mp4"):
         pass
-
-
-def test_a_name_that_is_no_text_is_refused(tmp_path):
     with pytest.raises(InputError, match="must be text in UTF-8"), opened(tmp_path / "walk\udcff.mp4"):
         pass

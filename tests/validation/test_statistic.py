@@ -66,14 +66,11 @@ def corrections(steps: int, bias: np.ndarray, scale: float, rng: np.random.Gener
     return np.einsum("tab,tb->ta", gain, measured), gain
 
 
-def test_corrections_of_an_honest_motion_are_supported():
+def test_corrections_of_an_honest_motion_are_supported_and_a_bias_is_found_and_measured():
     size, bias = motion_statistics(*corrections(600, np.zeros(3), 1.0, np.random.default_rng(3)))
     assert size.outcome == "supports"
     assert bias.outcome != "contradicts"
     assert bias.low < 0.1
-
-
-def test_a_bias_of_the_motion_is_found_and_measured():
     true = np.array([0.0, 0.8, 0.0])
     _, bias = motion_statistics(*corrections(300, true, 1.0, np.random.default_rng(4)))
     assert bias.outcome == "contradicts"
