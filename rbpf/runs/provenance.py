@@ -175,13 +175,13 @@ def _options(entries: Mapping[str, Any]) -> list[str]:
     return words + [f"--no-{name}" for name in _MADE if entries.get(name) is False]
 
 
-def command_of(entries: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
-    """The command of such a run, by its config.yaml: every setting that is not the default is named."""
+def command_of(entries: Mapping[str, Any], *defaults: Mapping[str, Any]) -> list[str]:
+    """The command of such a run, by its config.yaml: every setting that is not the default, in all of these, is named."""
     words = ["rbpf", "run", str(entries["system"]), str(entries.get("recording", "RECORDING")), *_options(entries)]
-    own = decisive_settings({name: value for name, value in entries.items() if name in defaults})
-    usual = decisive_settings(defaults)
+    own = decisive_settings({name: value for name, value in entries.items() if name in defaults[0]})
+    usual = [decisive_settings(each) for each in defaults]
     for name, value in own.items():
-        if value != usual.get(name):
+        if any(value != each.get(name) for each in usual):
             value = value.strip('"')
             words += [f"--{name}", value] if name in ("particles", "seed") else ["--set", f"{name}={value}"]
     return words

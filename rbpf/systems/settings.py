@@ -59,9 +59,7 @@ def load_settings(
     values.update(given)
     _refuse_unknown(values, kind, "")
     try:
-        # A system's defaults may depend on what is asked for.
-        defaults = kind() if (chosen := getattr(kind, "defaults", None)) is None else chosen(values)
-        return msgspec.convert(_over(asdict(defaults), values), kind, strict=False)
+        return msgspec.convert(_over(asdict(defaults_of(kind, values)), values), kind, strict=False)
     except msgspec.ValidationError as error:
         # "Expected `int`, got `str` - at `$.search.measurements`", or a range's own words and the group's place.
         words, _, place = str(error).partition(" - at `$")
@@ -69,6 +67,11 @@ def load_settings(
         if isinstance(error.__cause__, SettingError):
             name, words = f"{name}.{error.__cause__.name}".lstrip("."), error.__cause__.words
         raise InputError(f"settings: {name} {words}".replace(" Expected", ": expected")) from error
+
+
+def defaults_of(kind: type[Config], values: Mapping[str, Any]) -> Config:
+    """The settings of a system where nothing else is said: they may depend on the `values` that are."""
+    return kind() if (chosen := getattr(kind, "defaults", None)) is None else chosen(values)
 
 
 def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

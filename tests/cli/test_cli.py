@@ -171,14 +171,11 @@ def test_folders_of_runs_are_numbered(tmp_path):
     assert numbered(tmp_path / "other", last=True) == tmp_path / "other"
 
 
-def test_one_run_at_a_time_writes_to_a_folder(log, tmp_path, capsys):
+def test_one_run_at_a_time_writes_to_a_folder_and_the_lock_of_a_killed_one_is_taken_over(log, tmp_path, capsys):
     with own_folder(tmp_path / "run"):
         assert run(log, tmp_path / "run") == 2
         assert f"another run, process {os.getpid()}, writes to" in " ".join(capsys.readouterr().err.split())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_lock_of_a_killed_run_is_taken_over(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".lock").write_text("1\n")
     with own_folder(tmp_path / "run"):

@@ -32,14 +32,11 @@ def check(out: Path) -> None:
     assert (out / "report.html").read_text().count("data:image/png;base64,") == len(names)
 
 
-def test_a_robot_among_landmarks(tmp_path):
+def test_a_robot_among_landmarks_one_camera_and_two(desk, room, tmp_path):
     log, out = tmp_path / "log", tmp_path / "run"
     assert main(["simulate", "range-bearing", "--out", str(log), "--steps", "20", "--landmarks", "30"]) == 0
     assert main(["run", "range-bearing", str(log), "--out", str(out), "--particles", "30"]) == 0
     check(out)
-
-
-def test_one_camera_and_two(desk, room, tmp_path):
     assert run(desk, tmp_path / "one") == 0
     assert run_stereo(room, tmp_path / "two") == 0
     check(tmp_path / "one")

@@ -65,12 +65,9 @@ def test_nees_is_measured_in_the_chart_at_the_mean(space):
     assert value == pytest.approx(u @ u, rel=1e-6)
 
 
-def test_nees_leaves_out_what_is_known_exactly():
+def test_nees_leaves_out_what_is_known_exactly_and_effective_sample_sizes():
     cov = np.diag([0.0, 4.0])
     assert nees(PLANE, Estimate(np.zeros(2), cov), np.array([0.0, 2.0])) == pytest.approx(1.0)
-
-
-def test_effective_sample_size():
     assert effective_sample_size(np.full(8, 1 / 8)) == pytest.approx(8.0)
     assert effective_sample_size(np.eye(8)[3]) == 1.0
     assert effective_sample_size(np.array([0.5, 0.5, 0.0])) == pytest.approx(2.0)

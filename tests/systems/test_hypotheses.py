@@ -14,7 +14,7 @@ from rbpf.runs.recordings import filter_opened, open_robot_log, part_of_log
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.readers import Frame, Part, RobotLog
 from rbpf.systems.map_estimate import Anchored, relative_estimate
-from rbpf.systems.range_bearing.config import AssociationConfig, RangeBearingConfig
+from rbpf.systems.range_bearing.config import AssociationConfig, CalibrationConfig, RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 
@@ -76,11 +76,23 @@ def test_a_landmark_that_should_be_seen_and_is_not_is_dropped():
 
 
 ONLINE, OWN = {"calibrate": "online"}, {"map": "particles"}
+NAMED = ONLINE | {"association": "known"}
 
 
-@pytest.mark.parametrize("setting", [OWN, {"map": "auto", "lag": 5}, ONLINE, {"association": "known"} | ONLINE | OWN])
-def test_what_takes_a_joint_map_or_names_is_refused_without(setting):
-    told = r"(calibrate=online takes .*|association=ml needs a joint map): leave out map=particles(,| and) lag"
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        (OWN, "association=ml needs a joint map: leave out map=particles and lag"),
+        ({"map": "auto", "lag": 5}, "association=ml needs a joint map"),
+        (ONLINE, "calibrate=online takes a joint map of landmarks with names"),
+        ({"association": "known"} | ONLINE | OWN, "calibrate=online takes .*: leave out map=particles, lag"),
+        (
+            NAMED | {"self_calibration": CalibrationConfig(x_m=0, y_m=0, heading_deg_per_m=0, turn=0)},
+            "nothing to estimate",
+        ),
+    ],
+)
+def test_what_takes_a_joint_map_or_names_is_refused_without(setting, told):
     with pytest.raises(InputError, match=told):
         RangeBearingSlam(replace(CONFIG, **setting))
 

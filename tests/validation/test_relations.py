@@ -47,15 +47,12 @@ def test_a_path_misses_its_own_relations_by_nothing_and_others_by_how_they_diffe
     assert found["relations_rotation_std_deg"] == pytest.approx(np.std([0, 0, np.degrees(0.1)]))
 
 
-def test_between_two_poses_the_path_is_a_line_and_the_shortest_turn(tmp_path):
+def test_between_two_poses_the_path_is_a_line_and_the_shortest_turn_and_roll_and_pitch_count(tmp_path):
     middle = np.array([np.pi, 0.0, 1.0])  # of headings 3 and -3
     half = [relation(0, 0.5, [0.25, 0.5, 0.0]), relation(1, 3.5, SE2.between(PLANAR[1], middle))]
     errors = relation_errors(PATH, read_relations(written(tmp_path, *half)))
     np.testing.assert_allclose(errors.translations, 0.0, atol=1e-12)
     np.testing.assert_allclose(errors.rotations_deg, 0.0, atol=1e-5)
-
-
-def test_roll_and_pitch_count(tmp_path):
     turn = SE3.from_ypr(np.array([1.0, 2.0, 3.0]), 0.3, 0.2, 0.1)
     path = Trajectory(np.array([0, 10**9]), np.stack([SE3.identity(), turn]))
     errors = relation_errors(path, read_relations(written(tmp_path, [0, 1, 1, 2, 3, 0.1, 0.2, 0.3])))

@@ -21,6 +21,8 @@ from rbpf.runs.results import load
 from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers import Truth
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.settings import defaults_of
 from rbpf.validation.report.page import _images, digits, program, scene, write_report
 from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
@@ -236,6 +238,10 @@ def test_a_command_names_what_is_not_the_default():
     for part in ("--known-points k.csv", "--particles 7", "--set map=particles", "--set search.noise_px=0.5"):
         assert part in rest
     assert words.count("--set") == 2
+    # And what is not the default of a run so set, as a window of 5 where a sensor's place is estimated.
+    entries = asdict(RangeBearingConfig(calibrate="sensor")) | {"system": "range-bearing"}
+    usual = asdict(RangeBearingConfig()), asdict(defaults_of(RangeBearingConfig, entries))
+    assert command_of(entries, *usual)[4:] == ["--set", "window=5", "--set", "calibrate=sensor"]
 
 
 def test_the_page_has_a_head_a_scene_and_no_empty_section(two):

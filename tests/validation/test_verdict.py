@@ -117,7 +117,7 @@ def test_the_path_has_a_light_of_its_own():
 
 
 def record(system: str, **config: object) -> Results:
-    return Results(Path("run"), {"system": system, **config}, {})
+    return Results(Path("run"), {"system": system, **config}, {"map": "joint"})
 
 
 def innovations(value: float):

@@ -137,10 +137,16 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
 def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     """One sentence where a robot's odometry errs alike in all steps, and the run has not learnt what its wheels get wrong."""
     biased = any(s.name == BIAS_OF_MOTION and s.outcome == "contradicts" for s in statistics)
-    if not biased or record.config.get("calibrate") != "off" or record.config.get("association") != "known":
+    more = {"off": "odometry", "sensor": "online"}.get(str(record.config.get("calibrate")))
+    if (
+        not biased
+        or more is None
+        or record.config.get("association") != "known"
+        or record.summary.get("map") != "joint"
+    ):
         return ""
     return (
-        "The odometry errs alike in all steps: in the plane --set calibrate=odometry learns what the wheels get wrong."
+        f"The odometry errs alike in all steps: in the plane --set calibrate={more} learns what the wheels get wrong."
     )
 
 

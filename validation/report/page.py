@@ -40,6 +40,7 @@ from rbpf.runs.plots import (
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import SYSTEMS
+from rbpf.systems.settings import defaults_of
 from rbpf.validation.consistency import comparison as verdicts
 from rbpf.validation.consistency.comparison import Comparison, Verdict
 
@@ -132,13 +133,14 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     environment.filters["digits"] = digits
     # System, size, date and version.
     day, kind = str(record.summary.get("finished", ""))[:10], SYSTEMS.get(record.system)
+    usual = [] if kind is None else [asdict(each) for each in (kind.config(), defaults_of(kind.config, record.config))]
     counted = [f"{record.summary[name]} {name}" for name in ("frames", "particles") if name in record.summary]
     shown = {
         "verdict": verdict,
         "world": world,
         "facts": ", ".join([record.system, *counted, *([day] if day else []), f"rbpf {record.config.get('rbpf', '')}"]),
         # That repeats it; nothing of a system that is not on the command line.
-        "command": "" if kind is None else shlex.join(command_of(record.config, asdict(kind.config()))),
+        "command": "" if kind is None else shlex.join(command_of(record.config, *usual)),
         "remarks": [*record.summary.get("remarks", ()), *problems],
         "on_frames": record.summary.get("problems", ()),
         "sections": [each for each in sections if any(each.get(part) for part in each if part != "title")],

@@ -85,7 +85,8 @@ class RangeBearingConfig(RunConfig):
     #: the map becomes; with 20 it ends where it reaches three times as far as the sensor. None keeps one Gaussian of all.
     submap: Count | None = 150
     #: of a joint map: what is estimated with everything else: in the plane what the wheels get wrong alike in all steps
-    #: (odometry), or the sensor's place on the robot (sensor), or both (online).
+    #: (odometry), or the sensor's place on the robot (sensor), or both (online; in space
+    #: the sensor's place alone).
     calibrate: Literal["off", "odometry", "sensor", "online"] = "off"
     #: what is known of a robot that calibrates itself.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)

@@ -323,10 +323,14 @@ class RangeBearingSlam(System):
             "odometry": self._odometry,
             "observed_once": np.array(sorted(self.sensor.observed_once), dtype=np.int64),
         }
+        if self._learnt.size:
+            kept["learnt"] = self._learnt
         return kept if self.hypotheses is None else kept | self.hypotheses.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
+        if self._learnt.size and not np.array_equal(read_one(arrays, "learnt", integers("learnt")), self._learnt):
+            raise InputError(f"the checkpoint is of another robot than one with calibrate={self.config.calibrate}")
         if self.hypotheses is not None:
             self.hypotheses.restore(arrays)

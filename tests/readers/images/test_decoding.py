@@ -101,14 +101,12 @@ def test_pipes_and_devices_are_no_files(tmp_path):
         load_arrays(tmp_path / "pipe.npz")
 
 
-def test_the_first_image_that_can_be_read_tells_the_size(tmp_path):
+def test_the_first_image_that_can_be_read_tells_the_size_and_reading_begins_at_any(tmp_path):
     write_plain(tmp_path)
     (tmp_path / "0.png").write_bytes(b"none")
     assert levels(open_images(tmp_path)) == [None, 20, 30]
-
-
-def test_from_any_image_on_and_more_than_once(tmp_path):
-    sequence = open_images(write_plain(tmp_path, [f"{i}.png" for i in range(12)]))
+    # From any image on, and more than once.
+    sequence = open_images(write_plain(tmp_path / "twelve", [f"{i}.png" for i in range(12)]))
     everything = [10 * i + 10 for i in range(12)]
     assert levels(sequence) == everything == levels(sequence)
     assert levels(sequence, 7) == everything[7:]
