@@ -74,19 +74,22 @@ class Ranged:
 class SettingError(InputError):
     """A field, by its name, has a value that it cannot have; `words` say what it must be, and what it is."""
 
-    def __init__(self, name: str, words: str) -> None:
-        super().__init__(f"{name} {words}")
+    def __init__(self, name: str, words: str, whose: str = "") -> None:
+        super().__init__(f"{whose}{name} {words}")
         self.name, self.words = name, words
 
 
-def check_ranges(settings: Any) -> None:
-    """Refuses, by a SettingError, a field of another type than declared, or a number that is out of its range."""
+def check_ranges(settings: Any, whose: str = "") -> None:
+    """Refuses, by a SettingError, a field of another type than declared, or a number that is out of its range.
+
+    `whose` comes before the field's name in the message, as "the camera's ".
+    """
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():
         value = getattr(settings, name)
         expected = _expected(hint, value, ANY)
         if expected is not None:
-            raise SettingError(name, f"must be {expected}, got {value!r}")
+            raise SettingError(name, f"must be {expected}, got {value!r}", whose)
 
 
 def require_memory(size: float, what: str) -> None:

@@ -22,6 +22,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import Count, NotNegative, Positive, check_ranges
 from rbpf.sensors.camera import LENSES, Pinhole
 from rbpf.sensors.features.interface import checked_image
 from rbpf.sensors.readers.known_points import KnownPixels
@@ -47,16 +48,15 @@ class Board:
 
     columns: int
     rows: int
-    square_m: float
+    square_m: Positive
 
     def __post_init__(self) -> None:
+        check_ranges(self, "of a chessboard ")
         if min(self.columns, self.rows) < 3:
             raise InputError(
                 f"a chessboard needs at least 3x3 inner corners, got {self.columns}x{self.rows}: count the places "
                 "where four squares meet"
             )
-        if not 0.0 < self.square_m < np.inf:
-            raise InputError(f"the side of a chessboard's square must be positive, got {self.square_m} m")
 
     @classmethod
     def parse(cls, size: str, square_m: float) -> "Board":
@@ -153,17 +153,14 @@ class MarkerBoard:
     known or too small.
     """
 
-    columns: int
-    rows: int
-    side_m: float
-    gap_m: float
+    columns: Count
+    rows: Count
+    side_m: Positive
+    gap_m: NotNegative
     dictionary: str = "4X4_50"
 
     def __post_init__(self) -> None:
-        if min(self.columns, self.rows) < 1:
-            raise InputError(f"a board needs at least 1x1 markers, got {self.columns}x{self.rows}")
-        if not (0.0 < self.side_m < np.inf and 0.0 <= self.gap_m < np.inf):
-            raise InputError(f"a marker's side is positive, the gap not negative, got {self.side_m} m, {self.gap_m} m")
+        check_ranges(self, "of a board of markers ")
         if self.dictionary not in DICTIONARIES:
             raise InputError(f"there is no dictionary {self.dictionary!r} of markers; known: {', '.join(DICTIONARIES)}")
 

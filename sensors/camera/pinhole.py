@@ -6,13 +6,13 @@ is that of `rbpf.sensors.camera.distortion`.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from numbers import Integral, Real
 from typing import Self, final
 
 import numpy as np
 
 from rbpf.arrays import Bool, Float
 from rbpf.errors import InputError
+from rbpf.ranges import Count, Positive, check_ranges
 from rbpf.sensors.camera.distortion import Equidistant, RadialTangential, inverse
 
 Lens = RadialTangential | Equidistant
@@ -26,14 +26,14 @@ LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidis
 class Pinhole:
     """Pinhole camera with distortion (OpenCV's models and pixel convention).
 
-    Raises InputError: a size is no positive whole number, a focal length is not positive, a number is not finite, there
-    is no such model of distortion, or it has another number of coefficients.
+    Raises InputError: a number is out of its range or not finite, there is no such model of distortion, or it has another
+    number of coefficients.
     """
 
-    width: int  #: of the image, px.
-    height: int  #: of the image, px.
-    fx: float  #: focal length along the rows, px.
-    fy: float  #: focal length along the columns, px.
+    width: Count  #: of the image, px.
+    height: Count  #: of the image, px.
+    fx: Positive  #: focal length along the rows, px.
+    fy: Positive  #: focal length along the columns, px.
     cx: float  #: column of the principal point, px.
     cy: float  #: row of the principal point, px.
     #: k1, k2, p1, p2, k3; of an equidistant lens k1, k2, k3, k4.
@@ -43,14 +43,6 @@ class Pinhole:
     dim = 2
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            size = getattr(self, name)
-            if isinstance(size, bool) or not isinstance(size, Integral) or int(size) <= 0:
-                raise InputError(f"the camera's {name} must be a positive whole number of pixels, got {size!r}")
-        for name in ("fx", "fy", "cx", "cy"):
-            _check_finite(f"the camera's {name}", getattr(self, name))
-        if not (self.fx > 0.0 and self.fy > 0.0):
-            raise InputError(f"the camera's fx and fy must be positive, got {self.fx!r} and {self.fy!r} px")
         if self.distortion_model not in LENSES:
             known = " or ".join(LENSES)
             raise InputError(f"the camera's distortion_model must be {known}, got {self.distortion_model!r}")
@@ -59,10 +51,9 @@ class Pinhole:
             left_out = " (k3 = 0 if there are four)" if len(names) == 5 else ""
             expected = f"the {len(names)} numbers {', '.join(names)}{left_out}"
             raise InputError(f"the camera's distortion must be {expected}, got {self.distortion!r}")
-        for name, number in zip(names, self.distortion, strict=True):
-            _check_finite(f"the camera's {name}", number)
         # A list from a file would make the camera unhashable.
         object.__setattr__(self, "distortion", tuple(self.distortion))
+        check_ranges(self, "the camera's ")
 
     @classmethod
     def from_params(cls, width: int, height: int, params: Float[np.ndarray, "10"]) -> Self:
@@ -194,13 +185,11 @@ class RectifiedStereo:
     """
 
     camera: Pinhole  #: each of the two.
-    baseline_m: float  #: distance of the right one from the left one, along the rows.
+    baseline_m: Positive  #: distance of the right one from the left one, along the rows.
     dim = 3
 
     def __post_init__(self) -> None:
-        _check_finite("the stereo baseline", self.baseline_m)
-        if self.baseline_m <= 0.0:
-            raise InputError(f"the stereo baseline must be positive, got {self.baseline_m!r} m")
+        check_ranges(self, "the stereo pair's ")
         if not self.camera.lens.is_identity:
             bent = f"{self.camera.distortion_model} distortion {self.camera.distortion}"
             found = f"the camera of a rectified stereo pair has {bent}"
@@ -243,9 +232,3 @@ def _normalise(point: np.ndarray) -> np.ndarray:
     """(x/z, y/z) (…, 2) of points (…, 3)."""
     point = np.asarray(point, float)
     return point[..., :2] / point[..., 2:]
-
-
-def _check_finite(what: str, value: object) -> None:
-    """Refuses what is no finite number."""
-    if not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise InputError(f"{what} must be a finite number, got {value!r}")

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from math import isfinite
 from typing import Any, Self, final
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.ranges import Count, NotNegative, check_ranges
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 
 
@@ -19,20 +19,16 @@ class Part:
     Raises InputError: a number is out of its range.
     """
 
-    start_s: float = 0.0  #: the first is the first one so long after the recording's first, s.
+    start_s: NotNegative = 0.0  #: the first is the first one so long after the recording's first, s.
     end_s: float | None = None  #: the last is the last one no longer after it, s; None for the recording's.
-    every: int = 1  #: of these each so many-th.
+    every: Count = 1  #: of these each so many-th.
     #: width that they are made smaller to, px; the height follows. None leaves them as they are.
-    resize_px: int | None = None
+    resize_px: Count | None = None
 
     def __post_init__(self) -> None:
-        end_s, width = self.end_s, self.resize_px
-        if not (isfinite(self.start_s) and self.start_s >= 0.0):
-            raise InputError(f"a recording is used from its start on or later: start is {self.start_s:g} s")
-        if end_s is not None and not end_s > self.start_s:
-            raise InputError(f"end is {end_s:g} s: expected more than the start, {self.start_s:g} s")
-        if (least := min(self.every, 1 if width is None else width)) < 1:
-            raise InputError(f"every and resize must be at least 1, got {least}")
+        check_ranges(self)
+        if self.end_s is not None and not self.end_s > self.start_s:
+            raise InputError(f"end is {self.end_s:g} s: expected more than the start, {self.start_s:g} s")
 
     @classmethod
     def of(cls, entries: Mapping[str, Any]) -> Self:

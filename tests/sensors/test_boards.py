@@ -95,10 +95,10 @@ def test_what_is_no_such_board_is_refused(image):
         (Board, ("9", 0.02), "inner corners as 9x6"),
         (Board, ("9x-6", 0.02), "inner corners as 9x6"),
         (Board, ("9x2", 0.02), "at least 3x3"),
-        (Board, ("9x6", 0.0), "must be positive"),
+        (Board, ("9x6", 0.0), "square_m must be above 0"),
         (MarkerBoard, ("5", 0.04, 0.01, "4x4_50"), "their number as 5x7"),
-        (MarkerBoard, ("4x3", 0.0, 0.01, "4x4_50"), "is positive"),
-        (MarkerBoard, ("4x3", 0.04, -0.01, "4x4_50"), "not negative"),
+        (MarkerBoard, ("4x3", 0.0, 0.01, "4x4_50"), "side_m must be above 0"),
+        (MarkerBoard, ("4x3", 0.04, -0.01, "4x4_50"), "gap_m must be at least 0"),
         (MarkerBoard, ("4x3", 0.04, 0.01, "9x9_50"), "no dictionary"),
     ],
 )

@@ -134,7 +134,7 @@ def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
         (log(), OBSERVATIONS, "# measurement: pinhole", "# measurement: range_bearing", "measurement to be pinhole"),
         (log(), OBSERVATIONS, "3,1400000000099999999,", "3,1400000000099999998,", "gives this step"),
         (log(), FRAMES, "# recording: a desk", "# recording: a room", "take both files from one run"),
-        (log(camera=PAIR), OBSERVATIONS, "# baseline: 0.3", "# baseline: -0.3", "baseline must be positive"),
+        (log(camera=PAIR), OBSERVATIONS, "# baseline: 0.3", "# baseline: -0.3", "baseline_m must be above 0"),
         (log(camera=FISHEYE), OBSERVATIONS, "# lens: equidistant", "# lens: radial-tangential", "expected 9 numbers for"),
     ],
 )  # fmt: skip

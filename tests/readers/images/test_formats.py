@@ -439,9 +439,9 @@ def test_part_of_a_recording(tmp_path):
 @pytest.mark.parametrize(
     ("numbers", "said"),
     [
-        ({"start_s": -1.0}, "start is -1 s"),
+        ({"start_s": -1.0}, "start_s must be at least 0"),
         ({"start_s": 2.0, "end_s": 2.0}, "end is 2 s: expected more than the start, 2 s"),
-        ({"every": 0}, "at least 1, got 0"),
+        ({"every": 0}, "every must be a whole number, at least 1"),
         ({"resize_px": 10_000}, "are not made larger"),
         ({"start_s": 60.0}, "no image is left from 60 s on: the recording is 0.067 s long"),
     ],
