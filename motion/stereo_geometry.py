@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbpf import gaussian
+from rbpf.arrays import RowByRow
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array, skew
 
@@ -62,7 +63,7 @@ class StereoCamera(Protocol):
 
 
 @dataclass(frozen=True)
-class Matches:
+class Matches(RowByRow):
     """Points seen in an earlier and a later stereo frame: pixels (K, 3) (u_left, v, u_right), covariances (K, 3, 3) px²."""
 
     camera: StereoCamera
@@ -97,14 +98,6 @@ class Matches:
                 raise InputError(f"{name} is no covariance of pixels: {error}") from error
             covs.append(np.ascontiguousarray(np.broadcast_to(cov, (*before.shape, 3))))
         return cls(camera, before, now, *covs)
-
-    def __len__(self) -> int:
-        return len(self.z_prev)
-
-    def rows(self, kept: np.ndarray) -> "Matches":
-        """Some of them, (K,) bool or indices."""
-        chosen = (array[kept] for array in (self.z_prev, self.z_now, self.cov_prev, self.cov_now))
-        return Matches(self.camera, *chosen)
 
     def plausible(self, gate: float) -> np.ndarray:
         """Which (K,) can be points in front of the camera: no disparity is below zero by a squared distance of `gate`."""

@@ -90,7 +90,7 @@ def estimate_motion(
             negative = f"{count - plausible.sum()} of {count} matches have a negative disparity"
             there = f"{negative}: are left and right swapped? {plausible.sum()} are left"
         return _failed(start, matches, f"{there}, {config.min_matches} are needed")
-    motion = consensus(matches.rows(plausible), start, config.gate, rng, config.ransac)
+    motion = consensus(matches.take(plausible), start, config.gate, rng, config.ransac)
     found, squared = _refined(matches, plausible, motion, start, config)
     others, left, last = list[MotionEstimate](), plausible, found
     while last.found:
@@ -98,7 +98,7 @@ def estimate_motion(
         left = left & (squared > WIDE * config.gate)
         if left.sum() < config.min_matches:
             break
-        far, inliers = matches.rows(left), np.zeros(len(matches), dtype=bool)
+        far, inliers = matches.take(left), np.zeros(len(matches), dtype=bool)
         motion = consensus(far, SE3.identity(), config.gate, rng, config.ransac)
         last, squared[left] = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
         inliers[np.flatnonzero(left)[last.inliers]] = True
@@ -154,7 +154,7 @@ def _refined(
         if agreeing.sum() < config.min_matches:
             agree = f"{agreeing.sum()} of {len(matches)} matches agree on a motion"
             return _failed(start, matches, f"{agree}, {config.min_matches} are needed"), squared
-        inliers, part = agreeing, matches.rows(agreeing)
+        inliers, part = agreeing, matches.take(agreeing)
         found = fit(part, motion, config)
         motion, iterations = found.x, iterations + found.iterations
         squared = _squared(matches, motion, config)

@@ -9,7 +9,8 @@ C components, p measurement, r noise rank.
 """
 
 import sys
-from typing import TYPE_CHECKING
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Self
 from typing import Annotated as Like
 
 import numpy as np
@@ -24,9 +25,26 @@ if TYPE_CHECKING or "jaxtyping" not in sys.modules:
 else:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Array", "Bool", "Float", "Int", "Like", "numbers"]
+__all__ = ["Array", "Bool", "Float", "Int", "Like", "RowByRow", "numbers"]
 
 Array = NDArray[np.float64]
+
+
+class RowByRow:
+    """A dataclass whose arrays have a row each for as many things; what is no array is of all of them."""
+
+    def __len__(self) -> int:
+        return len(next(iter(self._arrays().values())))
+
+    def take(self, rows: np.ndarray | slice) -> Self:
+        """Some of them, by number or by mask."""
+        whole: Any = self
+        chosen: Self = replace(whole, **{name: array[rows] for name, array in self._arrays().items()})
+        return chosen
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        whole: Any = self
+        return {item.name: part for item in fields(whole) if isinstance(part := getattr(self, item.name), np.ndarray)}
 
 
 def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from typing import Annotated, ClassVar, final
 
 import numpy as np
 
+from rbpf.arrays import RowByRow
 from rbpf.core.checkpoint import Kept, integers, numbers
 from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import NULL
@@ -43,19 +44,12 @@ class MatchLimits(Ranged):
 
 @final
 @dataclass(frozen=True)
-class DescriptorMatches:
+class DescriptorMatches(RowByRow):
     """Pairs of descriptors, each at most once on either side, in the order of the first set."""
 
     first: np.ndarray  #: (P,) rows of the first set.
     second: np.ndarray  #: (P,) rows of the second set.
     distance: np.ndarray  #: (P,) of the descriptors.
-
-    def __len__(self) -> int:
-        return self.first.size
-
-    def take(self, rows: np.ndarray) -> "DescriptorMatches":
-        """Some of them, by number or by mask."""
-        return DescriptorMatches(self.first[rows], self.second[rows], self.distance[rows])
 
 
 def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> DescriptorMatches:

@@ -6,6 +6,7 @@ from numbers import Integral
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import RowByRow
 from rbpf.core.checkpoint import elements, integers, numbers, require
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
@@ -16,7 +17,7 @@ _KNOWN = {"names": integers("M"), "positions": numbers("M", 3), "cov": numbers("
 
 
 @dataclass(frozen=True)
-class FeatureFrame:
+class FeatureFrame(RowByRow):
     """One image: which landmarks were seen, and where. It is checked by the `FeatureLog`, which knows its index."""
 
     stamp_ns: int  #: time of the image, integer nanoseconds.
@@ -28,13 +29,6 @@ class FeatureFrame:
     def cov(self) -> np.ndarray:
         """(K, p, p), as features of any kind have it."""
         return self.cov_z
-
-    def __len__(self) -> int:
-        return len(self.landmarks)
-
-    def take(self, rows: np.ndarray | slice) -> "FeatureFrame":
-        """Some of its features, by number or by mask."""
-        return FeatureFrame(self.stamp_ns, self.landmarks[rows], self.z[rows], self.cov_z[rows])
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,13 @@ the error of u_left and adds that of the disparity, σ_d. Both grow with the key
 Without the refinement both places have their own error, and cov = σ_p² I.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Annotated, final
 
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import RowByRow
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.ranges import Formerly, NotNegative, Positive, Range, Ranged, Ratio
@@ -59,7 +60,7 @@ def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
 
 @final
 @dataclass(frozen=True)
-class StereoFeatures:
+class StereoFeatures(RowByRow):
     """What a pair of images shows, of highest contrast first: the local landmarks {P^L, C^L, α, s, f} of S05 §III-B."""
 
     z: np.ndarray  #: (K, 3) pixels (u_left, v, u_right).
@@ -79,13 +80,6 @@ class StereoFeatures:
         jac = np.linalg.inv(rig.jacobian(points))  # Mathematics (stereo-slope)
         cov_points = gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2))
         return cls(z, cov, points, cov_points, scale, orientation, descriptors)
-
-    def __len__(self) -> int:
-        return self.z.shape[0]
-
-    def take(self, rows: np.ndarray) -> "StereoFeatures":
-        """Some of them, by number or by mask."""
-        return StereoFeatures(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 SWAPPED, FEWER = 20, 4  #: So many matches the wrong way round, and so many times fewer the right way, are no accident.

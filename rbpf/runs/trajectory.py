@@ -11,6 +11,7 @@ from typing import Literal, Self, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbpf.arrays import RowByRow
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.files import write_text
@@ -52,7 +53,7 @@ class Similarity:
 
 @final
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(RowByRow):
     """Poses in order of time; refused are shapes that do not fit, numbers that are not finite, time that runs backwards."""
 
     stamps_ns: NDArray[np.int64]  #: (T,) integer nanoseconds; a recording without times counts its steps.
@@ -76,9 +77,6 @@ class Trajectory:
         zero = np.zeros_like(theta)
         return cls(stamps_ns, SE3.from_ypr(np.stack([x, y, zero], axis=-1), theta, zero, zero))
 
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
     @property
     def positions(self) -> Array:
         """(T, 3) positions of the body in the world [m]."""
@@ -88,9 +86,6 @@ class Trajectory:
     def spread(self) -> float:
         """Root mean square distance of the positions from their centre [m]."""
         return float(np.sqrt(np.square(self.positions - self.positions.mean(axis=0)).sum(axis=1).mean()))
-
-    def at(self, rows: NDArray[np.intp]) -> "Trajectory":
-        return Trajectory(self.stamps_ns[rows], self.world_from_body[rows])
 
     def transformed(self, similarity: Similarity) -> "Trajectory":
         """The trajectory in the world that a similarity leads to."""
@@ -129,7 +124,7 @@ def associate(
     best_first = near[np.lexsort((difference[near], wanted[near]))]
     _, first = np.unique(wanted[best_first], return_index=True)
     rows = best_first[first]
-    return estimate.at(rows), reference.at(wanted[rows])
+    return estimate.take(rows), reference.take(wanted[rows])
 
 
 def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: bool = False) -> Similarity:

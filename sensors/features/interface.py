@@ -8,11 +8,12 @@ Pixels are (column, row), with the centre of the top-left one at (0, 0). Images 
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
-from typing import Self, final
+from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
+from rbpf.arrays import RowByRow
 from rbpf.errors import InputError
 
 #: Scale of a keypoint whose SIFT descriptor covers a window of 31 × 31 px; that of corners, which have none.
@@ -22,7 +23,7 @@ SHEET_PAD_PX = 6
 
 
 @dataclass(frozen=True)
-class Keypoints:
+class Keypoints(RowByRow):
     """Keypoints of an image, best first."""
 
     px: np.ndarray  #: (K, 2) pixel.
@@ -42,13 +43,6 @@ class Keypoints:
         count = px.shape[0]
         one_each = (np.broadcast_to(np.asarray(value, float), count) for value in (scale, orientation, score))
         return Keypoints(np.asarray(px, float), *one_each)
-
-    def __len__(self) -> int:
-        return self.px.shape[0]
-
-    def take(self, rows: np.ndarray) -> Self:
-        """Some of them, by number or by mask."""
-        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 @final

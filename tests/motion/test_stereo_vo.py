@@ -124,7 +124,7 @@ class TestTooLittle:
 
     @pytest.mark.parametrize("count", [0, 1, 7])
     def test_too_few_matches(self, count):
-        matches = simulate(ROOM, 20, np.random.default_rng(0)).matches.rows(np.arange(count))
+        matches = simulate(ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(count))
         self.refused(matches, f"{count} matches are there, 8 are needed")
 
     def test_left_and_right_swapped(self):
@@ -255,7 +255,7 @@ class TestVisualOdometry:
         assert motion.note == found.failure == ""
 
     def test_without_a_motion_there_is_the_prior(self):
-        none = simulate(ROOM, 20, np.random.default_rng(0)).matches.rows(np.arange(0))
+        none = simulate(ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(0))
         found = VisualOdometry(prior=MotionPrior(0.5, 2.0)).candidates(
             none, np.full(6, 0.3), self.DT, np.random.default_rng(0)
         )

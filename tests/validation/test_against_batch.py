@@ -272,7 +272,7 @@ def test_the_batch_is_moved_as_the_filter_is(moved_run):
     """The truth was moved onto the filter and the batch was not, so that the wrong one looked right."""
     record, truth = load(moved_run), load(moved_run).truth
     off = replace(AWAY, scale=1.0)
-    batch = record.trajectory.at(truth.rows)
+    batch = record.trajectory.take(truth.rows)
     batch = replace(batch, world_from_body=off.transform_poses(truth.poses))
     write_tum(moved_run / "batch.tum", batch)
     in_another_world(moved_run)

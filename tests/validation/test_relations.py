@@ -65,7 +65,7 @@ def test_relations_outside_of_the_path_are_told(tmp_path):
     assert len(errors.translations) == 1
     assert "misses 1 relations of 2 (the others end outside of its time) by 0.000 ± 0.000 m" in errors.sentence(2)
     with pytest.raises(InputError, match="None of the relations has both ends within the path"):
-        relation_errors(PATH.at(np.array([3, 4])), relations)
+        relation_errors(PATH.take(np.array([3, 4])), relations)
 
 
 def test_a_run_is_scored_by_relations_and_by_another_path(tmp_path, capsys, plain_pictures):

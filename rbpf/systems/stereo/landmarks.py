@@ -11,7 +11,7 @@ they follow each particle's path, without a say in the particles' weights.
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, final
@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import RowByRow
 from rbpf.core.checkpoint import Kept, integers, read
 from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Particles, Prior
@@ -200,7 +201,7 @@ def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedSt
 
 
 @dataclass(frozen=True)
-class Expected:
+class Expected(RowByRow):
     """K landmarks in (u_left, v, u_right), px."""
 
     mean: np.ndarray  #: (K, 3) of the particles.
@@ -212,10 +213,6 @@ class Expected:
     def deviation(self) -> np.ndarray:
         """(K,) largest standard deviation along an axis."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2).max(axis=1))
-
-    def take(self, rows: np.ndarray) -> "Expected":
-        """Some of them."""
-        return Expected(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 @final

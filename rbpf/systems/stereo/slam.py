@@ -511,7 +511,7 @@ class StereoSlam(System):
         cross, noise = None, None
         if not self.config.odometry.independent:
             # Of the error of this step and the last one, which the pixels of the pair between them have caused both.
-            used = matches.rows(motion.inliers)
+            used = matches.take(motion.inliers)
             earlier, later = pixel_gains(used, motion.odometry, self.config.odometry.estimate)
             if before.noise.size:
                 shared = before.noise[rows[0][motion.inliers]]
