@@ -5,15 +5,14 @@ from numbers import Integral
 
 import numpy as np
 
-from rbpf import gaussian
 from rbpf.arrays import RowByRow
-from rbpf.core.checkpoint import elements, integers, numbers, require
+from rbpf.core.checkpoint import covariances, elements, integers, numbers, require, stamps
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
-_FRAME = {"landmarks": integers("K"), "z": numbers("K", "p"), "cov_z": numbers("K", "p", "p")}
-_KNOWN = {"names": integers("M"), "positions": numbers("M", 3), "cov": numbers("M", 3, 3)}
+_FRAME = {"landmarks": integers("K", distinct=True), "z": numbers("K", "p"), "cov_z": covariances("K", "p", "p")}
+_KNOWN = {"names": integers("M", distinct=True), "positions": numbers("M", 3), "cov": covariances("M", 3, 3)}
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,7 @@ class KnownPoints:
     cov: np.ndarray  #: (M, 3, 3) their covariance, m².
 
     def __post_init__(self) -> None:
-        what = "the known points"
-        require(what, vars(self), _KNOWN)
-        _check_names(what, self.names)
-        _check_covariances(what, "cov", self.cov)
+        require("the known points", vars(self), _KNOWN)
 
 
 @dataclass(frozen=True)
@@ -65,9 +61,7 @@ class Truth:
 
     def __post_init__(self) -> None:
         what, planar = "the ground truth", self.poses.shape[1:] == (3,)
-        require(what, vars(self), {"stamps_ns": integers("T"), "poses": elements(SE2 if planar else SE3, "T")})
-        if (late := np.flatnonzero(np.diff(self.stamps_ns) < 0)).size:
-            raise InputError(f"{what}: stamp {late[0] + 1} is before the one it follows, sort the poses by time")
+        require(what, vars(self), {"stamps_ns": stamps("T"), "poses": elements(SE2 if planar else SE3, "T")})
         places = {f"landmark {name}": position for name, position in self.landmarks.items()}
         require(what, places, dict.fromkeys(places, numbers("" if planar else 3)))
 
@@ -95,8 +89,6 @@ class FeatureLog:
             if not isinstance(stamp_ns, Integral):
                 raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
             require(where, vars(frame), _FRAME, p=self.camera.dim)
-            _check_names(where, frame.landmarks)
-            _check_covariances(where, "cov_z", frame.cov_z)
             before = self.frames[max(index - 1, 0)].stamp_ns
             if frame.stamp_ns < before:
                 order = f"at {frame.stamp_ns} ns is before the frame it follows ({before} ns)"
@@ -106,18 +98,3 @@ class FeatureLog:
     def stamps_ns(self) -> np.ndarray:
         """(T,) int64 times of the frames."""
         return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
-
-
-def _check_names(what: str, names: np.ndarray) -> None:
-    """Refuses names that come twice."""
-    unique, counts = np.unique(names, return_counts=True)
-    if (counts > 1).any():
-        raise InputError(f"{what}: landmark {unique[np.argmax(counts > 1)]} comes twice, keep one of the two")
-
-
-def _check_covariances(what: str, name: str, cov: np.ndarray) -> None:
-    """Refuses all but symmetric positive semi-definite matrices."""
-    try:
-        gaussian.psd_factor(cov)
-    except InputError as error:
-        raise InputError(f"{what}: {name} is no covariance: {error}") from error

@@ -23,6 +23,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3, LieGroup
 
@@ -208,6 +209,9 @@ class Entry:
     values: Literal["finite", "log", "any"] = "finite"  #: "finite"; "log" also takes −∞; "any" also +∞ and NaN.
     space: LieGroup | None = None  #: group whose elements the last axis holds; None for plain numbers.
     ascending: bool = False  #: each value is above the one before.
+    ordered: bool = False  #: no value is below the one before, as of times.
+    distinct: bool = False  #: no value comes twice, as of names.
+    covariance: bool = False  #: the last two axes are those of covariances, which may be singular.
     refers: str | None = None  #: name of an array of the same file that holds all of its values.
 
     def empty(self, **sizes: int) -> np.ndarray:
@@ -226,6 +230,10 @@ def entry(*shape: int | str, **options: Any) -> Entry:
 #: Arrays of an `Entry`'s shape and options: numbers, whole numbers, truth values, text, grey levels of images.
 numbers, integers = partial(entry, dtype=np.float64), partial(entry, dtype=np.int64)
 truths, text, grey = (partial(entry, dtype=kind) for kind in (np.bool_, np.str_, np.uint8))
+
+
+#: Times, and covariances whose shape has the size of both axes.
+stamps, covariances = partial(integers, ordered=True), partial(numbers, covariance=True)
 
 
 def elements(space: LieGroup, *shape: int | str) -> Entry:
@@ -326,6 +334,16 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
         _require(array >= entry.least, array, name, f"numbers of at least {entry.least:g}")
     if entry.ascending:
         _require(np.diff(array, prepend=array[:1] - 1) > 0, array, name, "ascending numbers")
+    if entry.ordered:
+        _require(np.diff(array, prepend=array[:1]) >= 0, array, name, "numbers in order")
+    if entry.distinct:
+        is_first = np.isin(np.arange(array.size), np.unique(array, return_index=True)[1])
+        _require(is_first, array, name, "numbers that come once")
+    if entry.covariance:
+        try:
+            gaussian.psd_factor(array)
+        except InputError as error:
+            raise InputError(f"the array {name} must hold covariances: {error}") from error
     if entry.refers is not None:
         held = np.isin(array, arrays.get(entry.refers, array[:0]))
         _require(held, array, name, f"what {entry.refers} holds")

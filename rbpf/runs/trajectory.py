@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbpf.arrays import RowByRow
+from rbpf.core.checkpoint import numbers, require, stamps
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.files import write_text
@@ -60,15 +61,7 @@ class Trajectory(RowByRow):
     world_from_body: Array  #: (T, 7) poses [qx, qy, qz, qw, tx, ty, tz] with unit quaternions.
 
     def __post_init__(self) -> None:
-        if self.world_from_body.shape != (*self.stamps_ns.shape, 7) or self.stamps_ns.ndim != 1:
-            shapes = f"{self.stamps_ns.shape} and {self.world_from_body.shape}"
-            raise InputError(f"Expected (T,) stamps and (T, 7) poses of a trajectory, found {shapes}.")
-        if not np.isfinite(self.world_from_body).all():
-            row = int(np.argmin(np.isfinite(self.world_from_body).all(1)))
-            raise InputError(f"Expected finite poses in a trajectory, found another in row {row} (from 0).")
-        if (np.diff(self.stamps_ns) < 0).any():
-            row = int(np.argmax(np.diff(self.stamps_ns) < 0)) + 1
-            raise InputError(f"Expected a trajectory in order of time, row {row} (from 0) is before the last one.")
+        require("a trajectory", vars(self), {"stamps_ns": stamps("T"), "world_from_body": numbers("T", 7)})
 
     @classmethod
     def from_planar(cls, stamps_ns: NDArray[np.int64], world_from_body: ArrayLike) -> Self:

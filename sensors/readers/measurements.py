@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf.core.checkpoint import elements, integers, numbers, require
+from rbpf.core.checkpoint import covariances, elements, integers, numbers, require, stamps
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, SE3Group
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
@@ -53,22 +53,15 @@ class Measurements:
         schema = {
             "robot_from_sensor": poses(),
             "start": poses(),
-            "stamps_ns": integers("T"),
+            "stamps_ns": stamps("T"),
             "deltas": poses("moves"),
-            "covs": numbers("moves", dim, dim),
+            "covs": covariances("moves", dim, dim),
             "steps": integers("K", least=0, below="T"),
             "landmarks": integers("K"),
             "z": numbers("K", point),
-            "cov_z": numbers("K", point, point),
+            "cov_z": covariances("K", point, point),
         }
         require(self.recording, vars(self), schema, moves=max(len(self.stamps_ns) - 1, 0))
-        if (np.diff(self.stamps_ns) < 0).any():
-            raise InputError("Expected the stamps of the steps in order of time.")
-        for name in ("covs", "cov_z"):
-            valid = are_covariances(getattr(self, name))
-            if not valid.all():
-                row = int(np.argmin(valid))
-                raise InputError(f"Expected covariances in {name}, found another matrix in row {row} (from 0).")
 
     def model(self) -> RangeBearing | RelativePosition:
         """The observation model, the same one that the filter uses."""

@@ -8,6 +8,7 @@ from typing import Self, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import require, stamps
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import Truth
@@ -41,7 +42,7 @@ class ImageSequence:
     """A recording of a camera or of a rectified stereo pair.
 
     Nothing of it but its first image is decoded before `frames` is called. Raises InputError: the stamps are no whole
-    numbers, or one is before the one it follows; the camera of a pair is distorted, or its baseline is not positive.
+    numbers in order; the camera of a pair is distorted, or its baseline is not positive.
     """
 
     name: str  #: short name of the recording.
@@ -58,11 +59,7 @@ class ImageSequence:
         """A sequence may be made by hand."""
         if self.baseline_m is not None:
             RectifiedStereo(self.camera, self.baseline_m)
-        stamps = np.asarray(self.stamps_ns)
-        if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
-            raise InputError(f"{self.name}: stamps_ns must be (T,) whole numbers, got {stamps.shape} {stamps.dtype}")
-        if (late := np.flatnonzero(np.diff(stamps) < 0)).size:
-            raise InputError(f"{self.name}: the stamp of image {late[0] + 1} is before the one it follows")
+        require(self.name, vars(self), {"stamps_ns": stamps("T")})
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
