@@ -1,6 +1,7 @@
 """What is tried of motion and observation models, landmarks, likelihoods, sensors and what is marginalised."""
 
 from functools import partial
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def motion_checks(model: models.MotionModel, space: LieGroup, rng: Generator, ex
     name, states = named(model.transition), example.states(space, rng)
 
     def transition(state: np.ndarray) -> Any:
-        return called(model.transition, state, example.control, example.dt)
+        return called(model.transition, state, example.control, example.dt, gives=[models.Transition])
 
     def shapes() -> None:
         nonlocal states
@@ -64,7 +65,6 @@ def motion_checks(model: models.MotionModel, space: LieGroup, rng: Generator, ex
             require_close(what, first, space.normalise(first), 1e-9)
             states = first
         n, d, m, found = states.shape[0], space.dim, 0, transition(states)
-        require_type(name, found, models.Transition)
         there = [part is not None for part in (found.coupling, found.dynamics, found.drift)]
         require(
             all(there) or not any(there), f"{name} must give coupling, dynamics and drift together, or none of them"
@@ -159,9 +159,7 @@ def check_visible(model: models.ObservationModel, scene: Scene) -> None:
 
 def check_jacobians(model: models.ObservationModel, scene: Scene) -> None:
     """Analytic derivatives are the numeric ones."""
-    analytic = called(model.jacobians, *scene.args)
-    name = named(model.jacobians)
-    require_type(name, analytic, models.Jacobians, type(None))
+    name, analytic = named(model.jacobians), called(model.jacobians, *scene.args, gives=[models.Jacobians, NoneType])
     if analytic is None:
         return
     for block, expected in numeric_jacobians(model, scene.space, *scene.args)._asdict().items():
@@ -180,7 +178,7 @@ def check_jacobians(model: models.ObservationModel, scene: Scene) -> None:
 def check_kernel(model: models.ObservationModel, scene: Scene) -> None:
     """The fused kernel is NumPy's twin: innovation and Jacobians of a block of particles, full and partly filled."""
     fused, name = model.kernel(), named(model.kernel)
-    require_type(name, fused, models.FusedKernel, type(None))
+    require_type(name, fused, models.FusedKernel, NoneType)
     if fused is None or scene.landmark is None:
         return
     plain = isinstance(fused.params, np.ndarray) and fused.params.dtype.kind in "fiub"
@@ -252,8 +250,7 @@ def check_initialise(model: models.ObservationModel, scene: Scene, landmark: mod
         return
     name, z = named(model.initialise), model.predict(*scene.args)[0]
     cov = np.repeat(STD**2 * np.eye(model.dim)[None], z.shape[0], axis=0)
-    records = called(model.initialise, scene.state[:, 0], z, cov)
-    require_type(name, records, models.Records)
+    records = called(model.initialise, scene.state[:, 0], z, cov, gives=[models.Records])
     lead = (scene.state.shape[0], scene.landmark.shape[1])
     components, dim = 1 if landmark is None else landmark.components, scene.landmark.shape[-1]
     inner = lead if components == 1 else (*lead, components)
@@ -310,8 +307,7 @@ def landmark_checks(landmark: models.Landmark, space: LieGroup | None, rng: Gene
 
     def promotion() -> None:
         records, name = tried(), named(landmark.promote)
-        promoted, lead = called(landmark.promote, records), records.mean.shape[:2]
-        require_type(name, promoted, models.Records)
+        promoted, lead = called(landmark.promote, records, gives=[models.Records]), records.mean.shape[:2]
         require_shape(f"{name}: mean", promoted.mean, (*lead, 2), (*lead, 3))
         size = promoted.mean.shape[-1]
         require_shape(f"{name}: cov", promoted.cov, (*lead, size, size))
@@ -431,15 +427,12 @@ def conditional_checks(part: models.Conditional, space: LieGroup, rng: Generator
 
     def predicted(state: np.ndarray) -> Prior:
         transition = example.transition or models.Transition(state, np.zeros((1, d, 1)))
-        prior = called(part.predict, transition, space, example.dt)
-        require_type(named(part.predict), prior, Prior, type(None))
+        prior = called(part.predict, transition, space, example.dt, gives=[Prior, NoneType])
         return prior or Prior(space, transition.mean, np.zeros((1, d)), transition.noise_factor[:, :d])
 
-    def corrected(state: np.ndarray) -> models.LogDensities:
-        prior = predicted(state)
-        found = called(part.correct, state, space.local(prior.base, state), groups, repeat=False)
-        require_type(named(part.correct), found, models.LogDensities)
-        return found
+    def corrected(state: np.ndarray) -> Any:
+        moved = space.local(predicted(state).base, state)
+        return called(part.correct, state, moved, groups, repeat=False, gives=[models.LogDensities])
 
     def life() -> None:
         require(
@@ -452,8 +445,7 @@ def conditional_checks(part: models.Conditional, space: LieGroup, rng: Generator
         unchanged(before, f"{named(part.predict)} changes what is held: a step may be looked at and not be taken")
         name, found = named(part.information), Information.zeros(n, d)
         if groups:
-            found = called(part.information, states, groups, prior)
-        require_type(name, found, Information)
+            found = called(part.information, states, groups, prior, gives=[Information])
         for block, shape in (("info", (n, d, d)), ("vector", (n, d)), *((other, (n,)) for other in SUMMED[2:])):
             require_shape(f"{name}: {block}", getattr(found, block), shape)
         unchanged(before, f"{name} changes what is held: a proposal may linearise several times, or not at all")

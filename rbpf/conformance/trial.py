@@ -152,8 +152,11 @@ def run(checks: Sequence[Check]) -> list[str]:
     return list(dict.fromkeys(findings))
 
 
-def called(method: Callable[..., Any], *args: Any, repeat: bool = True) -> Any:
-    """What a method returns, after it was seen to return the same twice and to leave its arguments alone."""
+def called(method: Callable[..., Any], *args: Any, repeat: bool = True, gives: Sequence[type] = ()) -> Any:
+    """What a method returns, after it was seen to return the same twice and to leave its arguments alone.
+
+    If types are given, it must be of one of these.
+    """
     name, given = named(method), [np.copy(arg) for arg in args if isinstance(arg, np.ndarray)]
     try:
         first = method(*args)
@@ -168,6 +171,8 @@ def called(method: Callable[..., Any], *args: Any, repeat: bool = True) -> Any:
     pairs = zip(_arrays_in(first), _arrays_in(second), strict=False)
     alike = all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
     require(alike, f"{name} returns different numbers for the same arguments: it must not draw or count")
+    if gives:
+        require_type(name, first, *gives)
     return first
 
 
