@@ -53,6 +53,10 @@ class Picture:
     cell_m: float
     corner: np.ndarray  #: (2,) x and y of the outer corner of cell [0, 0].
 
+    def walls(self) -> np.ndarray:
+        """(M, 2) the middles of the cells in which something is, m."""
+        return self.corner + self.cell_m * (np.argwhere(self.log_odds > 0.0)[:, ::-1] + 0.5)
+
 
 @final
 class GridMap(Conditional):

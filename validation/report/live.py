@@ -167,9 +167,7 @@ def _places(run: Run) -> np.ndarray:
     """(M, 3) of the map as it is now: of a scanner the middles of walls' cells, else the points of known depth."""
     if not isinstance(run.system, LaserSlam):
         return run.system.map().points().in_space()[0]
-    picture = run.system.picture()
-    walls = picture.corner + picture.cell_m * (np.argwhere(picture.log_odds > 0.0)[:, ::-1] + 0.5)
-    return np.pad(walls, ((0, 0), (0, 1)))
+    return np.pad(run.system.picture().walls(), ((0, 0), (0, 1)))
 
 
 def _lens(system: Any) -> Any:

@@ -246,9 +246,7 @@ def scene(found: RunFolder, world: World) -> str:
     mean, cov = landmarks.points().in_space()
     has_grid = (found.folder / GRID).is_file()
     if has_grid:
-        rows, columns = np.nonzero(found.grid.log_odds > 0.0)
-        cells = found.grid.corner + found.grid.cell_m * (np.column_stack([columns, rows]) + 0.5)
-        mean = motion.transform(np.pad(_some(cells, CELLS), ((0, 0), (0, 1))))
+        mean = motion.transform(np.pad(_some(found.grid.walls(), CELLS), ((0, 0), (0, 1))))
     near, low, high = near_box(mean, at)
     size = max(float((high - low).max()), 1e-3)
     traces = [_line(at, "path", "filter", 4)]
