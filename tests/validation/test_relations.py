@@ -11,7 +11,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.runs.results import load
 from rbpf.runs.trajectory import Trajectory, in_space, read_tum, write_tum
 from rbpf.sensors.readers import read_laser_log
-from rbpf.validation.metrics.relations import read_relations, relation_errors
+from rbpf.validation.metrics.relations import entries, read_relations, relation_errors, sentence
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 SECONDS = np.arange(5)
@@ -41,7 +41,7 @@ def test_a_path_misses_its_own_relations_by_nothing_and_others_by_how_they_diffe
     wrong = SE2.compose(SE2.between(PLANAR[2], PLANAR[4]), SE2.inverse(np.array([0.1, 0.3, 0.4])))
     errors = relation_errors(PATH, read_relations(written(tmp_path, *own[:2], relation(2, 4, wrong))))
     np.testing.assert_allclose(errors.translations, [0, 0, 0.5], atol=1e-12)
-    found = errors.entries()
+    found = entries(errors)
     assert found["relations"] == 3
     assert found["relations_translation_mean_m"] == pytest.approx(0.5 / 3)
     assert found["relations_rotation_std_deg"] == pytest.approx(np.std([0, 0, np.degrees(0.1)]))
@@ -63,7 +63,7 @@ def test_relations_outside_of_the_path_are_told(tmp_path):
     relations = read_relations(written(tmp_path, relation(0, 1, [0.5, 1, 0]), relation(1, 9, [0, 0, 0])))
     errors = relation_errors(PATH, relations)
     assert len(errors.translations) == 1
-    assert "misses 1 relations of 2 (the others end outside of its time) by 0.000 ± 0.000 m" in errors.sentence(2)
+    assert "misses 1 relations of 2 (the others end outside of its time) by 0.000 ± 0.000 m" in sentence(errors, 2)
     with pytest.raises(InputError, match="None of the relations has both ends within the path"):
         relation_errors(PATH.take(np.array([3, 4])), relations)
 
@@ -101,11 +101,11 @@ def test_figures_of_a_known_path_and_of_odometry(data_dir):
     """The path that GMapping found on this log, and the wheels alone."""
     folder = data_dir / "laser_intel"
     relations = read_relations(folder / "intel.relations")
-    found = relation_errors(read_tum(folder / "gmapping.tum"), relations).entries()
+    found = entries(relation_errors(read_tum(folder / "gmapping.tum"), relations))
     assert found["relations"] == 2984
     assert found["relations_translation_mean_m"] == pytest.approx(0.126, abs=5e-4)
     assert found["relations_translation_std_m"] == pytest.approx(0.118, abs=5e-4)
     assert found["relations_rotation_mean_deg"] == pytest.approx(4.1, abs=0.05)
     log = read_laser_log(folder / "intel.clf")
-    found = relation_errors(in_space(log.stamps_ns, log.odometry), relations).entries()
+    found = entries(relation_errors(in_space(log.stamps_ns, log.odometry), relations))
     assert found["relations_translation_mean_m"] == pytest.approx(7.43, abs=0.01)

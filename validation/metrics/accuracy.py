@@ -6,7 +6,7 @@ The definitions are those of J. Sturm et al., "A benchmark for the evaluation of
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,10 +49,17 @@ class AbsoluteError:
 @final
 @dataclass(frozen=True)
 class RelativeError:
-    """Differences between estimated and true motions from each of T poses to the next."""
+    """Differences between S estimated and true motions."""
 
-    translations: Array  #: (T - 1,) [m].
-    rotations_deg: Array  #: (T - 1,) angles in [0, 180].
+    translations: Array  #: (S,) [m].
+    rotations_deg: Array  #: (S,) angles in [0, 180].
+
+    @classmethod
+    def of(cls, true: Array, estimated: Array) -> Self:
+        """Of motions (S, 7), each as a pose seen from another."""
+        error = SE3.between(true, estimated)
+        turned = np.linalg.norm(SE3.log(error)[:, :3], axis=-1)
+        return cls(np.linalg.norm(SE3.translation(error), axis=-1), np.degrees(turned))
 
     @property
     def translation_rmse(self) -> float:
@@ -90,9 +97,7 @@ def rpe(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Simi
         raise InputError("Expected a trajectory of two poses or more, found one: it has no motion.")
     moved = estimate.transformed(fit(alignment, estimate.positions, reference.positions))
     motions = (SE3.between(p.world_from_body[:-1], p.world_from_body[1:]) for p in (reference, moved))
-    error = SE3.between(*motions)
-    turned = np.linalg.norm(SE3.log(error)[:, :3], axis=-1)
-    return RelativeError(np.linalg.norm(SE3.translation(error), axis=-1), np.degrees(turned))
+    return RelativeError.of(*motions)
 
 
 def landmark_errors(

@@ -12,7 +12,6 @@ with the pose at t2 seen from that at t1 (Unix seconds, metres, radians). A path
 two, the position follows the line and the rotation the shortest turn.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.trajectory import MAX_DIFFERENCE_NS, Trajectory
 from rbpf.sensors.readers.text import parse_time, read_columns
+from rbpf.validation.metrics.accuracy import RelativeError
 from rbpf.validation.metrics.scores import ODOMETRY
 
 #: Times (R, 2) of both ends, and poses (R, 7) at the second time, seen from that at the first.
@@ -31,30 +31,23 @@ _COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
 PATHS = {"": "trajectory.tum", "final_": "posterior.tum", "odometry_": ODOMETRY}
 
 
-@dataclass(frozen=True)
-class RelationErrors:
-    """Errors of the relations whose times lie within a path."""
+def entries(errors: RelativeError) -> dict[str, float]:
+    """Number, means and standard deviations, by names for summary.json."""
+    return {
+        "relations": len(errors.translations),
+        "relations_translation_mean_m": float(errors.translations.mean()),
+        "relations_translation_std_m": float(errors.translations.std()),
+        "relations_rotation_mean_deg": float(errors.rotations_deg.mean()),
+        "relations_rotation_std_deg": float(errors.rotations_deg.std()),
+    }
 
-    translations: Array  #: (S,) [m].
-    rotations_deg: Array  #: (S,) in [0, 180].
 
-    def entries(self) -> dict[str, float]:
-        """Number, means and standard deviations, by names for summary.json."""
-        return {
-            "relations": len(self.translations),
-            "relations_translation_mean_m": float(self.translations.mean()),
-            "relations_translation_std_m": float(self.translations.std()),
-            "relations_rotation_mean_deg": float(self.rotations_deg.mean()),
-            "relations_rotation_std_deg": float(self.rotations_deg.std()),
-        }
-
-    def sentence(self, total: int) -> str:
-        """What was found, of so many relations in the file."""
-        found = self.entries()
-        part = "" if found["relations"] == total else f" of {total} (the others end outside of its time)"
-        metres = f"{found['relations_translation_mean_m']:.3f} ± {found['relations_translation_std_m']:.3f} m"
-        degrees = f"{found['relations_rotation_mean_deg']:.1f} ± {found['relations_rotation_std_deg']:.1f} degrees"
-        return f"The path misses {found['relations']} relations{part} by {metres} and {degrees} (mean ± standard deviation)."
+def sentence(errors: RelativeError, total: int) -> str:
+    """What was found, of so many relations in the file."""
+    count, *figures = entries(errors).values()
+    part = "" if count == total else f" of {total} (the others end outside of its time)"
+    misses = "{:.3f} ± {:.3f} m and {:.1f} ± {:.1f} degrees".format(*figures)
+    return f"The path misses {count} relations{part} by {misses} (mean ± standard deviation)."
 
 
 def read_relations(path: Path) -> Relations:
@@ -66,8 +59,8 @@ def read_relations(path: Path) -> Relations:
     return np.array(ends, dtype=np.int64), poses
 
 
-def relation_errors(estimate: Trajectory, relations: Relations) -> RelationErrors:
-    """Errors of a path by relations, of which one must have both ends within the path."""
+def relation_errors(estimate: Trajectory, relations: Relations) -> RelativeError:
+    """Errors of a path by the relations that have both ends within it, of which there must be one."""
     if not len(estimate):
         raise InputError("Expected a path with poses to score by relations, found an empty one.")
     first, last = estimate.stamps_ns[[0, -1]] + [-MAX_DIFFERENCE_NS, MAX_DIFFERENCE_NS]
@@ -76,9 +69,7 @@ def relation_errors(estimate: Trajectory, relations: Relations) -> RelationError
     if not inside.any():
         raise InputError("None of the relations has both ends within the path; expected times of the same clock.")
     ends = [_at(estimate, column) for column in stamps_ns[inside].T]
-    error = SE3.between(first_from_second[inside], SE3.between(*ends))
-    turned = np.linalg.norm(SE3.log(error)[:, :3], axis=1)
-    return RelationErrors(np.linalg.norm(SE3.translation(error), axis=1), np.degrees(turned))
+    return RelativeError.of(first_from_second[inside], SE3.between(*ends))
 
 
 def _at(path: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:

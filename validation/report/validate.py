@@ -58,14 +58,14 @@ def _camera_colmap(record: RunFolder) -> Comparison:
 
 def _relations(record: RunFolder, file: Path) -> Comparison:
     """A run's paths by the relations of a file; the figures go into its summary.json, too."""
-    from rbpf.validation.metrics.relations import PATHS, read_relations, relation_errors
+    from rbpf.validation.metrics import relations as relative
 
-    relations = read_relations(file)
-    paths = {prefix: record.folder / name for prefix, name in PATHS.items() if (record.folder / name).is_file()}
-    scores = {prefix: relation_errors(read_tum(path), relations) for prefix, path in paths.items()}
-    figures = {prefix + name: value for prefix, errors in scores.items() for name, value in errors.entries().items()}
+    known = relative.read_relations(file)
+    paths = {prefix: record.folder / name for prefix, name in relative.PATHS.items()}
+    scores = {p: relative.relation_errors(read_tum(path), known) for p, path in paths.items() if path.is_file()}
+    figures = {prefix + name: value for prefix, one in scores.items() for name, value in relative.entries(one).items()}
     write_summary(record.folder, dict(record.summary) | figures)
-    said = scores.get("final_", scores[""]).sentence(len(relations[0]))
+    said = relative.sentence(scores.get("final_", scores[""]), len(known[0]))
     return Comparison("relations", said, figures)
 
 
