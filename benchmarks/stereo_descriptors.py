@@ -19,7 +19,7 @@ from benchmarks.plain_odometry import path
 from rbpf.core.models import NULL
 from rbpf.lie import SE3
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors import DescriptorStore, MatchLimits, gate_pairs, match_all, match_pairs
+from rbpf.sensors.descriptors import MatchLimits, distances, gate_pairs, match_all, match_pairs, two_best
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.sift import SiftConfig, descriptors_from_histograms
 from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
@@ -28,6 +28,7 @@ from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 
 NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
 SLACK_PX, RIGHT = 2.0, 16.3
+ELSEWHERE = -2  #: In place of the name of a landmark that is not of the recording.
 REACH_PX = 5.0
 """Standard deviation of the prediction that gates a map."""
 
@@ -111,39 +112,34 @@ class Tally:
 def with_map(recording: Recording, gated: bool, others: np.ndarray) -> Tally:
     """Goes through a recording with a map that grows as S05 has it, beside descriptors (D, d) of elsewhere."""
     length, tally = recording.features[0].descriptors.shape[1], Tally()
-    store, limits = DescriptorStore(length), MatchLimits()
-    store.add(np.arange(len(others)), others)
-    camera = recording.rig.camera
-    manager = LandmarkManager(NewLandmarkConfig(), (camera.width, camera.height))
+    limits, camera = MatchLimits(), recording.rig.camera
+    manager = LandmarkManager(NewLandmarkConfig(), (camera.width, camera.height), length)
     points, covs = np.zeros((0, 3)), np.zeros((0, 3, 3))
     for frame, features in enumerate(recording.features):
         mean, cov = recording.predicted(points, covs, frame)
         seen = manager.names[np.isfinite(mean[manager.names]).all(axis=1)]
         reach = cov[seen] + REACH_PX**2 * np.eye(3)
+        held = np.concatenate([others, manager.descriptors])
         start = time.thread_time()
         if gated:
             k, m = gate_pairs(features.z, features.cov, mean[seen], reach, 11.3)
-            pairs = k, store.rows(seen + len(others))[m]
-            found = match_pairs(features.descriptors, store.descriptors, pairs, limits)
-            ids = np.full(len(features), NULL, dtype=np.int64)
-            ids[found.first] = store.ids[found.second]
+            found = match_pairs(features.descriptors, held, (k, len(others) + manager.rows(seen)[m]), limits)
         else:
-            ids = store.match(features.descriptors, limits)
+            found = match_all(features.descriptors, held, limits)
         tally.seconds += time.thread_time() - start
-        rows = np.flatnonzero(ids >= len(others))
-        names = ids[rows] - len(others)
+        ids = np.full(len(features), NULL, dtype=np.int64)
+        ids[found.first] = np.append(np.full(len(others), ELSEWHERE), manager.names)[found.second]
+        rows = np.flatnonzero(ids >= 0)
+        names = ids[rows]
         tally.frames += 1
         tally.found += int((ids != NULL).sum())
         tally.right += int(agree(mean[names], cov[names], features.z[rows], features.cov[rows]).sum())
-        store.remove(manager.observe(names) + len(others))
+        manager.observe(names)
         free = np.flatnonzero(ids == NULL)
-        new = manager.select(
-            features.z[free, :2],
-            features.descriptors[free],
-            store.nearest(features.descriptors[free]),
-            features.z[rows, :2],
-        )
-        store.add(manager.add(new.size) + len(others), features.descriptors[free[new]])
+        descriptors, px = features.descriptors[free], features.z[:, :2]
+        nearest = distances(two_best(descriptors, np.concatenate([others, manager.descriptors]))[0])
+        new = manager.select(px[free], descriptors, nearest, px[rows])
+        manager.add(descriptors[new])
         added = recording.in_world(frame, free[new])
         points, covs = np.concatenate([points, added[0]]), np.concatenate([covs, added[1]])
     return tally

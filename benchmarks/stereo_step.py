@@ -54,10 +54,9 @@ class Drive:
     def _fill(self, landmarks: int) -> None:
         """Every landmark in every particle's map, with counters of one often seen."""
         sensor, n = self.sensor, self.config.particles
-        names = sensor.manager.add(landmarks)
+        names = sensor.manager.add(self.descriptors)
         table = np.column_stack([names, np.full(landmarks, 5), np.zeros(landmarks, dtype=np.int64)])
-        sensor.manager.restore({"key_manager/table": table, "key_manager/counters": np.array([0, landmarks])})
-        sensor.store.add(names, self.descriptors)
+        sensor.manager.restore(sensor.manager.arrays() | {"key_manager/table": table})
         sensor.places.put(names, self.places, SE3.identity())
         held = self.filter.belief().map
         for part in np.array_split(names, max(1, landmarks // 500)):

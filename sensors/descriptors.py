@@ -9,15 +9,12 @@ by one matrix product, or one by one with those of the landmarks that a predicti
 """
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, final
+from typing import Annotated, final
 
 import numpy as np
 
 from rbpf.arrays import RowByRow
-from rbpf.core.checkpoint import Kept, integers, numbers
 from rbpf.core.likelihoods import squared_mahalanobis
-from rbpf.core.models import NULL
-from rbpf.errors import InputError
 from rbpf.ranges import Range, Ranged
 
 BLOCK = 4096  #: Columns of a product that are looked at together: a block of a few hundred rows stays in the cache.
@@ -162,63 +159,3 @@ def gate_pairs(
         k, m = k[near], m[near]
     near = squared_mahalanobis(z[k] - mean[m], noise[k] + cov[m]) <= gate
     return k[near], held[m[near]]
-
-
-@final
-class DescriptorStore(Kept):
-    """Descriptors of a length, of landmarks that come and go."""
-
-    kept: ClassVar = {
-        "ids": integers("landmarks", least=0, ascending=True),
-        "descriptors": numbers("landmarks", "length", dtype=np.float32),
-    }
-    prefix = "descriptors/"
-
-    def __init__(self, length: int) -> None:
-        self.length = length
-        self.ids = np.zeros(0, dtype=np.int64)  #: (M,) ascending.
-        self.descriptors = np.zeros((0, length), dtype=np.float32)  #: (M, d), in the order of the ids.
-
-    def __len__(self) -> int:
-        return self.ids.size
-
-    def add(self, ids: np.ndarray, descriptors: np.ndarray) -> None:
-        """Adds descriptors (k, d) of new landmarks (k,), whose ids ascend beyond those held; else an InputError."""
-        ids = np.asarray(ids, dtype=np.int64)
-        if descriptors.shape != (ids.size, self.length):
-            raise InputError(f"descriptors must be ({ids.size}, {self.length}), a row an id, got {descriptors.shape}")
-        if (np.diff(np.concatenate([self.ids[-1:], ids])) <= 0).any():
-            raise InputError("ids of new descriptors must ascend, and be above those held: take the map's own")
-        self.ids = np.concatenate([self.ids, ids])
-        self.descriptors = np.concatenate([self.descriptors, descriptors], dtype=np.float32)
-
-    def remove(self, ids: np.ndarray) -> None:
-        """Drops landmarks (k,); an InputError if one is not held."""
-        rows = self.rows(ids)
-        self.ids, self.descriptors = np.delete(self.ids, rows), np.delete(self.descriptors, rows, axis=0)
-
-    def rows(self, ids: np.ndarray) -> np.ndarray:
-        """Rows (k,) of landmarks (k,); an InputError if one is not held."""
-        ids = np.asarray(ids, dtype=np.int64)
-        rows, held = self.find(ids)
-        if not held.all():
-            raise InputError(f"there is no descriptor of landmark {ids[~held][0]}")
-        return rows
-
-    def find(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (k,) of landmarks (k,), and whether each is held (k,); the row of one that is not means nothing."""
-        rows = np.minimum(np.searchsorted(self.ids, ids), max(self.ids.size - 1, 0))
-        return rows, (self.ids[rows] == ids) if self.ids.size else np.zeros(rows.shape, dtype=bool)
-
-    def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
-        """The landmark (K,) of each descriptor (K, d), each once; NULL where there is none, an InputError for another d."""
-        if descriptors.ndim != 2 or descriptors.shape[1] != self.length:
-            raise InputError(f"descriptors must be (K, {self.length}), got {descriptors.shape}")
-        matches = match_all(descriptors, self.descriptors, limits)
-        ids = np.full(descriptors.shape[0], NULL, dtype=np.int64)
-        ids[matches.first] = self.ids[matches.second]
-        return ids
-
-    def nearest(self, descriptors: np.ndarray) -> np.ndarray:
-        """Distance (K,) of each descriptor (K, d) to the nearest one held, infinite where none is."""
-        return distances(two_best(descriptors, self.descriptors)[0])

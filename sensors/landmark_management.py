@@ -1,4 +1,4 @@
-"""Which features become landmarks: candidates are started, confirmed and dropped (S05 §IV–V).
+"""How landmarks look, and which features become some: candidates are started, confirmed and dropped (S05 §IV–V).
 
 S05 adds 10 to 15 SIFT features per frame whose descriptors are sufficiently distinct from those held, drops one that is
 not seen again within three frames, and calls it a landmark once it has been seen three times. Until then it is a
@@ -11,14 +11,19 @@ from typing import Annotated, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, read
+from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, Formerly, NotNegative, Range, Ranged
-from rbpf.sensors.descriptors import distances
+from rbpf.sensors.descriptors import MatchLimits, distances, match_all, two_best
 
 #: Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer.
 DISTINCT = {36: 0.12, 128: 0.3}
-_KEPT = {"table": integers("landmarks", 3, least=0), "counters": integers(2, least=0)}
+_DESCRIPTORS = {
+    "ids": integers("landmarks", least=0, ascending=True),
+    "descriptors": numbers("landmarks", "length", dtype=np.float32),
+}
+_COUNTED = {"table": integers("landmarks", 3, least=0), "counters": integers(2, least=0)}
 
 
 @dataclass(frozen=True)
@@ -40,22 +45,32 @@ class NewLandmarkConfig(Ranged):
 
 @final
 class LandmarkManager:
-    """Counts observations of landmarks and candidates, frame by frame, in images of a size (width, height) [px].
+    """Holds landmarks and candidates by their descriptors, and counts observations of them, frame by frame.
 
     Call `observe`, then `select`, then `add`.
+
+    Args:
+        config: settings.
+        size: of the images, (width, height) [px].
+        length: of a descriptor.
     """
 
-    def __init__(self, config: NewLandmarkConfig, size: tuple[int, int]) -> None:
+    def __init__(self, config: NewLandmarkConfig, size: tuple[int, int], length: int) -> None:
         self.config = config
         self.size = size
+        self.length = length
         self.frame = 0  #: Frames so far.
         self.next_name = 0
-        #: Of each descriptor held its name, how often it was seen, and the frame in which it was seen last.
+        self.descriptors = np.zeros((0, length), dtype=np.float32)  #: (M, d), in the order of the names.
+        #: Of each its name, how often it was seen, and the frame in which it was seen last.
         self._table = np.zeros((0, 3), dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self._table)
 
     @property
     def names(self) -> np.ndarray:
-        """(M,) of the descriptors held, ascending."""
+        """(M,) of what is held, ascending."""
         return self._table[:, 0]
 
     @property
@@ -73,24 +88,46 @@ class LandmarkManager:
         """(M,) whether each is a landmark."""
         return self.observations >= self.config.observations
 
-    def observe(self, names: np.ndarray) -> np.ndarray:
-        """Begins a frame in which landmarks (k,) were seen again; returns names (j,) of those dropped.
+    def find(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (k,) of landmarks (k,), and whether each is held (k,); the row of one that is not means nothing."""
+        rows = np.minimum(np.searchsorted(self.names, names), max(len(self) - 1, 0))
+        return rows, (self.names[rows] == names) if len(self) else np.zeros(rows.shape, dtype=bool)
+
+    def rows(self, names: np.ndarray) -> np.ndarray:
+        """Rows (k,) of landmarks (k,); an InputError if one is not held."""
+        names = np.asarray(names, dtype=np.int64)
+        rows, held = self.find(names)
+        if not held.all():
+            raise InputError(f"there is no landmark named {names[~held][0]}")
+        return rows
+
+    def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
+        """The landmark (K,) of each descriptor (K, d), each once; NULL where there is none, an InputError for another d."""
+        if descriptors.ndim != 2 or descriptors.shape[1] != self.length:
+            raise InputError(f"descriptors must be (K, {self.length}), got {descriptors.shape}")
+        matches = match_all(descriptors, self.descriptors, limits)
+        names = np.full(len(descriptors), NULL, dtype=np.int64)
+        names[matches.first] = self.names[matches.second]
+        return names
+
+    def nearest(self, descriptors: np.ndarray) -> np.ndarray:
+        """Distance (K,) of each descriptor (K, d) to the nearest one held, infinite where none is."""
+        return distances(two_best(descriptors, self.descriptors)[0])
+
+    def observe(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Begins a frame in which landmarks (k,) were seen again; returns names (j,) and rows (j,) of those dropped.
 
         Raises InputError: one is not held.
         """
-        names = np.asarray(names, dtype=np.int64)
-        rows = np.searchsorted(self.names, names)
-        known = rows < self.names.size
-        known[known] = self.names[rows[known]] == names[known]
-        if not known.all():
-            raise InputError(f"there is no landmark named {names[~known][0]}")
+        rows = self.rows(names)
         self.frame += 1
         self._table[rows, 1] += 1
         self._table[rows, 2] = self.frame
-        overdue = ~self.confirmed & (self.frame - self._table[:, 2] >= self.config.patience)
-        dropped = self.names[overdue].copy()
-        self._table = self._table[~overdue]
-        return dropped
+        overdue = np.flatnonzero(~self.confirmed & (self.unseen_for >= self.config.patience))
+        dropped = self.names[overdue]
+        if overdue.size:
+            self._table, self.descriptors = np.delete(self._table, overdue, 0), np.delete(self.descriptors, overdue, 0)
+        return dropped, overdue
 
     def select(self, px: np.ndarray, descriptors: np.ndarray, nearest: np.ndarray, taken: np.ndarray) -> np.ndarray:
         """Rows (k,) of those features of a frame that are worth a new candidate, in their order.
@@ -104,7 +141,7 @@ class LandmarkManager:
         room = min(self.config.max_per_frame, self.config.max_candidates - int((~self.confirmed).sum()))
         distinct = self.config.distinct
         if distinct is None:
-            distinct = DISTINCT.get(descriptors.shape[1], 0.0)
+            distinct = DISTINCT.get(self.length, 0.0)
         # Those of the emptiest cells first, in each cell in their order.
         cell = self._cell(px)
         rank, count = (
@@ -128,24 +165,29 @@ class LandmarkManager:
                 chosen.append(row)
         return np.array(sorted(chosen), dtype=np.int64)
 
-    def add(self, count: int) -> np.ndarray:
-        """Takes in new descriptors, seen for the first time in this frame; returns their names (count,)."""
+    def add(self, descriptors: np.ndarray) -> np.ndarray:
+        """Takes in descriptors (k, d), seen for the first time in this frame; returns their names (k,)."""
+        count = len(descriptors)
         names = np.arange(self.next_name, self.next_name + count)
         self.next_name += count
         new = np.column_stack([names, np.ones(count, dtype=np.int64), np.full(count, self.frame)])
         self._table = np.concatenate([self._table, new])
+        self.descriptors = np.concatenate([self.descriptors, descriptors], dtype=np.float32)
         return names
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return {"key_manager/table": self._table.copy(), "key_manager/counters": np.array([self.frame, self.next_name])}
+        described = {"descriptors/ids": self.names.copy(), "descriptors/descriptors": self.descriptors}
+        counters = np.array([self.frame, self.next_name])
+        return described | {"key_manager/table": self._table.copy(), "key_manager/counters": counters}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        found = read(arrays, _KEPT, "key_manager/")
-        self._table, (self.frame, self.next_name) = found["table"], found["counters"].tolist()
-        if (np.diff(self.names, append=self.next_name) <= 0).any():
-            raise InputError("the names of the landmarks that are counted do not ascend below the next one")
+        ids, self.descriptors = read(arrays, _DESCRIPTORS, "descriptors/", length=self.length).values()
+        self._table, counters = read(arrays, _COUNTED, "key_manager/").values()
+        self.frame, self.next_name = counters.tolist()
+        if not np.array_equal(ids, self.names) or ids.max(initial=-1) >= self.next_name:
+            raise InputError("the landmarks that have descriptors are not those that are counted, below the next one")
 
     def _cell(self, px: np.ndarray) -> np.ndarray:
         column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T

@@ -8,15 +8,7 @@ from hypothesis import strategies as st
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.sensors import descriptors as descriptor_matching
-from rbpf.sensors.descriptors import (
-    DescriptorStore,
-    MatchLimits,
-    band_pairs,
-    distances,
-    gate_pairs,
-    match_all,
-    match_pairs,
-)
+from rbpf.sensors.descriptors import MatchLimits, band_pairs, distances, gate_pairs, match_all, match_pairs
 from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 
 
@@ -119,50 +111,31 @@ def test_pairs_within_a_gate(seed, dim):
 LIMITS = MatchLimits(0.3, 0.8)
 
 
-@settings(max_examples=20)
-@given(st.lists(st.tuples(st.integers(0, 90), st.lists(st.integers(0, 200), max_size=30, unique=True)), max_size=6))
-def test_the_store_holds_what_a_dictionary_would(steps):
-    rng, store, held, last = np.random.default_rng(0), DescriptorStore(4), {}, 0
-    for count, gone in steps:
-        ids, descriptors = last + 1 + np.arange(count), unit(rng, count, 4)
-        last += count
-        store.add(ids, descriptors)
-        held.update(zip(ids.tolist(), descriptors, strict=True))
-        drop = [i for i in gone if i in held]
-        store.remove(np.array(drop, dtype=np.int64))
-        for i in drop:
-            del held[i]
-        assert store.ids.tolist() == sorted(held) and len(store) == len(held)
-        for i, descriptor in zip(store.ids.tolist(), store.descriptors, strict=True):
-            np.testing.assert_array_equal(descriptor, held[i])
+SIZE = (640, 480)
 
 
-def test_what_a_store_and_a_manager_refuse():
-    store = DescriptorStore(4)
-    descriptors = unit(np.random.default_rng(0), 3, 4)
-    store.add(np.array([2, 5, 6]), descriptors)
+def managing(length=36, **config):
+    return LandmarkManager(NewLandmarkConfig(**config), SIZE, length)
+
+
+def test_what_a_manager_refuses():
+    manager = managing(4)
+    manager.add(unit(np.random.default_rng(0), 3, 4))
     for use, what, words in (
-        (store.add, (np.array([6]), descriptors[:1]), "must ascend"),
-        (store.add, (np.array([9, 8]), descriptors[:2]), "must ascend"),
-        (store.add, (np.array([7]), descriptors[:1, :3]), r"must be \(1, 4\)"),
-        (store.remove, (np.array([5, 3]),), "no descriptor of landmark 3"),
-        (store.match, (np.zeros((2, 128), dtype=np.float32), LIMITS), r"\(K, 4\)"),
-        (LandmarkManager(NewLandmarkConfig(), SIZE).observe, (np.array([0]),), "no landmark named 0"),
+        (manager.rows, (np.array([1, 3]),), "no landmark named 3"),
+        (manager.observe, (np.array([5]),), "no landmark named 5"),
+        (manager.match, (np.zeros((2, 128), dtype=np.float32), LIMITS), r"\(K, 4\)"),
     ):
         with pytest.raises(InputError, match=words):
             use(*what)
-    assert store.ids.tolist() == [2, 5, 6]
+    assert manager.names.tolist() == [0, 1, 2]
 
 
 def test_an_empty_map():
-    store = DescriptorStore(36)
-    descriptors = unit(np.random.default_rng(5), 4, 36)
-    assert (store.match(descriptors, LIMITS) == NULL).all() and np.isinf(store.nearest(descriptors)).all()
-    store.add(np.array([7]), descriptors[:1])
-    assert store.match(descriptors, LIMITS).tolist() == [7, NULL, NULL, NULL]
-
-
-SIZE = (640, 480)
+    manager, descriptors = managing(), unit(np.random.default_rng(5), 4, 36)
+    assert (manager.match(descriptors, LIMITS) == NULL).all() and np.isinf(manager.nearest(descriptors)).all()
+    manager.add(descriptors[:1])
+    assert manager.match(descriptors, LIMITS).tolist() == [0, NULL, NULL, NULL]
 
 
 def features(rng, count):
@@ -183,8 +156,9 @@ def features(rng, count):
 )
 def test_sightings_decide_who_stays(seed, fraction, config):
     rng = np.random.default_rng(seed)
-    manager = LandmarkManager(config, SIZE)
+    manager = LandmarkManager(config, SIZE, 36)
     seen: dict[int, list[int]] = {}
+    looks: dict[int, np.ndarray] = {}
     ever = 0
     for frame in range(1, 15):
         names = manager.names[rng.random(manager.names.size) < fraction]
@@ -195,17 +169,19 @@ def test_sightings_decide_who_stays(seed, fraction, config):
             for name, frames in seen.items()
             if len(frames) < config.observations and frame - frames[-1] >= config.patience
         ]
-        assert manager.observe(names).tolist() == overdue
+        assert manager.observe(names)[0].tolist() == overdue
         for name in overdue:
             del seen[name]
         px, descriptors = features(rng, 30)
         chosen = manager.select(px, descriptors, np.full(30, np.inf), np.zeros((0, 2)))
         assert chosen.size <= config.max_per_frame
-        new = manager.add(chosen.size)
+        new = manager.add(descriptors[chosen])
         assert new.tolist() == list(range(ever, ever + chosen.size))
         ever += chosen.size
         seen.update({name: [frame] for name in new.tolist()})
+        looks.update(zip(new.tolist(), descriptors[chosen], strict=True))
         assert manager.names.tolist() == sorted(seen)
+        np.testing.assert_array_equal(manager.descriptors, np.array([looks[k] for k in sorted(seen)]).reshape(-1, 36))
         assert manager.observations.tolist() == [len(seen[name]) for name in sorted(seen)]
         np.testing.assert_array_equal(manager.confirmed, manager.observations >= config.observations)
         if config.observations > 1:
@@ -215,7 +191,7 @@ def test_sightings_decide_who_stays(seed, fraction, config):
 @given(seed=st.integers(0, 10_000), spacing=st.floats(0.0, 80.0), distinct=st.floats(0.05, 0.6))
 def test_new_keys_are_apart_from_others(seed, spacing, distinct):
     rng = np.random.default_rng(seed)
-    manager = LandmarkManager(NewLandmarkConfig(spacing_px=spacing, distinct=distinct), SIZE)
+    manager = managing(spacing_px=spacing, distinct=distinct)
     px, descriptors = features(rng, 40)
     taken, nearest = rng.uniform([0, 0], SIZE, (10, 2)), rng.uniform(0.0, 0.8, 40)
     chosen = manager.select(px, descriptors, nearest, taken)
@@ -241,9 +217,9 @@ def test_new_keys_spread_over_the_image():
     corner = rng.uniform([0, 0], [100, 75], (60, 2))
     elsewhere = np.array([[600.0, 450.0], [20.0, 460.0], [620.0, 20.0], [320.0, 240.0]])
     px = np.concatenate([corner, elsewhere])
-    config = NewLandmarkConfig(max_per_frame=6, spacing_px=0.0, distinct=0.0)
-    chosen = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), np.zeros((0, 2)))
+    manager = managing(max_per_frame=6, spacing_px=0.0, distinct=0.0)
+    chosen = manager.select(px, unit(rng, 64, 36), np.full(64, np.inf), np.zeros((0, 2)))
     assert set(range(60, 64)) <= set(chosen.tolist()) and chosen.size == 6
     occupied = np.repeat(elsewhere[:1], 5, axis=0) + 15.0
-    crowded = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)
+    crowded = manager.select(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)
     assert 60 not in crowded.tolist()

@@ -46,13 +46,11 @@ class TestPath:
         assert set(plain.log.states) == {TrackingState.TRACKED}
 
     def test_landmarks_are_found_again(self, plain):
-        landmarks, found = plain.system.front_end.landmarks, plain.system.map()
-        manager = landmarks.manager
+        manager, found = plain.system.front_end.landmarks.manager, plain.system.map()
         assert manager.confirmed.sum() > 15
         assert plain.log["observed"][3:].mean() > 10
         assert (~manager.confirmed).sum() <= CONFIG.new_landmarks.max_candidates
-        for ids in (manager.names, landmarks.store.ids):
-            np.testing.assert_array_equal(ids, found.ids)
+        np.testing.assert_array_equal(manager.names, found.ids)
         np.testing.assert_array_equal(found.columns["landmark"], manager.confirmed)
 
     def test_the_map_is_where_the_plane_is(self, plain):

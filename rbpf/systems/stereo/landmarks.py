@@ -23,7 +23,6 @@ from rbpf.arrays import RowByRow
 from rbpf.core.checkpoint import Kept, integers, read
 from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Particles, Prior
-from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
@@ -33,7 +32,7 @@ from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
-from rbpf.sensors.descriptors import DescriptorStore, gate_pairs, match_pairs
+from rbpf.sensors.descriptors import gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_management import LandmarkManager
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
@@ -300,8 +299,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.rig, self.config, self.likelihood = rig, config.map, config.likelihood.build()
         self.gate = gate or MahalanobisGate(self.config.gate, self.config.slack_px)
         self.model, self.landmark = model or StereoPoint(rig), landmark or Point(3)
-        self.store = DescriptorStore(length)
-        self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height))
+        self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height), length)
         self.places = Places(rig, self.config)
         self.noise = LearntNoise() if self.config.kind == "joint" else None
         self.ids = np.zeros(0, dtype=np.int64)
@@ -351,11 +349,10 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             assert isinstance(held, JointMap)
             for group in observed:
                 self.noise.learn_from(group, partial(held.expected_alone, self.model, belief))
-        dropped = self.manager.observe(seen)
+        dropped, rows = self.manager.observe(seen)
         if dropped.size:
             belief.map.remove(dropped)
-            self.places.remove(self.store.rows(dropped))
-            self.store.remove(dropped)
+            self.places.remove(rows)
             if self.noise is not None:
                 self.noise.remove(dropped)
         # Places are in the world, the particles' states and landmarks perhaps not.
@@ -365,7 +362,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             records = belief.read_mode(seen)
             place = self.landmark.homogeneous(records.mean, records.const)[0]
             place = place[:, :3] / place[:, 3:]
-            self.places.put(self.store.rows(seen), SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
+            self.places.put(self.manager.rows(seen), SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
         # Candidates that are not seen again are dropped anyway.
         confirmed = self.manager.confirmed
         make_room(belief.map, self.manager.names[confirmed], self.manager.unseen_for[confirmed])
@@ -376,16 +373,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
         rows = np.flatnonzero(~known & deep & frame.for_map)
         if rows.size:
-            descriptors = features.descriptors[rows]
-            nearest, px = self.store.nearest(descriptors), features.z[:, :2]
-            rows = rows[self.manager.select(px[rows], descriptors, nearest, px[known])]
+            descriptors, px = features.descriptors[rows], features.z[:, :2]
+            rows = rows[self.manager.select(px[rows], descriptors, self.manager.nearest(descriptors), px[known])]
         if not rows.size:
             return []
         features = features.take(rows)
         # The manager counts as the map does: its numbers are the map's.
-        ids = self.manager.add(rows.size)
-        self.store.add(ids, features.descriptors)
-        self.places.put(self.store.rows(ids), SE3.transform(pose, features.points), pose)
+        ids = self.manager.add(features.descriptors)
+        self.places.put(self.manager.rows(ids), SE3.transform(pose, features.points), pose)
         self.ids[rows] = ids
         cov = features.cov
         if self.noise is not None:
@@ -399,13 +394,13 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         features = pair.features.take(rows)
         subsample = ParticleSubsample.of(belief, self.config.subsample)
         near = self.places.in_view(subsample.middle, subsample.std_direction_rad)
-        store, limits = self.store, self.config.limits
+        held, limits = self.manager, self.config.limits
         if near.size and rows.size:
             # Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
-            most = limits.largest(store.length) / limits.ratio
-            products = features.descriptors @ store.descriptors[near].T
+            most = limits.largest(held.length) / limits.ratio
+            products = features.descriptors @ held.descriptors[near].T
             near = near[products.max(axis=0) >= 1.0 - 0.5 * most**2]
-        ids = store.ids[near]
+        ids = held.names[near]
         ids = ids[belief.map.holds(ids)]
         if pair.uncertain:
             ids = ids[np.isin(ids, self.seen_again())]
@@ -413,8 +408,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             return out
         expected = subsample.expected(belief, self.model, ids)
         k, m = self.gate.pairs(features, expected)
-        found = match_pairs(features.descriptors, store.descriptors, (k, store.rows(ids)[m]), limits)
-        taken = store.ids[found.second]
+        found = match_pairs(features.descriptors, held.descriptors, (k, held.rows(ids)[m]), limits)
+        taken = held.names[found.second]
         agreed = self._agreed(
             expected.take(np.searchsorted(ids, taken)), features.take(found.first), pair.uncertain, belief.rng
         )
@@ -426,14 +421,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
 
         Those that are not about where the present sub-map begins must agree on one motion: with them all is solved for.
         """
-        (old, places), store, prior = joint.old.places(), self.store, belief.prior
+        (old, places), held, prior = joint.old.places(), self.manager, belief.prior
         away, rows = ~joint.holds(old), np.flatnonzero(pair.for_map & free)
         out, features = np.full(len(pair), NULL, dtype=np.int64), pair.features.take(rows)
-        self.places.move(store.rows(old[away]), places[away])
+        self.places.move(held.rows(old[away]), places[away])
         camera, spread = joint.estimate(Particles(prior.predicted(), belief.log_weights)), prior.spread(prior.mean)[-1]
         cov = camera.cov + spread @ spread.T
         at = self.places.in_view(camera.mean, float(np.sqrt(np.diagonal(cov)[:3].max())))
-        at = at[np.isin(store.ids[at], old[away])]
+        at = at[np.isin(held.names[at], old[away])]
         if not (at.size and len(features)):
             return out
         px = self.model.predict(camera.mean, self.places.place[at])
@@ -442,8 +437,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         own = np.tile(self.config.slack_px**2 * np.eye(3), (at.size, 1, 1))
         expected = Expected(px, symmetrise(slope @ cov @ slope.mT), own, px)
         near = self.gate.pairs(features, expected)
-        found = match_pairs(features.descriptors, store.descriptors[at], near, self.config.limits)
-        taken = store.ids[at[found.second]]
+        found = match_pairs(features.descriptors, held.descriptors[at], near, self.config.limits)
+        taken = held.names[at[found.second]]
         far = np.flatnonzero(~np.isin(taken, joint.old.near))
         agreed = np.ones(len(found), dtype=bool)
         agreed[far] = self._agreed(expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng)
@@ -454,7 +449,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         """By their descriptors alone."""
         out = np.full(len(pair), NULL, dtype=np.int64)
         rows = np.flatnonzero(pair.for_map)
-        out[rows] = self.store.match(pair.features.descriptors[rows], self.config.limits)
+        out[rows] = self.manager.match(pair.features.descriptors[rows], self.config.limits)
         return out
 
     def seen_again(self) -> np.ndarray:
@@ -467,7 +462,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def kinds(self) -> np.ndarray:
         manager = self.manager
         out = np.full(self.ids.size, FeatureKind.FEATURE)
-        rows, is_held = self.store.find(self.ids)
+        rows, is_held = self.manager.find(self.ids)
         held, rows = np.flatnonzero(is_held), rows[is_held]
         out[held] = np.where(manager.confirmed[rows], FeatureKind.LANDMARK, FeatureKind.CANDIDATE)
         out[held[manager.observations[rows] == 1]] = FeatureKind.NEW
@@ -489,15 +484,12 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
 
     def arrays(self) -> dict[str, np.ndarray]:
         learnt = {} if self.noise is None else self.noise.arrays()
-        return self.store.arrays() | self.manager.arrays() | self.places.arrays() | learnt
+        return self.manager.arrays() | self.places.arrays() | learnt
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         read(arrays, {"descriptors/ids": integers("landmarks", refers=MAP_IDS)})
-        self.store.restore(arrays, length=self.store.length)
         self.manager.restore(arrays)
-        if not np.array_equal(self.store.ids, self.manager.names):
-            raise InputError("the landmarks that have descriptors are not those that are counted")
-        self.places.restore(arrays, landmarks=len(self.store))
+        self.places.restore(arrays, landmarks=len(self.manager))
         if self.noise is not None:
             self.noise.restore(arrays)
 

@@ -17,7 +17,7 @@ SIGMAS = 3.0  #: The image is widened by so many standard deviations of the came
 class Places(Kept):
     """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
 
-    Landmarks go by their rows in the store of descriptors.
+    Landmarks go by their rows among those that are managed.
     """
 
     place: np.ndarray  #: (M, 3) in the world of the heaviest particle.
