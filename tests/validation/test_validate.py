@@ -75,7 +75,7 @@ def test_gtsam_stands_beside(run_folder, tmp_path, capsys):
     figures = entries["figures"]
     assert figures["landmarks_count"] > 10
     assert 0.0 < figures["landmarks_kullback_leibler_median"] < 5.0
-    assert 0.0 < figures["poses_bhattacharyya_median"] < 5.0 and figures["poses_count"] == 1
+    assert 0.0 < figures["poses_kullback_leibler_median"] < 5.0 and figures["poses_count"] == 1
     assert 0.5 < figures["landmarks_sigma_ratio_median"] < 1.5
     assert figures["batch_log_likelihood"] > figures["filter_log_likelihood"] - 5.0
     summary = json.loads((run_folder / "summary.json").read_text())

@@ -103,7 +103,13 @@ def test_innovations_alone_never_say_cautious():
         assert (verdict.trust, verdict.leaning) == ("do not trust", "")
         assert "to which side the poses err innovations do not tell" in verdict.sentences[1]
     wide = variance_ratio("poses", 0.1, 400.0, 2.0)
-    assert judge([small, wide], ["poses"]).leaning == "cautious"
+    assert judge([small, wide], ["poses"], truth=["poses"]).leaning == "cautious"
+    told = judge([small, good], ["poses"], truth=["poses"])  # by the truth, which has not the run's noise
+    assert told.trust == "trust" and "noise is stated too large: innovations: " in told.reason
+    far = variance_ratio("landmarks", 6.0, 3.0, 2.0)  # it may be far off
+    assert judge([good, far], ["poses", "landmarks"]).trust == "cannot tell"
+    large = variance_ratio("innovations", 4.0, 5000.0, 1.1)
+    assert judge([large, good], ["poses"], truth=["poses"]).leaning == "over-confident"
 
 
 def test_the_path_has_a_light_of_its_own():

@@ -63,11 +63,6 @@ class AgainstBatch:
     fit_batch: dict[str, float]  #: by the optimum.
 
     @property
-    def floats(self) -> bool:
-        """Whether only what a change of scale does not move is compared."""
-        return self.gauge == SCALED
-
-    @property
     def ours(self) -> PathAndMap:
         """The filter at the steps of the optimum."""
         return self.filter.at(self.optimum.steps)
@@ -90,28 +85,11 @@ class AgainstBatch:
             return ours.cov_poses[:0], ours.cov_poses[:0], delta[:0]
         carry = ours.space.right_jacobian_inverse(delta)
         found = ours.cov_poses, np.asarray(carry @ theirs.cov_poses @ carry.mT), delta
-        if not self.floats:
+        if self.gauge == SAME:
             return found
         basis = gaussians.across_of(gaussians.away_from_first(ours.world_from_body))
         own, batch, apart = (gaussians.projected(basis, part) for part in found)
         return own, batch, apart
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything for JSON."""
-        return {
-            "recording": self.name,
-            "gauge": self.gauge,
-            "scale": self.scale,
-            "steps": len(self.path.keys),
-            "path_rmse_m": self.path.rmse,
-            "path_max_m": self.path.max,
-            "path_distances_m": self.path.distances.tolist(),
-            "landmarks": self.landmarks.as_dict(),
-            "poses": self.poses.as_dict(),
-            "fit_filter": self.fit_filter,
-            "fit_batch": self.fit_batch,
-            "batch_error": self.optimum.error,
-        }
 
 
 def compare_run(run: Run) -> AgainstBatch:

@@ -45,6 +45,7 @@ class TruthErrors:
     fitted: int  #: parameters of the motion that brought the truth into the run's world; 0 where it is there.
     landmarks: "LandmarkErrors | None"  #: the map's points whose true places are known; None without any.
     stated: Precision  #: the truth's own.
+    claimed: float  #: fraction of the expected squared errors of the poses that is the filter's own, not the truth's.
 
 
 @dataclass(frozen=True)
@@ -78,15 +79,14 @@ def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
     # A truth that was moved so that both begin alike errs everywhere by what its first pose errs.
     moved_by_first = any(stated) and np.array_equal(truth.poses[0], space.identity())
     if truth.alignment == "none" and not moved_by_first:
-        cov = cov + np.diag(own)
-        whitened = statistic.whitened_errors(space, mean, cov, truth.poses)
+        both = cov + np.diag(own)
+        whitened = statistic.whitened_errors(space, mean, both, truth.poses)
         landmarks = None if anonymous else _landmark_errors(record, truth, positions.alignment)
-        return TruthErrors(positions, whitened, 0, landmarks, stated)
+        return TruthErrors(positions, whitened, 0, landmarks, stated, _claimed(cov, both))
     # The truth brought into the run's world.
     true, ours = (in_space(path.stamps_ns[truth.rows], poses) for poses in (truth.poses, mean))
     start = align(true.positions, ours.positions, with_scale=across)
     own[turns:] *= start.scale**2
-    cov = cov + np.diag(own)
     if space.dim == SE2.dim:
         plane = start.in_dimension(2)
         turned = np.array([np.arctan2(plane.rotation[1, 0], plane.rotation[0, 0]), *plane.translation])
@@ -96,7 +96,8 @@ def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
     basis = np.broadcast_to(np.eye(space.dim), cov.shape)
     if across:
         basis = across_of(away_from_first(path.world_from_body)[truth.rows])
-    roots, ranks = statistic.inverse_roots(projected(basis, cov))
+    both = projected(basis, cov + np.diag(own))
+    roots, ranks = statistic.inverse_roots(both)
 
     def errors(motion: np.ndarray) -> np.ndarray:
         there = space.local(mean, space.compose(space.exp(motion), moved))
@@ -108,7 +109,7 @@ def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
     there = RunTruth(truth.rows, space.compose(turn, moved), points, truth.alignment)
     landmarks = None if anonymous else _landmark_errors(record, there, positions.alignment)
     whitened = statistic.WhitenedErrors(errors(motion), ranks)
-    return TruthErrors(positions, whitened, space.dim, landmarks, stated)
+    return TruthErrors(positions, whitened, space.dim, landmarks, stated, _claimed(projected(basis, cov), both))
 
 
 def pose_statistics(errors: statistic.WhitenedErrors, fitted: int = 0) -> list[statistic.Statistic]:
@@ -154,6 +155,8 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
     known, white = errors.whitened.ranks > 0, errors.whitened
     nees, ranks = (values[known] if known.any() else np.zeros(1) for values in (white.nees, white.ranks))
     statistics = pose_statistics(white, errors.fitted)
+    if any(errors.stated):  # regions are of both
+        statistics = [_of_filter(ratio, errors.claimed) for ratio in statistics[:1]]
     figures |= {"pose_nees_mean": float(nees.mean()), "pose_nees_median": float(np.median(nees))}
     figures["pose_nees_right"] = float(ranks.mean())
     if errors.landmarks is not None:
@@ -172,6 +175,24 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
         figures["batch_position_rmse_m"] = rmse
         accuracy += f"; the batch optimum of the same measurements is {_metres(rmse)} from it"
     return Comparison("groundtruth", f"{accuracy}.", figures, statistics)
+
+
+def _claimed(cov: np.ndarray, both: np.ndarray) -> float:
+    """Mean of tr S⁻¹ P per degree of freedom, of covariances P of S (T, d, d)."""
+    roots, ranks = statistic.inverse_roots(both)
+    return float(np.einsum("tab,tbc,tca->", roots, cov, roots) / max(ranks.sum(), 1))
+
+
+def _of_filter(ratio: statistic.Statistic, claimed: float) -> statistic.Statistic:
+    """A ratio of errors to what filter and truth expect together, without what the truth errs.
+
+    The interval has room for a truth whose standard deviations are stated wrong by `STATE_FACTOR`: one that is coarser than
+    the filter's claim neither supports nor contradicts it.
+    """
+    rest, most = 1.0 - claimed, statistic.STATE_FACTOR**2
+    offs = {"value": rest, "low": most * rest, "high": rest / most}
+    found = {name: max(getattr(ratio, name) - off, 0.0) / claimed for name, off in offs.items()}
+    return replace(ratio, samples=claimed**2 * ratio.samples, **found)
 
 
 def _landmark_errors(record: RunFolder, truth: RunTruth, world: Similarity) -> LandmarkErrors | None:

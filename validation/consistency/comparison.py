@@ -4,8 +4,7 @@ The verdict is two lights, each with a sentence: how good the path is, and wheth
 independent: a path as good as the best may claim ten times too little, and a poor one may know how poor it is.
 
 The first compares the error with the path's own size: the root mean square distance of the true positions from their
-centre, which is the error of an estimate that stays there. It is *good* up to 3 %, *fair* up to 10 %, *poor* above, and
-never better than the frames that were lost allow.
+centre, which is the error of an estimate that stays there. It is never better than the frames that were lost allow.
 
 The second follows from the statistics of `rbpf.validation.consistency.statistic` alone:
 
@@ -13,7 +12,8 @@ The second follows from the statistics of `rbpf.validation.consistency.statistic
   than claimed, or biased. It is *cautious*, its uncertainty larger than needed, if all say so and one of them compares
   poses or landmarks with the truth or the batch posterior. Innovations that are too small show that the noise is not
   the stated one, and not more: they do not see a past that the particles have forgotten, nor errors that repeat;
-- trust: none contradicts, and one that compares poses or landmarks with something else supports it;
+- trust: none contradicts, one that compares poses or landmarks with something else supports it, and none of these is itself
+  outside its zone. Where the truth supports it, noise that is stated too large is no contradiction: what comes of it is known;
 - cannot tell: otherwise. The run is too short or too much alike from step to step, or there is nothing to compare it
   with: good innovations alone do not show that the particles follow the right path.
 """
@@ -222,30 +222,39 @@ class Verdict:
         return self.path.sentence, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."
 
 
-def judge(statistics: Sequence[Statistic], independent: Sequence[str] = (), path: PathGrade | None = None) -> Verdict:
+def judge(
+    statistics: Sequence[Statistic],
+    independent: Sequence[str] = (),
+    path: PathGrade | None = None,
+    truth: Sequence[str] = (),
+) -> Verdict:
     """The verdict from all statistics.
 
-    `independent` names those that compare poses or landmarks with something the filter did not compute itself.
+    `independent` names those that compare poses or landmarks with something the filter did not compute itself, `truth` those
+    among them that compare with the truth, which does not have the run's noise as the batch posterior has.
     """
     path = path or PathGrade()
     against = [s for s in statistics if s.outcome == "contradicts"]
-    if against:
+    judging = [s for s in statistics if s.name in independent]
+    support = [s for s in judging if s.outcome == "supports"]
+    told = [s for s in support if s.name in truth and s.kind == "ratio"]
+    # Those that say that it errs more than it claims; else those that may say that it errs less.
+    daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
+    witnesses = [s for s in against if s.name in independent]
+    if against and (daring or witnesses or not told):
         more = f" ({len(against) - 1} more of {len(statistics)} statistics contradict it)" if len(against) > 1 else ""
-        # Those that say that it errs more than it claims; else those that may say that it errs less.
-        daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
-        witnesses = [s for s in against if s.name in independent]
         worst = max(daring or witnesses or against, key=_distance)
         if daring or witnesses:
             leaning: Leaning = "over-confident" if daring else "cautious"
             return Verdict(path, "do not trust", described(worst) + more, leaning)
         reason = f"{described(worst)}{more}; the noise is not the stated one, and to which side the poses err "
         return Verdict(path, "do not trust", f"{reason}innovations do not tell")
-    judging = [s for s in statistics if s.name in independent]
-    support = [s for s in judging if s.outcome == "supports"]
-    if support:
-        return Verdict(path, "trust", described(support[0]))
+    doubtful = [s for s in judging if s.kind == "ratio" and s.samples >= 1.0 and not s.zone[0] <= s.value <= s.zone[1]]
+    if support and not doubtful:
+        but = f"; but noise is stated too large: {described(max(against, key=_distance))}" if against else ""
+        return Verdict(path, "trust", described((told or support)[0]) + but)
     if judging:
-        first = judging[0]
+        first = (doubtful or judging)[0]
         zone = first.zone if first.kind != "ratio" else tuple(map(_root, first.zone))
         reason = (
             f"{described(first)}; the run is worth only {first.samples:.0f} independent samples of it, too few to say "
@@ -281,7 +290,8 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
     path = grade_path(accuracy, figures.get(key), figures.get("path_spread_m"), lost, frames)
     # Those that compare poses or landmarks with what the filter did not compute itself.
     independent = [s.name for c in comparisons if c.accuracy for s in c.statistics if s.name != RESIDUALS]
-    verdict = judge(statistics, independent, path)
+    truth = [s.name for c in comparisons if c.against == "groundtruth" for s in c.statistics]
+    verdict = judge(statistics, independent, path, truth)
     advice = motion_advice(record, statistics), noise_advice(record, statistics)
     return replace(verdict, advice=" ".join(filter(None, advice)))
 

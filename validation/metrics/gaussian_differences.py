@@ -1,7 +1,7 @@
 """Landmarks and poses of two estimates as Gaussians in one frame, chart and gauge, and how far they are apart.
 
-The difference of the means is given in units of one's standard deviations; S. Kullback and R. Leibler (1951) and
-A. Bhattacharyya (1943) compare the whole densities, in natural units of information.
+The difference of the means is given in units of one's standard deviations; S. Kullback and R. Leibler (1951) compare the
+whole densities, in natural units of information.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.trajectory import Similarity
 
 #: What is reported of each pair of Gaussians.
-COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
+COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "sigma_ratio")
 #: A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none.
 _TINY = 1e-9
 
@@ -31,12 +31,6 @@ def kullback_leibler(delta: Array, cov_p: Array, cov_q: Array) -> Array:
     """KL(p ‖ q) of Gaussians whose means differ by δ (…, n), with covariances (…, n, n) [nats]: (…)."""
     trace = np.trace(np.linalg.solve(cov_q, cov_p), axis1=-2, axis2=-1)
     return np.asarray(0.5 * (trace + _square(delta, cov_q) - delta.shape[-1] + _log_det(cov_q) - _log_det(cov_p)))
-
-
-def bhattacharyya(delta: Array, cov_p: Array, cov_q: Array) -> Array:
-    """Bhattacharyya's distance, −log ∫ √(p q); symmetric and 0 for equal Gaussians: (…)."""
-    middle = 0.5 * (cov_p + cov_q)
-    return 0.125 * _square(delta, middle) + 0.5 * (_log_det(middle) - 0.5 * (_log_det(cov_p) + _log_det(cov_q)))
 
 
 def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
@@ -54,7 +48,6 @@ class Differences:
     sigmas: Array  #: (K,) between the means in the filter's standard deviations, √(δᵀ P_f⁻¹ δ).
     #: (K,) KL(optimum ‖ filter) [nats]: what believing the filter instead of the optimum costs.
     kullback_leibler: Array
-    bhattacharyya: Array  #: (K,) the symmetric distance.
     sigma_ratio: Array  #: (K,) the filter's mean standard deviation over the optimum's; below 1 is over-confident.
     delta: Array  #: (K, n) the filter's means less the optimum's, in the directions that are compared.
     cov: Array  #: (K, n, n) of the filter, there.
@@ -63,14 +56,9 @@ class Differences:
     def __len__(self) -> int:
         return len(self.keys)
 
-    @property
-    def dims(self) -> int:
-        """Of the Gaussians, n."""
-        return self.delta.shape[-1]
-
     def as_dict(self) -> dict[str, Any]:
         """Medians and 90 % quantiles for JSON, and every row."""
-        figures: dict[str, Any] = {"count": len(self), "dims": self.dims}
+        figures: dict[str, Any] = {"count": len(self), "dims": self.delta.shape[-1]}
         for name in COLUMNS:
             values = getattr(self, name)
             if len(self):
@@ -142,7 +130,6 @@ def _differences(
         distances_m=distances[kept],
         sigmas=mahalanobis(delta, ours),
         kullback_leibler=kullback_leibler(-delta, theirs, ours),
-        bhattacharyya=bhattacharyya(delta, ours, theirs),
         sigma_ratio=sigma_ratio(ours, theirs),
         delta=delta,
         cov=ours,

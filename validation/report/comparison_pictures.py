@@ -68,7 +68,8 @@ def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = N
         figures["gtsam_nees.png"] = consistency_figure(title, NEES, curve, cov.shape[-1], banded=True)
     if len(found.landmarks):
         title = f"{name}: landmarks against the batch optimum"
-        figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), found.landmarks.dims)
+        dim = found.landmarks.delta.shape[-1]
+        figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), dim)
         places = moved_map(theirs.landmarks, motions["batch"]).in_space()[0]
         title, others = (
             f"{name}: map over the batch optimum, in {world.name}",
