@@ -7,7 +7,7 @@ has a kernel, else in NumPy.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -61,11 +61,23 @@ class Batch:
     ks: np.ndarray
     ids: np.ndarray
     mask: np.ndarray | None = None
+    #: What the drivers take of it in every stage of a step, in parts; found when it is first asked for.
+    given: "list[Given]" = field(default_factory=list)
 
     def some(self, rows: np.ndarray | slice) -> "Batch":
         """A part of its rows."""
         mask = None if self.mask is None else self.mask[:, rows]
         return Batch(self.group, self.ks[rows], self.ids[rows], mask)
+
+
+class Given(NamedTuple):
+    """What the drivers take of a part of a batch, whatever the states are."""
+
+    ids: np.ndarray
+    kernel: FusedKernel | None  #: None where the model is linearised in NumPy.
+    #: z (K, p), their covariances, the mask (K, N) or (0, 0), and the likelihood's number and parameters.
+    measured: tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]
+    sizes: np.ndarray  #: d, D, A.
 
 
 @dataclass
@@ -185,11 +197,10 @@ class RowEngine:
                 total.add(self._information_numpy(batch, group, state, prior))
                 continue
             factor = np.ascontiguousarray(prior.factor)
-            kernel = fused_kernel(group.model)
-            for part in self._parts(batch, kernel):
-                fused, measured, sizes = self._observed(part, group, kernel, state, EVERYTHING)
-                access, pairs = tuple(self.store.access(part.ids)), state.shape[0] * part.ks.size
-                run_driver(refine, pairs, fused, access, measured, factor, sizes, out, alone=refine_alone)
+            for given in self._given(batch, group):
+                fused, measured = self._observed(given, group, state, EVERYTHING)
+                access, pairs = tuple(self.store.access(given.ids)), state.shape[0] * given.ids.size
+                run_driver(refine, pairs, fused, access, measured, factor, given.sizes, out, alone=refine_alone)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
@@ -215,12 +226,11 @@ class RowEngine:
                 for part in _one_after_the_other(batch):
                     self._correct_once(part, group, state, log_density)
                 continue
-            kernel = fused_kernel(group.model)
-            for part in self._parts(batch, kernel):
-                fused, measured, sizes = self._observed(part, group, kernel, state, MAP)
-                access, targets = self.store.rewrite(part.ids)
-                what = fused, tuple(access), targets, measured, sizes, log_density
-                run_driver(update, state.shape[0] * part.ks.size, *what, alone=update_alone)
+            for given in self._given(batch, group):
+                fused, measured = self._observed(given, group, state, MAP)
+                access, targets = self.store.rewrite(given.ids)
+                what = fused, tuple(access), targets, measured, given.sizes, log_density
+                run_driver(update, state.shape[0] * given.ids.size, *what, alone=update_alone)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
         after_sampling = np.zeros(state.shape[0])
@@ -231,41 +241,43 @@ class RowEngine:
     def _is_compiled(self, group: Observations) -> bool:
         return self.compiled and _likelihood(group).kernel_id >= 0
 
-    def _parts(self, batch: Batch, kernel: FusedKernel | None) -> list[Batch]:
-        """A batch as the drivers take it: whole, or so much of it at once as NumPy linearises in the cache."""
-        if kernel is not None:
-            return [batch]
-        size = max(1, PAIRS_AT_ONCE // self.store.n)
-        return [
-            part.some(slice(first, first + size))
-            for part in _one_after_the_other(batch)
-            for first in range(0, part.ks.size, size)
-        ]
+    def _given(self, batch: Batch, group: Observations) -> list[Given]:
+        """Of a batch as the drivers take it: whole, or so much of it at once as NumPy linearises in the cache."""
+        if not batch.given:
+            kernel, parts = fused_kernel(group.model), [batch]
+            if kernel is None:
+                size = max(1, PAIRS_AT_ONCE // self.store.n)
+                parts = [
+                    part.some(slice(first, first + size))
+                    for part in _one_after_the_other(batch)
+                    for first in range(0, part.ks.size, size)
+                ]
+            likelihood, landmark = _likelihood(group), self.layout_of(int(batch.ids[0])).landmark
+            params = numbers(likelihood.params, "the params of a likelihood")
+            sizes = np.array([self.space.dim, landmark.dim, landmark.constants])
+            for part in parts:
+                mask = _NO_MASK if part.mask is None else np.ascontiguousarray(part.mask.T)
+                measured = group.z[part.ks], group.cov[part.ks], mask, likelihood.kernel_id, params
+                batch.given.append(Given(part.ids, kernel, measured, sizes))
+        return batch.given
 
     def _observed(
-        self, batch: Batch, group: Observations, kernel: FusedKernel | None, state: np.ndarray, by: frozenset[Part]
-    ) -> tuple[tuple[Any, ...], tuple[Any, ...], np.ndarray]:
-        """What both drivers take: the kernel and the states; the measurements and their likelihood; the sizes d, D, A.
+        self, given: Given, group: Observations, state: np.ndarray, by: frozenset[Part]
+    ) -> tuple[tuple[int, np.ndarray, np.ndarray], tuple[Any, ...]]:
+        """What both drivers take: the kernel and the states; the measurements and their likelihood.
 
         A model without a kernel is linearised in NumPy, and its rows are handed on.
         """
-        likelihood, landmark = _likelihood(group), self.layout_of(int(batch.ids[0])).landmark
-        z = group.z[batch.ks]
+        kernel, (z, *likelihood) = given.kernel, given.measured
         if kernel is None:
-            _, records = self._read(batch.ids)
-            nu, jac = linearise(group.model, self.space, z, state[:, None], records.mean, records.const, by=by)
+            mean, const = self.layout_of(int(given.ids[0])).estimates(self.store.read_all(given.ids))
+            nu, jac = linearise(group.model, self.space, z, state[:, None], mean, const, by=by)
             rows = np.concatenate([nu[..., None], *(block for block in jac if block is not None)], axis=-1)
             z = np.zeros_like(z)
             z[:, 0] = np.arange(len(z)) * rows[0, 0].size
             by_state = 0 if jac.state is None else self.space.dim
             kernel, state = FusedKernel(given_rows, np.array([by_state], dtype=float)), rows.reshape(len(state), -1)
-        mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
-        params = numbers(likelihood.params, "the params of a likelihood")
-        return (
-            (kernel.function.address, kernel.params, np.ascontiguousarray(state)),
-            (z, group.cov[batch.ks], mask, likelihood.kernel_id, params),
-            np.array([self.space.dim, landmark.dim, landmark.constants]),
-        )
+        return (kernel.function.address, kernel.params, np.ascontiguousarray(state)), (z, *likelihood)
 
     def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
         columns = self.store.read_all(ids)

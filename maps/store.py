@@ -93,6 +93,12 @@ class Layout:
             rows[..., -1] = 0.0 if log_odds is None else log_odds
         return columns
 
+    def estimates(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Means (N, K, D) and constants (N, K, A) of columns (K, fields, N) of single Gaussians, as views."""
+        rows, end = columns.transpose(2, 0, 1), self.gaussian_fields
+        const = rows[..., end : end + self.landmark.constants] if self.landmark.constants else None
+        return rows[..., : self.landmark.dim], const
+
     def unpack(self, columns: np.ndarray) -> Records:
         """Columns (K, fields, N) as records."""
         rows = columns.transpose(2, 0, 1)

@@ -226,6 +226,8 @@ class Lineage:
 
     def _grow(self) -> None:
         """Takes the ancestors that are pending into the forest."""
+        if self._is_planted and not self._pending:
+            return
         self._forget()
         if not self._is_planted:
             self._plant()

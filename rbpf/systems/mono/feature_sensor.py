@@ -319,6 +319,8 @@ class FeatureSensor(Sensor):
             is_old = is_new & np.isin(frame.landmarks, belief.map.old.ids)
             belief.map.bring_back(frame.landmarks[is_old & ~self.amiss(belief, frame)])
             is_new &= ~is_old
+        if not is_new.any():
+            return []
         new = np.flatnonzero(is_new & self.camera.inside(frame.z))
         new = new[np.isfinite(self.camera.unproject(frame.z[new])).all(axis=-1)][: self.max_new_per_frame]
         if not new.size:
