@@ -320,10 +320,10 @@ def _projected(point, nearness, camera):
     return left, down, left - camera[4] * nearness / point[2]
 
 
-# Triples side by side: of each of three points z⁻, z and W by rows, the motion T, and of the points' nine pixels, whitened,
-# the derivatives (6) and the error; then products of these seven columns, Σ aᵢ bᵢ for b ≤ a, by rows.
-_POINT, _POSE, _SLOPE, _PRODUCTS = 15 * _LANES, 45 * _LANES, 52 * _LANES, 115 * _LANES
-_GUESSED, _ALIGNED, _OF_TRIPLES = _SLOPE, _SLOPE + _LANES, 143 * _LANES
+# Triples side by side: of each of three points z⁻, z and W by rows, the motion T, and of one of them, which is copied, three
+# pixels' derivatives (6), whitened, and their error; then products of these seven columns, Σ aᵢ bᵢ for b ≤ a, by rows.
+_POINT, _POSE, _ONE, _SLOPE, _PRODUCTS = 15 * _LANES, 45 * _LANES, 52 * _LANES, 67 * _LANES, 88 * _LANES
+_GUESSED, _MISSED, _OF_TRIPLES = _SLOPE, _SLOPE + _LANES, 116 * _LANES
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -345,31 +345,33 @@ def _put_motion(lanes, i, quat, shift):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _add_squared(lanes, n, place, camera, total):
-    # Adds a point's squared distance from the motion, infinite behind the camera.
-    for i in range(n):
-        quat, shift = _motion(lanes, i)
-        point, nearness = _transformed(quat, shift, _three(lanes, place, i), camera)
-        miss = _difference(_three(lanes, place + 3 * _LANES, i), _projected(point, nearness, camera))
-        p, q, r = _white(lanes, place, i, miss)
-        squared = lanes[total + i] + p * p + q * q + r * r
-        lanes[total + i] = squared if point[2] > 0.0 else np.inf
+def _take_point(lanes, j):
+    # To a place that is a constant: what is written out for each of three takes three times as long to compile.
+    for i in range(_POINT):
+        lanes[_ONE + i] = lanes[j * _POINT + i]
 
 
 @njit(cache=True, error_model="numpy")
-def _squared_distances(lanes, n, camera, total):
-    lanes[total : total + n] = 0.0
-    _add_squared(lanes, n, 0, camera, total)
-    _add_squared(lanes, n, _POINT, camera, total)
-    _add_squared(lanes, n, 2 * _POINT, camera, total)
+def _squared_distances(lanes, n, camera):
+    # Of the points from the motion, infinite where one is behind the camera.
+    lanes[_MISSED : _MISSED + n] = 0.0
+    for j in range(3):
+        _take_point(lanes, j)
+        for i in range(n):
+            quat, shift = _motion(lanes, i)
+            point, nearness = _transformed(quat, shift, _three(lanes, _ONE, i), camera)
+            miss = _difference(_three(lanes, _ONE + 3 * _LANES, i), _projected(point, nearness, camera))
+            p, q, r = _white(lanes, _ONE, i, miss)
+            squared = lanes[_MISSED + i] + p * p + q * q + r * r
+            lanes[_MISSED + i] = squared if point[2] > 0.0 else np.inf
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _put_slopes(lanes, n, place, camera, slope):
-    # Of a point. One behind the camera counts as one at infinity that is seen at the pixels (0, 0, 0).
+def _put_slopes(lanes, n, camera):
+    # Of the point that was taken. One behind the camera counts as one at infinity that is seen at the pixels (0, 0, 0).
     for i in range(n):
         quat, shift = _motion(lanes, i)
-        point, nearness = _transformed(quat, shift, _three(lanes, place, i), camera)
+        point, nearness = _transformed(quat, shift, _three(lanes, _ONE, i), camera)
         seen, front = _projected(point, nearness, camera), point[2] > 0.0
         seen = (seen[0] if front else 0.0, seen[1] if front else 0.0, seen[2] if front else 0.0)
         x, y = point[0] if front else -camera[2] / camera[0], point[1] if front else -camera[3] / camera[1]
@@ -377,14 +379,14 @@ def _put_slopes(lanes, n, place, camera, slope):
         left = _pixel_row(False, point, nearness, seen[0], camera)
         down = _pixel_row(True, point, nearness, seen[1], camera)
         right = _pixel_row(False, point, nearness, seen[2], camera)
-        miss = _difference(_three(lanes, place + 3 * _LANES, i), seen)
-        _put_column(lanes, slope, i, _white(lanes, place, i, (left[0], down[0], right[0])))
-        _put_column(lanes, slope + _LANES, i, _white(lanes, place, i, (left[1], down[1], right[1])))
-        _put_column(lanes, slope + 2 * _LANES, i, _white(lanes, place, i, (left[2], down[2], right[2])))
-        _put_column(lanes, slope + 3 * _LANES, i, _white(lanes, place, i, (left[3], down[3], right[3])))
-        _put_column(lanes, slope + 4 * _LANES, i, _white(lanes, place, i, (left[4], down[4], right[4])))
-        _put_column(lanes, slope + 5 * _LANES, i, _white(lanes, place, i, (left[5], down[5], right[5])))
-        _put_column(lanes, slope + 6 * _LANES, i, _white(lanes, place, i, miss))
+        miss = _difference(_three(lanes, _ONE + 3 * _LANES, i), seen)
+        _put_column(lanes, _SLOPE, i, _white(lanes, _ONE, i, (left[0], down[0], right[0])))
+        _put_column(lanes, _SLOPE + _LANES, i, _white(lanes, _ONE, i, (left[1], down[1], right[1])))
+        _put_column(lanes, _SLOPE + 2 * _LANES, i, _white(lanes, _ONE, i, (left[2], down[2], right[2])))
+        _put_column(lanes, _SLOPE + 3 * _LANES, i, _white(lanes, _ONE, i, (left[3], down[3], right[3])))
+        _put_column(lanes, _SLOPE + 4 * _LANES, i, _white(lanes, _ONE, i, (left[4], down[4], right[4])))
+        _put_column(lanes, _SLOPE + 5 * _LANES, i, _white(lanes, _ONE, i, (left[5], down[5], right[5])))
+        _put_column(lanes, _SLOPE + 6 * _LANES, i, _white(lanes, _ONE, i, miss))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -395,15 +397,13 @@ def _put_column(lanes, place, i, v):
 @njit(cache=True, error_model="numpy")
 def _solve_triples(lanes, n, camera):
     """Puts a step of Gauss-Newton (6) into the last row of the products."""
-    _put_slopes(lanes, n, 0, camera, _SLOPE)
-    _put_slopes(lanes, n, _POINT, camera, _SLOPE + 21 * _LANES)
-    _put_slopes(lanes, n, 2 * _POINT, camera, _SLOPE + 42 * _LANES)
-    for a in range(7):
-        for b in range(min(a + 1, 6)):
-            out = _at(a, b)
-            lanes[out : out + n] = 0.0
-            for row in range(0, 9, 3):
-                p, q = _SLOPE + (7 * row + a) * _LANES, _SLOPE + (7 * row + b) * _LANES
+    lanes[_PRODUCTS:] = 0.0
+    for j in range(3):
+        _take_point(lanes, j)
+        _put_slopes(lanes, n, camera)
+        for a in range(7):
+            for b in range(min(a + 1, 6)):
+                out, p, q = _at(a, b), _SLOPE + a * _LANES, _SLOPE + b * _LANES
                 for i in range(n):
                     total = lanes[out + i] + lanes[p + i] * lanes[q + i]
                     total = total + lanes[p + 7 * _LANES + i] * lanes[q + 7 * _LANES + i]
@@ -454,13 +454,14 @@ def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motio
                     for b in range(3):
                         lanes[place + (6 + 3 * a + b) * _LANES] = white[k, a, b]
             _put_motion(lanes, i, guess[0], guess[1])
-        _squared_distances(lanes, n, camera, _GUESSED)
+        _squared_distances(lanes, n, camera)
         for i in range(n):
+            lanes[_GUESSED + i] = lanes[_MISSED + i]
             quat, shift = _align(before, now, rows[first + i])
             _put_motion(lanes, i, quat, shift)
-        _squared_distances(lanes, n, camera, _ALIGNED)
+        _squared_distances(lanes, n, camera)
         for i in range(n):
-            if lanes[_GUESSED + i] < lanes[_ALIGNED + i]:
+            if lanes[_GUESSED + i] < lanes[_MISSED + i]:
                 _put_motion(lanes, i, guess[0], guess[1])
         for _ in range(steps):
             _solve_triples(lanes, n, camera)
@@ -469,4 +470,6 @@ def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motio
                 turn, way = exp_pair(_three(lanes, _at(6, 0), i), _three(lanes, _at(6, 3), i))
                 way = turned(quat, way)
                 _put_motion(lanes, i, multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2]))
-        motions[first : first + n] = lanes[_POSE:_SLOPE].reshape(7, _LANES)[:, :n].T
+        for i in range(n):
+            for a in range(7):
+                motions[first + i, a] = lanes[_POSE + a * _LANES + i]

@@ -70,11 +70,14 @@ def load_record(pool, slab, rows, start, count, mean, cov, const):
         apart |= rows[start + i] != first + i
     if not apart:  # as before the first resampling after it was written
         for f in range(dim):
-            mean[f, :count] = pool[slab, f, first : first + count]
+            for i in range(count):
+                mean[f, i] = pool[slab, f, first + i]
         for f in range(size_cov):
-            cov[f, :count] = pool[slab, dim + f, first : first + count]
+            for i in range(count):
+                cov[f, i] = pool[slab, dim + f, first + i]
         for f in range(size_const):
-            const[f, :count] = pool[slab, dim + size_cov + f, first : first + count]
+            for i in range(count):
+                const[f, i] = pool[slab, dim + size_cov + f, first + i]
         return
     for f in range(dim):
         for i in range(count):

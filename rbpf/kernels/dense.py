@@ -56,8 +56,9 @@ def fit_robustly(white, slope, rounds, scale, u, info):
     off = np.empty(p)
     u[:] = 0.0
     for _ in range(rounds):
-        info[:] = np.eye(rank)
-        total[:] = 0.0
+        info[:] = total[:] = 0.0
+        for r in range(rank):
+            info[r, r] = 1.0
         for k in range(count):
             squared = 0.0
             for a in range(p):
@@ -75,7 +76,8 @@ def fit_robustly(white, slope, rounds, scale, u, info):
         chol = info.copy()
         factor(chol)
         solve(chol, total)
-        u[:] = total
+        for r in range(rank):
+            u[r] = total[r]
 
 
 @njit(void(MATRIX, CUBE, MATRIX, MATRIX), cache=True, error_model="numpy")
@@ -300,8 +302,10 @@ def add_turned(said, weight, turn):
     """Adds to `said` (R, 1 + d, N), from its second column on, rows `weight` (R, d) times each particle's `turn` (N, d, d)."""
     count, size, particles = said.shape
     lanes = np.empty((size - 1, size - 1, particles))
-    for i in range(particles):
-        lanes[:, :, i] = turn[i]
+    for a in range(size - 1):
+        for b in range(size - 1):
+            for i in range(particles):
+                lanes[a, b, i] = turn[i, a, b]
     for r in range(count):
         for a in range(size - 1):
             for b in range(size - 1):

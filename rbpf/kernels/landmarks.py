@@ -291,10 +291,11 @@ def project(fused, records, mode, weights, factor, sizes, mean, cov):
     offset = np.empty((p, n_particles))
     nothing = np.zeros((p, p))
     at, anchor = np.empty((size, BLOCK)), np.empty(p)
-    lanes.load_states(state, mode, 1, at)
+    one = int64(1)  # for a literal all that takes it is compiled once more
+    lanes.load_states(state, mode, one, at)
     for k in range(mean.shape[0]):
         cov[k] = 0.0
-        lanes.load_record(pool, slabs[k], maps[which[k]], mode, 1, record, packed_cov, const)
+        lanes.load_record(pool, slabs[k], maps[which[k]], mode, one, record, packed_cov, const)
         kernel(at, record, const, nothing[0], params, 1, nu, jac_state, jac_map)
         for a in range(p):
             anchor[a] = -nu[a, 0]

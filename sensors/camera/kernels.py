@@ -124,8 +124,8 @@ def camera_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     across, down = flat(jac_state[0]), flat(jac_state[1])
     locate(pose, flat(mean), n, by_point)
     measure(by_point, z[0], z[1], params, n, flat(nu), across, down)
-    turn(pose, across, n, by_point)
-    turn(pose, down, n, by_point[3 * BLOCK :])
+    for a in range(2):
+        turn(pose, flat(jac_state[a]), n, by_point[3 * a * BLOCK :])
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -154,9 +154,8 @@ def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     _store_pixel(by_point, fx, 0.0, 0.0, n, left)
     _store_pixel(by_point, 0.0, fy, 0.0, n, down)
     _store_pixel(by_point, fx, 0.0, baseline, n, right)
-    turn(pose, left, n, by_point)
-    turn(pose, down, n, by_point[3 * BLOCK :])
-    turn(pose, right, n, by_point[6 * BLOCK :])
+    for a in range(3):
+        turn(pose, flat(jac_state[a]), n, by_point[3 * a * BLOCK :])
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -200,10 +199,10 @@ def _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
         x, y, depth = back(r, a, b, c)
         by_ray[i], by_ray[BLOCK + i], by_ray[2 * BLOCK + i] = x, y, clamp_depth(x, y, depth)
     measure(by_ray, z[0], z[1], params, n, flat(nu), across, down)
-    _turn_ray(pose, anchor, across, n, by_ray)
-    _turn_ray(pose, anchor, down, n, by_ray[3 * BLOCK :])
-    _scale_shift(ray, n, across)
-    _scale_shift(ray, n, down)
+    for a in range(2):
+        row = flat(jac_state[a])
+        _turn_ray(pose, anchor, row, n, by_ray[3 * a * BLOCK :])
+        _scale_shift(ray, n, row)
 
 
 @observation_kernel
