@@ -57,7 +57,7 @@ from rbpf.maps.joint.rows import (
     spread_of,
     turned,
 )
-from rbpf.maps.joint.solution import Given, SubMap
+from rbpf.maps.joint.solution import Constants, Given, SubMap
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
 from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations
@@ -89,11 +89,12 @@ class JointMap(Map):
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
         substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
             frame; None has none. It may be observed together with a landmark.
+        is_constant: the substate never changes, as what a sensor or the wheels get wrong: all sub-maps have it in common.
         compiled: use the models' fused kernels where they have one.
         submap: landmarks with which a sub-map ends at the latest (`LOCAL`), so that a step costs the same however large the
             map becomes; None keeps one Gaussian. Nothing may be observed in the world.
         passed_on: a sub-map ends when landmarks are `put_away`, and what stays goes over into the next one, as always with a
-            substate; else that begins with nothing.
+            substate that changes; else that begins with nothing.
         unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
 
     Attributes:
@@ -114,6 +115,7 @@ class JointMap(Map):
         submap: int | None = None,
         passed_on: bool = False,
         unnamed: bool = False,
+        is_constant: bool = False,
     ) -> None:
         self.space, self.compiled = space, compiled
         self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
@@ -123,12 +125,14 @@ class JointMap(Map):
         gaussian.psd_factor(cov)
         self._substate, self._first = (mean, cov), space.dim + mean.size
         self.held = JointColumns(space, self._first, [self.point])
-        self.submap, self.passed_on, self.unnamed = submap, passed_on or mean.size > 0, unnamed
+        self.submap, self.unnamed = submap, unnamed
+        self.passed_on = passed_on or (mean.size > 0 and not is_constant)
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n, self._next_id = n, 0
-        self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed)
+        constants = [] if self.passed_on else [Constants(*self._substate)]
+        self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed, *constants)
         self._given_ids = self.leaving = self._returning = np.zeros(0, dtype=np.int64)
         self._observed = self.leaving  # in a step what has been observed already, which stays until that ends
         self._begin_submap()
@@ -145,12 +149,12 @@ class JointMap(Map):
         self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(cov)
 
     def _begin_submap(self) -> None:
-        """At the robot, with no landmark."""
+        """At the robot, with no landmark, and with what all sub-maps say of their constants."""
         d, n = self.space.dim, self.n
         self.origin = self.space.identity()
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
-        self.mean[:, d:], self.cov[d:, d:] = self._substate
+        self.mean[:, d:], self.cov[d:, d:] = self._substate if self.passed_on else self.old.known
         self.held = JointColumns(self.space, self._first, self.held.kinds)
         self._reach = 0.0  # distance from the frame at which its landmarks were begun, at most
         self._leave_step()

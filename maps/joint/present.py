@@ -30,8 +30,17 @@ class Present:
         """As it would be if it ended here."""
         points = self.held.table.ids[self.held.table.kind == 0]
         columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
-        used = np.append(np.arange(self.held.space.dim), columns)
-        return SubMap(self.origin, points, self.mean[columns], self.cov[np.ix_(used, used)], given=old.given(given))
+        d, k = self.held.space.dim, old.constants.size
+        used = np.concatenate([np.arange(d), columns.ravel(), np.arange(d, d + k)])
+        return SubMap(
+            self.origin,
+            points,
+            self.mean[columns],
+            self.cov[np.ix_(used, used)],
+            given=old.given(given),
+            constants=self.mean[d : d + k],
+            known=old.known if old.maps else None,
+        )
 
     def pass_on(self, old: SubMaps, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:
         """Ends it, and begins the next one; what does not leave goes over as it is.

@@ -27,10 +27,17 @@ class Given(NamedTuple):
     cov: np.ndarray
 
 
+class Constants(NamedTuple):
+    """What is the same in all sub-maps, Mathematics (submap-constants): mean (k,) and covariance (k, k)."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+
+
 class SubMap(NamedTuple):
     """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
 
-    `cov` is that of the end, in its right chart, and the points, (d + MD, d + MD).
+    `cov` is that of the end, in its right chart, the points and the `constants` (k,), (d + MD + k, d + MD + k).
     """
 
     end: np.ndarray
@@ -39,11 +46,19 @@ class SubMap(NamedTuple):
     cov: np.ndarray
     tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
     given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
+    constants: np.ndarray = np.zeros(0)
+    known: Constants | None = None  #: what was known of these before it; None in the first one, whose prior is its own.
 
     def seeing(self, seen: Given) -> "SubMap":
         """With landmarks that are seen from its end besides."""
         cov = block_diag(self.cov, seen.cov)
         return self._replace(ids=np.append(self.ids, seen.ids), points=np.append(self.points, seen.points, 0), cov=cov)
+
+
+def columns_of(d: int, dim: int, rows: np.ndarray, cov: np.ndarray, constants: int) -> np.ndarray:
+    """Columns (d + KD + k,) of a Gaussian's pose, of points by row (K,), and of the constants at its end."""
+    last = np.arange(len(cov) - constants, len(cov))
+    return np.concatenate([np.arange(d), (d + dim * rows[:, None] + np.arange(dim)).ravel(), last])
 
 
 def inverse_of(cov: np.ndarray) -> np.ndarray:
@@ -73,11 +88,12 @@ class Factor(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Landmarks (M,) in the world (M, D) and all starts, the information (n, n) of both, and what solves with it."""
+    """Landmarks (M,) in the world (M, D), all starts, the constants, the information (n, n) of all, what solves with it."""
 
     ids: np.ndarray
     world: np.ndarray
     starts: np.ndarray
+    constants: np.ndarray
     factors: list[Factor]
     information: sparse.csc_matrix
     solver: SuperLU
@@ -86,14 +102,15 @@ class Solution(NamedTuple):
     def seen_from(
         self, space: SE2Group | SE3Group | Euclidean, number: int, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks by rows (K,) as seen from a start by number (K, D), and the covariance of it and them (d + KD, d + KD)."""
+        """Landmarks by rows (K,) as seen from a start by number (K, D), and the covariance of it, them and the constants."""
         d, dim = space.dim, self.world.shape[1]
         start, first = self.starts[number], d * (len(self.starts) - 1)
         seen = space.inverse_transform(start, self.world[rows])
-        columns = np.append(d * number - d + np.arange(d), first + dim * rows[:, None] + np.arange(dim))
-        turn = np.eye(columns.size)
-        turn[d:, :d] = -space.transform_jacobian(seen).reshape(-1, d)
-        turn[d:, d:] = np.kron(np.eye(rows.size), space.rotation(start).T)
+        points, last = (first + dim * rows[:, None] + np.arange(dim)).ravel(), first + self.world.size
+        columns = np.concatenate([d * number - d + np.arange(d), points, last + np.arange(self.constants.size)])
+        turn, own = np.eye(columns.size), slice(d, d + points.size)
+        turn[own, :d] = -space.transform_jacobian(seen).reshape(-1, d)
+        turn[own, own] = np.kron(np.eye(rows.size), space.rotation(start).T)
         return seen, gaussian.symmetrise(turn @ self.marginal(columns) @ turn.T)
 
     def marginal(self, columns: np.ndarray) -> np.ndarray:
@@ -127,24 +144,27 @@ def solve(
     ids: np.ndarray,
     starts: np.ndarray,
     world: np.ndarray,
+    constants: np.ndarray,
     is_whole: bool = True,
 ) -> Solution:
     """Gauss-Newton over all starts and some landmarks (M,); the others of a sub-map are left out of its factor.
 
-    It begins at `starts` (T + 1, E), of T sub-maps and of the next one, and at landmarks in the `world` (M, D). What
-    sub-maps were given is taken off. Where that leaves no minimum, as when a filter has diverged, it is not.
+    It begins at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
+    `constants` (k,). What sub-maps were given, or knew of constants before, is taken off. Where that leaves no minimum, as
+    when a filter has diverged, it is not.
     """
-    d, dim, first_guess = space.dim, world.shape[1], (starts, world)
+    d, dim, k, first_guess = space.dim, world.shape[1], constants.size, (starts, world, constants)
     starts, world = starts.copy(), world.copy()
     place = {landmark: row for row, landmark in enumerate(ids.tolist())}
     first = d * len(maps)
-    size = first + dim * ids.size
-    parts = []
+    size = first + dim * ids.size + k
+    common, parts = np.arange(size - k, size), []
     for number, each in enumerate(maps):
         rows = np.array([row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64)
-        own = np.append(np.arange(d), d + dim * rows[:, None] + np.arange(dim))
+        own = columns_of(d, dim, rows, each.cov, k)
         at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
+        columns = np.append(columns, common)
         cov = each.cov[np.ix_(own, own)]
         if each.given is not None:
             # A short one may know what drives the motion exactly from its start.
@@ -162,7 +182,9 @@ def solve(
             at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
             taken.append((number, each.given.points, at, columns, inverse_of(each.given.cov)))
-    blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
+    before = [(each.known.mean, inverse_of(each.known.cov)) for each in maps if each.known is not None and is_whole]
+    known = sum((info for _, info in before), np.zeros((k, k)))
+    blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken] + [common]
     where = np.concatenate([np.repeat(columns, columns.size) for columns in blocks])
     across = np.concatenate([np.tile(columns, columns.size) for columns in blocks])
     free = (where >= 0) & (across >= 0)  # the first start is where the world is
@@ -173,47 +195,55 @@ def solve(
             begin, end = starts[number], starts[number + 1]
             between = space.between(begin, end)
             error, seen = space.local(each.end, between), space.inverse_transform(end, world[at])
-            residual = np.append(error, seen - each.points[rows])
+            residual = np.concatenate([error, (seen - each.points[rows]).ravel(), constants - each.constants])
             by_ends, back = np.zeros((residual.size, 2 * d)), space.right_jacobian_inverse(error)
             by_ends[:d, :d] = -back @ space.adjoint(space.inverse(between))
             by_ends[:d, d:] = back
-            by_ends[d:, d:] = -space.transform_jacobian(seen).reshape(-1, d)
-            slope, half, product = _weighed(info, by_ends, space.rotation(end), d)
+            by_ends[d : d + seen.size, d:] = -space.transform_jacobian(seen).reshape(-1, d)
+            slope, half, product = _weighed(info, by_ends, space.rotation(end), d, k)
             entries.append(product.ravel())
             gradient[columns] += half @ residual  # columns below zero fall behind the end
             factors.append(Factor(own, columns, info, residual, slope))
         for number, points, at, columns, info in taken:
             seen = space.inverse_transform(starts[number], world[at])
             by_start = -space.transform_jacobian(seen).reshape(-1, d)
-            _, half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0)
+            _, half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0, 0)
             entries.append(product.ravel())
             gradient[columns] += half @ (seen - points).ravel()
+        entries.append(-known.ravel())
+        gradient[common] -= sum((info @ (constants - mean) for mean, info in before), np.zeros(k))
         information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
         solver = splu(information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
-        if taken and not solver.U.diagonal().min() > 0.0:
+        if (taken or before) and not solver.U.diagonal().min() > 0.0:
             return solve(space, maps, ids, *first_guess, is_whole=False)
         step = -solver.solve(gradient[:size])
         starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
-        world += step[first:].reshape(-1, dim)
+        world += step[first : size - k].reshape(-1, dim)
+        constants = constants + step[size - k :]
         if np.abs(step).max() < CLOSE_ENOUGH:
             break
-    return Solution(ids, world, starts, factors, information, solver, is_whole)
+    return Solution(ids, world, starts, constants, factors, information, solver, is_whole)
 
 
-def _weighed(info: np.ndarray, by_poses: np.ndarray, rotation: np.ndarray, first: int) -> tuple[np.ndarray, ...]:
+def _weighed(
+    info: np.ndarray, by_poses: np.ndarray, rotation: np.ndarray, first: int, k: int
+) -> tuple[np.ndarray, ...]:
     """A slope J, Jᵀ I and Jᵀ I J of a residual whose information is I (r, r), at the work of their entries.
 
-    J has columns of poses (r, c), and behind them those of landmarks, each with Rᵀ in rows of its own from the `first` on.
+    J has columns of poses (r, c), then those of landmarks, each with Rᵀ in rows of its own from the `first` on, then those
+    of k constants, each with 1 in one of the last rows.
     """
     rows, poses, dim = len(info), by_poses.shape[1], len(rotation)
-    count = (rows - first) // dim
-    slope = np.concatenate([by_poses, np.zeros((rows, count * dim))], axis=1)
-    slope[first:, poses:] = np.kron(np.eye(count), rotation.T)
-    half = np.concatenate(
-        [by_poses.T @ info, (rotation @ info[first:].reshape(count, dim, rows)).reshape(count * dim, rows)]
-    )
-    turned = half[:, first:].reshape(len(half), count, dim) @ rotation.T
-    return slope, half, np.concatenate([half @ by_poses, turned.reshape(len(half), count * dim)], axis=1)
+    last = rows - k
+    count = (last - first) // dim
+    slope = np.concatenate([by_poses, np.zeros((rows, last - first + k))], axis=1)
+    slope[first:last, poses : poses + last - first] = np.kron(np.eye(count), rotation.T)
+    slope[last:, poses + last - first :] = np.eye(k)
+    by_points = (rotation @ info[first:last].reshape(count, dim, rows)).reshape(count * dim, rows)
+    half = np.concatenate([by_poses.T @ info, by_points, info[last:]])
+    turned = half[:, first:last].reshape(len(half), count, dim) @ rotation.T
+    turned = turned.reshape(len(half), count * dim)
+    return slope, half, np.concatenate([half @ by_poses, turned, half[:, last:]], axis=1)
 
 
 def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
@@ -228,6 +258,7 @@ def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, betw
     points[rows] = space.transform(between, old.points)
     points[: new.ids.size] = new.points
     starts = np.array([space.identity(), new.end, space.compose(new.end, between)])
-    both = [new, old._replace(tied=False, given=None)]
-    solution = solve(space, both, ids, starts, space.transform(new.end, points))
-    return SubMap(solution.starts[1], ids, *solution.seen_from(space, 1, np.arange(ids.size)))
+    both = [new._replace(known=None), old._replace(tied=False, given=None)]
+    solution = solve(space, both, ids, starts, space.transform(new.end, points), new.constants)
+    seen, cov = solution.seen_from(space, 1, np.arange(ids.size))
+    return SubMap(solution.starts[1], ids, seen, cov, constants=solution.constants, known=new.known)

@@ -14,7 +14,7 @@ from copy import copy
 from typing import NamedTuple, final
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import block_diag, cho_solve, solve_triangular
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
@@ -22,7 +22,19 @@ from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.lie import Array, Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
-from rbpf.maps.joint.solution import CLOSE_ENOUGH, EXACT, ITERATIONS, Given, Solution, SubMap, fused, inverse_of, solve
+from rbpf.maps.joint.solution import (
+    CLOSE_ENOUGH,
+    EXACT,
+    ITERATIONS,
+    Constants,
+    Given,
+    Solution,
+    SubMap,
+    columns_of,
+    fused,
+    inverse_of,
+    solve,
+)
 
 ROUNDING = 1e-12
 """Variance [m²] below which nothing is told apart."""
@@ -68,6 +80,7 @@ class SubMaps:
         dim: D, of a point.
         most: landmarks that are kept about the start of the present sub-map, besides those of the last one.
         unnamed: keep what is `beside` the present one.
+        constants: what is the same in all sub-maps (k,), and what is known of it before.
 
     Attributes:
         frame: where there are finished ones, what they and the present one, as last looked at, say of its end.
@@ -76,17 +89,26 @@ class SubMaps:
         starts: the world's origin, and world_from_end (E,) of each; the last one is where the present one starts.
         near: (K,) landmarks about the last start.
         points: (K, D) where they are, as seen from it.
-        cov: (d + KD, d + KD) of the last start, in its right chart, and of `points`.
+        constants: (k,) what all sub-maps together say of them.
+        cov: (d + KD + k, d + KD + k) of the last start, in its right chart, of `points` and of the constants.
     """
 
-    def __init__(self, space: SE2Group | SE3Group | Euclidean, dim: int, most: int, unnamed: bool = False) -> None:
+    def __init__(
+        self,
+        space: SE2Group | SE3Group | Euclidean,
+        dim: int,
+        most: int,
+        unnamed: bool = False,
+        constants: Constants = Constants(np.zeros(0), np.zeros((0, 0))),  # noqa: B008
+    ) -> None:
         self.space, self.dim, self.most, self.unnamed = space, dim, most, unnamed
         self.frame: Estimate | None = None
         self.beside: Beside | None = None
         self.maps: list[SubMap] = []
         self.starts = [space.identity()]
         self.near, self.points = np.zeros(0, dtype=np.int64), np.zeros((0, dim))
-        self.cov = np.zeros((space.dim, space.dim))
+        self.constants = constants.mean
+        self.cov = block_diag(np.zeros((space.dim, space.dim)), constants.cov)
         self._places: tuple[np.ndarray, np.ndarray] | None = None
         self._factor_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
         self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
@@ -95,6 +117,12 @@ class SubMaps:
     def start(self) -> np.ndarray:
         """World_from_start (E,) of the present sub-map."""
         return self.starts[-1]
+
+    @property
+    def known(self) -> Constants:
+        """The constants, by all that is finished."""
+        own = slice(len(self.cov) - self.constants.size, None)
+        return Constants(self.constants, self.cov[own, own])
 
     def returned(self, ids: np.ndarray) -> np.ndarray:
         """Which landmarks (K,) are of old sub-maps, and not among those about the start."""
@@ -202,7 +230,7 @@ class SubMaps:
         else:
             about, present = self._of_both(present)
             x, cov, half, _ = about._tied(present)
-            ends = np.append(np.arange(d), d + self.dim * about.near.size + np.arange(d))
+            ends = np.append(np.arange(d), len(about.cov) + np.arange(d))
             x, own = x[ends], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
         end = space.retract(present.end, x[d:])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
@@ -214,7 +242,8 @@ class SubMaps:
         """The start and the present sub-map, without the landmarks that one of them alone has: these do not move ends."""
         d, dim, about = self.space.dim, self.dim, copy(self)
         mine, its = (np.flatnonzero(np.isin(*pair)) for pair in ((self.near, present.ids), (present.ids, self.near)))
-        columns, theirs = (np.append(np.arange(d), d + dim * rows[:, None] + np.arange(dim)) for rows in (mine, its))
+        columns = columns_of(d, dim, mine, self.cov, self.constants.size)
+        theirs = columns_of(d, dim, its, present.cov, self.constants.size)
         about.near, about.points, about.cov = self.near[mine], self.points[mine], self.cov[np.ix_(columns, columns)]
         cov = present.cov[np.ix_(theirs, theirs)]
         return about, present._replace(ids=present.ids[its], points=present.points[its], cov=cov)
@@ -230,18 +259,19 @@ class SubMaps:
         return Estimate(mean, gaussian.symmetrise(turn @ cov @ turn.T))
 
     def _followed(self, new: SubMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What a new sub-map says of landmarks it was given moves all about the start, of which these rows (R,) of `cov`.
+        """What a new sub-map says of landmarks it was given, and of constants, moves these rows (R,) of `cov`.
 
         They are known by it now, with all that was known before: the rest is what it was given them, Mathematics
         (passed-on). Returns how far the rows move (R,), by what slope with the new sub-map (R, d + MD), and what is left
         of their covariance given it.
         """
-        space, d, dim = self.space, self.space.dim, self.dim
+        space, d, dim, k = self.space, self.space.dim, self.dim, self.constants.size
         by_new = np.zeros((rows.size, len(new.cov)))
-        if new.given is None:
+        if new.given is None and not k:
             return np.zeros(rows.size), by_new, self.cov[np.ix_(rows, rows)]
-        _, mine, its = np.intersect1d(self.near, new.given.ids, assume_unique=True, return_indices=True)
-        columns = (d + dim * mine[:, None] + np.arange(dim)).ravel()
+        names = self.near[:0] if new.given is None else new.given.ids
+        _, mine, its = np.intersect1d(self.near, names, assume_unique=True, return_indices=True)
+        columns = columns_of(d, dim, mine, self.cov, k)[d:]
         held = self._factor_of_given
         if held is None or held[0] is not self.cov or not np.array_equal(held[1], columns):
             own = self.cov[np.ix_(columns, columns)] + ROUNDING * np.eye(columns.size)
@@ -249,12 +279,13 @@ class SubMaps:
         cross = self.cov[np.ix_(columns, rows)]
         gain = cho_solve((held[2], True), cross, check_finite=False).T
         row_of = {landmark: row for row, landmark in enumerate(new.ids.tolist())}
-        theirs = np.array([row_of[landmark] for landmark in new.given.ids[its].tolist()])
-        seen = new.points[theirs]
-        by_points = gain.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)
-        by_new[:, (d + dim * theirs[:, None] + np.arange(dim)).ravel()] = by_points.reshape(rows.size, -1)
-        by_new[:, :d] = by_points.reshape(rows.size, -1) @ space.transform_jacobian(seen).reshape(-1, d)
-        moved = gain @ (space.transform(new.end, seen) - self.points[mine]).ravel()
+        theirs = np.array([row_of[landmark] for landmark in names[its].tolist()], dtype=np.int64)
+        seen, of_points, last = new.points[theirs], gain[:, : mine.size * dim], gain[:, mine.size * dim :]
+        by_points = (of_points.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)).reshape(rows.size, -1)
+        by_new[:, columns_of(d, dim, theirs, new.cov, k)[d:]] = np.concatenate([by_points, last], axis=1)
+        by_new[:, :d] = by_points @ space.transform_jacobian(seen).reshape(-1, d)
+        off = space.transform(new.end, seen) - self.points[mine]
+        moved = gain @ np.append(off, new.constants - self.constants)
         return moved, by_new, self.cov[np.ix_(rows, rows)] - gain @ cross
 
     def brought_back(self, ids: np.ndarray, present: SubMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -280,8 +311,7 @@ class SubMaps:
         And what turns rows of the Gaussian that is tied, (n, …), into theirs (KD, …).
         """
         space, d, dim = self.space, self.space.dim, self.dim
-        first = d + dim * self.near.size
-        turned = slice(first, first + d)
+        turned = slice(len(self.cov), len(self.cov) + d)
         end, theirs = space.retract(new.end, tied.mean[turned]), d + dim * others[:, None] + np.arange(dim)
         seen = space.inverse_transform(end, tied.mean[theirs])
         by_end = -space.transform_jacobian(seen) @ space.right_jacobian(tied.mean[turned])
@@ -358,18 +388,20 @@ class SubMaps:
         """One Kalman update by what is shared, without noise, of the Gaussians about the last start and the new end."""
         space, d, dim = self.space, self.space.dim, self.dim
         _, mine, its = np.intersect1d(self.near, new.ids, assume_unique=True, return_indices=True)
-        first = d + dim * self.near.size
-        size = first + d + dim * new.ids.size
-        cov = np.zeros((size, size))
-        cov[:first, :first], cov[first:, first:] = self.cov, new.cov
-        prior = np.concatenate([np.zeros(d), self.points.ravel(), np.zeros(d), new.points.ravel()])
+        first = len(self.cov)
+        size = first + len(new.cov)
+        cov = block_diag(self.cov, new.cov)
+        prior = np.concatenate(
+            [np.zeros(d), self.points.ravel(), self.constants, np.zeros(d), new.points.ravel(), new.constants]
+        )
         of_mine = d + dim * mine[:, None] + np.arange(dim)
         of_its = first + d + dim * its[:, None] + np.arange(dim)
-        if new.given is not None:
+        if new.given is not None or self.constants.size:
             moved, by_new, rest = self._followed(new, np.arange(first))
             prior[:first] += moved
             cov[:first, first:] = cross = by_new @ new.cov
             cov[first:, :first], cov[:first, :first] = cross.T, gaussian.symmetrise(rest + cross @ by_new.T)
+        if new.given is not None:
             fresh = ~np.isin(new.ids[its], new.given.ids)
             of_mine, of_its = of_mine[fresh], of_its[fresh]
         x, half, turned = prior, np.zeros((0, size)), slice(first, first + d)
@@ -397,8 +429,8 @@ class SubMaps:
         """About its end: it, its landmarks, and the old ones that it has not, as far as there is room."""
         space, d, dim = self.space, self.space.dim, self.dim
         x, cov, half, mine = tied = self._tied(new)
-        first = d + dim * self.near.size
-        turned = slice(first, first + d)
+        first, k = len(self.cov), self.constants.size
+        turned, points = slice(first, first + d), slice(first + d, len(x) - k)
         start, end = space.retract(self.start, x[:d]), space.retract(new.end, x[turned])
         by_start, by_end = (
             space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d]),
@@ -411,10 +443,11 @@ class SubMaps:
         seen, of_others = self._seen_from_end(tied, new, others)
 
         def of_all(rows: np.ndarray) -> np.ndarray:
-            return np.concatenate([by_start @ rows[:d] + by_end @ rows[turned], rows[first + d :], of_others(rows)])
+            ends = by_start @ rows[:d] + by_end @ rows[turned]
+            return np.concatenate([ends, rows[points], of_others(rows), rows[len(x) - k :]])
 
         self.near = np.append(new.ids, self.near[others])
-        self.points = np.concatenate([x[first + d :].reshape(-1, dim), seen])
+        self.points, self.constants = np.concatenate([x[points].reshape(-1, dim), seen]), x[len(x) - k :]
         self.cov = gaussian.symmetrise(of_all(of_all(cov - half.T @ half).T))
         self.starts[-1:] = [start, space.compose(start, end)]
         self._places = None
@@ -487,7 +520,7 @@ class SubMaps:
         return self._places
 
     def _solve(self, ids: np.ndarray) -> Solution:
-        return solve(self.space, self.maps, ids, np.array(self.starts), self._guess(ids))
+        return solve(self.space, self.maps, ids, np.array(self.starts), self._guess(ids), self.constants)
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
@@ -503,6 +536,7 @@ class SubMaps:
         kept = kept[last[kept] | (ids[kept] >= 0)]
         self.near = ids[kept]
         self.points, self.cov = solution.seen_from(self.space, len(self.maps), kept)
+        self.constants = solution.constants
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All of it, for a checkpoint."""
@@ -521,6 +555,15 @@ class SubMaps:
             "given_covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in given)]),
             "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
         }  # fmt: skip
+        if self.constants.size:
+            # What the first one knew of them is its own.
+            before = [each.known or Constants(each.constants, np.eye(each.constants.size)) for each in self.maps]
+            named |= {
+                "constants": np.array([each.constants for each in self.maps]).reshape(-1, self.constants.size),
+                "known": np.array([each.mean for each in before]).reshape(-1, self.constants.size),
+                "known_covs": np.array([each.cov for each in before]).reshape(-1, *2 * [self.constants.size]),
+                "near_constants": self.constants,
+            }
         named = {f"submaps/{name}": array for name, array in named.items()}
         if self.frame is not None:
             named |= {"joint/frame": self.frame.mean, "joint/frame_cov": self.frame.cov}
@@ -541,14 +584,19 @@ class SubMaps:
             "near": checkpoint.integers("near"), "near_points": checkpoint.numbers("near", self.dim),
             "near_cov": checkpoint.numbers("size", "size"),
         }  # fmt: skip
+        if k := self.constants.size:
+            schema |= {
+                "constants": checkpoint.numbers("maps", k), "near_constants": checkpoint.numbers(k),
+                "known": checkpoint.numbers("maps", k), "known_covs": checkpoint.numbers("maps", k, k),
+            }  # fmt: skip
         found = checkpoint.read(arrays, schema, "submaps/")
         d, dim, counts, known = self.space.dim, self.dim, found["counts"], found["given"]
         rows = {
-            "ids": counts, "points": counts, "covs": (d + dim * counts) ** 2,
+            "ids": counts, "points": counts, "covs": (d + dim * counts + k) ** 2,
             "given_ids": known, "given_points": known, "given_covs": (dim * known) ** 2,
         }  # fmt: skip
         parts = [checkpoint.split(found[name], each.tolist(), f"submaps/{name}") for name, each in rows.items()]
-        if len(found["starts"]) != len(counts) + 1 or len(found["near_cov"]) != d + found["near_points"].size:
+        if len(found["starts"]) != len(counts) + 1 or len(found["near_cov"]) != d + found["near_points"].size + k:
             raise InputError("the arrays submaps/starts and submaps/near_cov do not fit the sub-maps")
         self.maps, self._last = [], {}
         every = zip(found["ends"], found["tied"].tolist(), *parts, strict=True)
@@ -556,7 +604,12 @@ class SubMaps:
             if np.unique(names).size < names.size or not np.isin(others, names).all():
                 raise InputError("the arrays submaps/ids and submaps/given_ids name a landmark twice in a sub-map")
             own = Given(others, before, prior.reshape(before.size, before.size)) if others.size else None
-            self._hold(SubMap(end, names, places, cov.reshape(d + places.size, -1), bool(tied), own))
+            self._hold(SubMap(end, names, places, cov.reshape(d + places.size + k, -1), bool(tied), own))
+        if k:
+            before = [None, *map(Constants, found["known"][1:], found["known_covs"][1:])][: len(self.maps)]
+            every = zip(self.maps, found["constants"], before, strict=True)
+            self.maps = [each._replace(constants=own, known=prior) for each, own, prior in every]
+            self.constants = found["near_constants"]
         if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
             raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
         self.starts, self.near = list(found["starts"]), found["near"]

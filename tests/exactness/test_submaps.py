@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from rbpf import RangeBearingConfig, RangeBearingSlam
 from rbpf.core.filter import Filter
@@ -12,18 +13,22 @@ from rbpf.core.models import Part
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
-from rbpf.maps.joint.solution import Given, SubMap
+from rbpf.maps.joint.solution import Constants, Given, SubMap
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.point import Point
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
-from tests.exactness.models import Relative
+from tests.exactness.models import LinearMotion, Relative
 from tests.exactness.slam import DRIFTING, NOISE, STEP, Q, Walk
 
 RING = 80
 START = np.array([2.0, 0.5]), np.eye(2)
 """A velocity."""
+STEADY = LinearMotion(
+    np.eye(2), np.vstack([np.linalg.cholesky(Q), np.zeros((2, 2))]), np.eye(2), np.eye(2), np.zeros(2)
+)
+"""A `Walk` whose steps are alike, and not known."""
 
 
 class Reading:
@@ -77,12 +82,13 @@ def walk(steps: int = 14) -> tuple[list[Reading], np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("window", [1, 4])
 @pytest.mark.parametrize("submap", [4, 7, 100])
-def test_joined_they_say_what_one_gaussian_says(submap, window):
+@pytest.mark.parametrize(("motion", "start"), [(Walk(), None), (STEADY, (STEP + 0.3, 0.2 * np.eye(2)))])
+def test_joined_they_say_what_one_gaussian_says(submap, window, motion, start):
     readings, mean, cov = walk()
     n, tolerance = (10, 1e-6) if window == 1 else (2000, 0.05)  # a window's samples tell no more
-    whole, joint = (JointMap(Euclidean(2), submap=most) for most in (None, submap))
+    whole, joint = (JointMap(Euclidean(2), start, submap=most, is_constant=True) for most in (None, submap))
     options = {"n": n, "rng": np.random.default_rng(0), "consolidation": Consolidation(window)}
-    filters = [Filter(Walk(), NamedLandmarkSensor(Relative(), Point(2)), held, **options) for held in (whole, joint)]
+    filters = [Filter(motion, NamedLandmarkSensor(Relative(), Point(2)), held, **options) for held in (whole, joint)]
     for t, reading in enumerate(readings):
         for filter_ in filters:
             filter_.step(reading)
@@ -96,6 +102,9 @@ def test_joined_they_say_what_one_gaussian_says(submap, window):
     order = np.argsort(ids)
     assert window > 1 or len(joint.old.maps) == {4: 14, 7: 5, 100: 1}[submap]  # the last one ends as it reaches far
     np.testing.assert_array_equal(ids[order], np.arange(ids.size))
+    if start is not None:
+        names, *expected = whole.landmarks(filters[0].particles)
+        mean[2:], cov[2:, 2:] = expected[0][np.argsort(names)].ravel(), block_diag(*expected[1][np.argsort(names)])
     np.testing.assert_allclose(places[order].ravel(), mean[2:], rtol=1e-6, atol=tolerance)
     for row, own in enumerate(covs[order]):
         at = slice(2 + 2 * row, 4 + 2 * row)
@@ -150,24 +159,42 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
     np.testing.assert_allclose(covs, dense[at[:, :, None], at[:, None]], rtol=1e-4, atol=1e-6 * dense.max())
 
 
+def turning(space, each: SubMap, known: Constants, by: float) -> SubMap:
+    """What a robot makes of it whose turns are too large by as much in every sub-map, of which it knows something."""
+    first = 0 if space is SE2 else 2
+    end = space.retract(each.end, np.eye(space.dim)[first] * (by - known.mean[0]))
+    slope = np.vstack([-np.eye(len(each.cov))[:, [first]], [[1.0]]])
+    cov = block_diag(each.cov, 0.0) + slope @ known.cov @ slope.T
+    return each._replace(end=end, cov=cov, constants=known.mean, known=known)
+
+
 @pytest.mark.parametrize(
-    ("space", "count", "most"), [(SE2, 14, 10), (SE3, 14, 10), pytest.param(SE2, 30, 50, marks=pytest.mark.slow)]
-)
-def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most):
+    ("space", "count", "most", "by"),
+    [
+        (SE2, 14, 10, None), (SE3, 14, 10, None), (SE2, 14, 10, 0.1), (SE3, 14, 10, 0.1),
+        pytest.param(SE2, 30, 50, None, marks=pytest.mark.slow), pytest.param(SE2, 30, 50, 0.1, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most, by):
     """NEES per degree of freedom of the last start and the landmarks about it, over the runs; going round holds no more."""
-    pose, near = [], []
+    pose, near, common = [], [], []
     for seed in range(20):
         finished, ends, landmarks = ring(space, seed, count=count)
-        maps, closed = SubMaps(space, landmarks.shape[1], most), 0
+        prior = () if by is None else [Constants(np.zeros(1), np.full((1, 1), by**2))]
+        wrong = 0.0 if by is None else by * np.random.default_rng(seed).normal()
+        maps, closed = SubMaps(space, landmarks.shape[1], most, False, *prior), 0
         for each in finished:
             closed += bool(maps.returned(each.ids).any())
-            maps.join(each)
+            maps.join(each if by is None else turning(space, each, maps.known, wrong))
         assert closed and len(maps.maps) <= 14
         error, d = space.local(maps.start, ends[-1]), space.dim
         pose.append(error @ np.linalg.solve(maps.cov[:d, :d], error) / d)
         error = (maps.points - space.inverse_transform(ends[-1], landmarks[maps.near])).ravel()
-        near.append(error @ np.linalg.solve(maps.cov[d:, d:], error) / error.size)
-    for found in (pose, near):
+        own = slice(d, d + error.size)
+        near.append(error @ np.linalg.solve(maps.cov[own, own], error) / error.size)
+        if by is not None:
+            common.append((maps.known.mean[0] - wrong) ** 2 / maps.known.cov[0, 0])
+    for found in (pose, near, common)[: 2 if by is None else 3]:
         assert abs(np.mean(found) - 1.0) < 3.0 * np.std(found) / np.sqrt(len(found)) + 0.05
 
 

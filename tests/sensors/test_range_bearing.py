@@ -199,11 +199,11 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
         config = replace(SENSOR, submap=submap)
         path, slam, steps = run(log, config)
         assert path < 0.7 * run(log, off)[0] and bool(slam.joint.old.maps) == (submap == 10)
-        pose, cov = slam.sensor_pose()
+        pose, cov = slam.calibration.sensor_pose(slam.filter)
         error, within = space.local(pose, mount)[-dim:], cov[-dim:, -dim:]
         assert error @ np.linalg.solve(within, error) < 4.0 * dim and np.trace(within) < dim * 0.01**2
         given.append(pose)
-    np.testing.assert_allclose(*given, atol=0.002)
+    assert np.linalg.norm(space.local(*given)[-dim:]) < 0.5 * np.sqrt(np.trace(within))
     assert RangeBearingConfig.defaults({"calibrate": "online"}).window == SENSOR.window
     entries = slam.summary(steps)["calibration"]
     assert entries["x_m"] == space.translation(pose)[0] and entries["std_x_m"] == np.sqrt(within[0, 0])
@@ -211,7 +211,7 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     slam.save(tmp_path / "checkpoint.npz")
     again = RangeBearingSlam.of_log(log, config)
     again.load(tmp_path / "checkpoint.npz")
-    np.testing.assert_array_equal(again.sensor_pose()[0], pose)
+    np.testing.assert_array_equal(again.calibration.sensor_pose(again.filter)[0], pose)
     turned = RangeBearingSlam.of_log(log, replace(SENSOR, self_calibration=CalibrationConfig(yaw_deg=2.0)))
     assert turned.summary(steps)["calibration"]["std_yaw_deg"] == pytest.approx(2.0)
     assert run(there, SENSOR)[0] < 1.5 * run(there, off)[0]
@@ -229,7 +229,7 @@ def test_what_wheels_get_wrong_is_found_while_running(submap, calibrate, costs):
     log, config = replace(right, frames=frames), replace(SENSOR, window=5, calibrate=calibrate, submap=submap)
     off = replace(config, calibrate="off")
     path, slam, steps = run(log, config)
-    found, std = slam.wheels()
+    found, std = slam.calibration.wheels(slam.filter)
     # On a circle only how far the heading drifts in all is told, and nothing of turns to the right.
     told = wheel_errors(right.frames[1].delta)[0]
     assert abs(told @ (found - wrong)) < 0.1 * told @ wrong and std[2] == pytest.approx(0.05)

@@ -10,19 +10,20 @@ import numpy as np
 
 from rbpf.core.checkpoint import elements, integers, read_one
 from rbpf.core.diagnostics import motion_correction
-from rbpf.core.models import NULL, Part
+from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.motion.odometry import Odometry, OdometryMotion, wheel_errors
+from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.range_bearing.calibration import RobotCalibration
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.hypotheses import HYPOTHESES, Hypotheses
 from rbpf.systems.system import FILTER_COLUMNS, Column, FrameLog, Ragged, System, Tracked, TrackingState, filter_values
@@ -77,30 +78,18 @@ class RangeBearingSlam(System):
                 "AnonymousLandmarkSensor associates in every particle"
             )
         landmark_map: JointMap | LandmarkMap
-        # What is estimated: the sensor's place, which moves by free (d, m) s, and what the wheels get wrong.
-        std = config.uncertain(space)
-        self._learnt = np.flatnonzero(std)
-        self._free = np.eye(space.dim, std.size)[:, self._learnt]
-        if config.calibrate != "off" and (is_unnamed or not is_joint):
-            raise InputError(
-                f"calibrate={config.calibrate} takes a joint map of landmarks with names: leave out map=particles, lag and "
-                "association=ml"
-            )
-        if config.calibrate != "off" and not self._learnt.size:
-            raise InputError(
-                f"calibrate={config.calibrate} leaves nothing to estimate: ask for calibrate=sensor in space, and for a "
-                "self_calibration above 0"
-            )
-        constants = np.zeros(self._learnt.size), np.diag(std[self._learnt] ** 2)
+        known_names = is_joint and not is_unnamed
+        self.calibration = calibration = RobotCalibration(config, space, self.model, known_names)
         if is_joint:
             unnamed = is_unnamed and config.submap is not None
-            landmark_map = JointMap(space, constants, config.compiled, config.submap, unnamed=unnamed)
+            prior = calibration.prior
+            landmark_map = JointMap(space, prior, config.compiled, config.submap, unnamed=unnamed, is_constant=True)
         else:
             landmark_map = LandmarkMap(space, compiled=config.compiled)
             landmark_map.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
-        motion = OdometryMotion(space, constants=self._learnt.size, by_constants=self._by_learnt)
+        motion = OdometryMotion(space, constants=calibration.learnt.size, by_constants=calibration.by_constants)
         self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
         self.hypotheses: Hypotheses | None = None
         if is_unnamed:
@@ -151,8 +140,7 @@ class RangeBearingSlam(System):
         Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
-        if self.joint is not None and (own := self.joint.driving()) is not None:
-            self._prepare(self.joint, own, np.unique(names[names != NULL]))
+        self.sensor.model = self.calibration.tuned(self.filter)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
             # One that comes a second time in the frame that starts its landmark is not used.
@@ -189,44 +177,6 @@ class RangeBearingSlam(System):
             {"landmarks": used, "z": z, "cov_z": cov_z},
         )
 
-    def _prepare(self, joint: JointMap, own: np.ndarray, seen: np.ndarray) -> None:
-        """Before landmarks (K,) are seen: the sensor is taken to be where the particles (N, m) have it on average.
-
-        A sub-map that is full lets go of the farthest landmarks, and what was put away is held again.
-        """
-        if self._free.any():
-            self.sensor.model = self.model.tuned(self.filter.particles.weights @ own, self._free)
-        if joint.is_full:
-            others = np.setdiff1d(np.setdiff1d(joint.ids, joint.leaving), seen)
-            away = np.linalg.norm(joint.mean[0, joint.held.of_one_kind(others).columns], axis=1)
-            joint.make_room(others[np.argsort(-away, kind="stable")])
-        if joint.old.maps and joint.bring_back(seen):
-            self.filter.consolidate()
-
-    def _by_learnt(self, delta: np.ndarray) -> np.ndarray:
-        """How odometry (E,) moves with what is estimated, (d, m) in the right chart at its end."""
-        d = self.space.dim
-        by_wheels = wheel_errors(delta) if isinstance(self.space, SE2Group) else np.zeros((d, 3))
-        return np.concatenate([np.zeros((d, d)), by_wheels], axis=1)[:, self._learnt]
-
-    def wheels(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the wheels get wrong as far as it is found (3,), as in `wheel_errors`, and its standard deviations (3,)."""
-        found, std, d = np.zeros(3), np.zeros(3), self.space.dim
-        own = self._learnt >= d
-        if self.joint is not None and own.any():
-            mean, cov = self.joint.moments(self.filter.particles, Part.SUBSTATE)
-            found[self._learnt[own] - d], std[self._learnt[own] - d] = mean[own], np.sqrt(np.diagonal(cov))[own]
-        return found, std
-
-    def sensor_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Robot_from_sensor (E,) as it is given or found, and its covariance (d, d) in the right chart."""
-        d, joint = self.space.dim, self.joint
-        if joint is None or joint.driving() is None:
-            return self.robot_from_sensor, np.zeros((d, d))
-        mean, cov = joint.moments(self.filter.particles, Part.SUBSTATE)
-        slope = self.space.right_jacobian(self._free @ mean) @ self._free
-        return self.model.tuned(mean, self._free).robot_from_sensor, slope @ cov @ slope.T
-
     def take(self, frame: Frame) -> Tracked:
         odometry = None
         if frame.delta is not None and frame.cov_delta is not None:
@@ -256,21 +206,16 @@ class RangeBearingSlam(System):
             space=self.space,
             measurement=self.measurement,
             pitch_sign=self.pitch_sign,
-            robot_from_sensor=self.sensor_pose()[0],
+            robot_from_sensor=self.calibration.sensor_pose(self.filter)[0],
             start=self.space.identity(),
             stamps_ns=log.stamps_ns,
-            deltas=self._corrected(log["delta"][1:]),
+            deltas=self.calibration.corrected(self.filter, log["delta"][1:]),
             covs=log["cov_delta"][1:],
             steps=np.repeat(np.arange(len(used)), [rows.size for rows in used]),
             landmarks=np.concatenate([np.zeros(0, dtype=np.int64), *(ids[ids >= 0] for ids in landmarks)]),
             z=gathered("z", (p,)),
             cov_z=gathered("cov_z", (p, p)),
         )
-
-    def _corrected(self, deltas: np.ndarray) -> np.ndarray:
-        """Odometry (T, E) without what is found to be wrong with it."""
-        wrong = self.wheels()[0]
-        return self.space.compose(deltas, self.space.exp(wheel_errors(deltas) @ wrong)) if wrong.any() else deltas
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
         """How much was observed and kept, and how far the particles have forgotten the past, if they sample it."""
@@ -279,32 +224,10 @@ class RangeBearingSlam(System):
             "landmarks": int(self.map().ids.size),
             "observations": int(sum((ids >= 0).sum() for ids in self._final(log))),
             "map": self.kept_map,
-            **self._calibration(),
+            **self.calibration.entries(self.filter),
             **({} if self.joint else distinct),
             "map_share_of_dense": round(self.filter.belief().map.stored_fraction, 4),
         }
-
-    def _calibration(self) -> dict[str, Any]:
-        """Entry of `summary`, of a robot that calibrates itself: what was found, with standard deviations."""
-        config = self.config
-        if config.calibrate == "off":
-            return {}
-        (mean, cov), space, dim = self.sensor_pose(), self.space, self.point.dim
-        turn, entries = space.rotation(mean), dict[str, tuple[float, float]]()
-        if config.calibrate != "odometry":
-            within = np.sqrt(np.diagonal(turn @ cov[-dim:, -dim:] @ turn.T))
-            entries |= dict(zip(["x_m", "y_m", "z_m"], zip(space.translation(mean), within, strict=True), strict=False))
-            if config.self_calibration.yaw_deg:
-                entries["yaw_deg"] = (
-                    np.rad2deg(np.arctan2(turn[1, 0], turn[0, 0])),
-                    np.rad2deg(np.sqrt(cov[-dim - 1, -dim - 1])),
-                )
-        if (self._learnt >= space.dim).any():
-            (drift, left, right), (std_drift, std_left, std_right) = self.wheels()
-            entries["heading_deg_per_m"] = np.rad2deg(drift), np.rad2deg(std_drift)
-            entries |= {"turn_left": (left, std_left), "turn_right": (right, std_right)}
-        stds = {f"std_{name}": float(std) for name, (_, std) in entries.items()}
-        return {"calibration": {name: float(value) for name, (value, _) in entries.items()} | stds}
 
     def _final(self, log: FrameLog) -> list[np.ndarray]:
         """The landmark of every observation, one array (K,) per step, as known now: by the heaviest hypothesis, if kept."""
@@ -323,14 +246,12 @@ class RangeBearingSlam(System):
             "odometry": self._odometry,
             "observed_once": np.array(sorted(self.sensor.observed_once), dtype=np.int64),
         }
-        if self._learnt.size:
-            kept["learnt"] = self._learnt
+        kept |= self.calibration.arrays()
         return kept if self.hypotheses is None else kept | self.hypotheses.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
-        if self._learnt.size and not np.array_equal(read_one(arrays, "learnt", integers("learnt")), self._learnt):
-            raise InputError(f"the checkpoint is of another robot than one with calibrate={self.config.calibrate}")
+        self.calibration.restore(arrays)
         if self.hypotheses is not None:
             self.hypotheses.restore(arrays)

@@ -1,0 +1,118 @@
+"""A robot that calibrates itself: where its sensor is, and what its wheels get wrong, as constants of the joint map."""
+
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.core.checkpoint import integers, read_one
+from rbpf.core.filter import Filter
+from rbpf.core.models import Part
+from rbpf.errors import InputError
+from rbpf.lie import SE2Group, SE3Group
+from rbpf.maps.joint_map import JointMap
+from rbpf.motion.odometry import wheel_errors
+from rbpf.sensors.range_bearing import RigidPointModel
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+
+
+@final
+class RobotCalibration:
+    """Constants (m,) of a joint map: coordinates of the sensor's place, then `wheel_errors`, whichever are uncertain.
+
+    `is_possible` is whether the map is a joint one of landmarks with names. Raises InputError: what is asked for is not
+    possible, or leaves nothing to estimate.
+    """
+
+    def __init__(
+        self, config: RangeBearingConfig, space: SE2Group | SE3Group, model: RigidPointModel, is_possible: bool
+    ) -> None:
+        std = config.uncertain(space)
+        if config.calibrate != "off" and not is_possible:
+            raise InputError(
+                f"calibrate={config.calibrate} takes a joint map of landmarks with names: leave out map=particles, lag and "
+                "association=ml"
+            )
+        if config.calibrate != "off" and not std.any():
+            raise InputError(
+                f"calibrate={config.calibrate} leaves nothing to estimate: ask for calibrate=sensor in space, and for a "
+                "self_calibration above 0"
+            )
+        self.space, self.model = space, model
+        self.learnt = np.flatnonzero(std)  #: (m,) which of all (d + 3,) are uncertain.
+        self.free = np.eye(space.dim, std.size)[:, self.learnt]  #: (d, m) how the sensor's place moves with them.
+        self.prior = np.zeros(self.learnt.size), np.diag(std[self.learnt] ** 2)
+
+    def by_constants(self, delta: np.ndarray) -> np.ndarray:
+        """How odometry (E,) moves with them, (d, m) in the right chart at its end."""
+        d = self.space.dim
+        by_wheels = wheel_errors(delta) if isinstance(self.space, SE2Group) else np.zeros((d, 3))
+        return np.concatenate([np.zeros((d, d)), by_wheels], axis=1)[:, self.learnt]
+
+    def tuned(self, filter_: Filter) -> RigidPointModel:
+        """The sensor where the particles have it on average."""
+        if not self.free.any():
+            return self.model
+        own = self._joint(filter_).driving()
+        assert own is not None
+        return self.model.tuned(filter_.particles.weights @ own, self.free)
+
+    def wheels(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
+        """What the wheels get wrong as far as it is found (3,), as in `wheel_errors`, and its standard deviations (3,)."""
+        found, std, own = np.zeros(3), np.zeros(3), self.learnt >= self.space.dim
+        if own.any():
+            (mean, cov), at = self._moments(filter_), self.learnt[own] - self.space.dim
+            found[at], std[at] = mean[own], np.sqrt(np.diagonal(cov))[own]
+        return found, std
+
+    def corrected(self, filter_: Filter, deltas: np.ndarray) -> np.ndarray:
+        """Odometry (T, E) without what is found to be wrong with it."""
+        wrong = self.wheels(filter_)[0]
+        return self.space.compose(deltas, self.space.exp(wheel_errors(deltas) @ wrong)) if wrong.any() else deltas
+
+    def sensor_pose(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
+        """Robot_from_sensor (E,) as it is given or found, and its covariance (d, d) in the right chart."""
+        if not self.free.any():
+            return self.model.robot_from_sensor, np.zeros((self.space.dim, self.space.dim))
+        mean, cov = self._moments(filter_)
+        slope = self.space.right_jacobian(self.free @ mean) @ self.free
+        return self.model.tuned(mean, self.free).robot_from_sensor, slope @ cov @ slope.T
+
+    def entries(self, filter_: Filter) -> dict[str, Any]:
+        """For summary.json: what was found, with standard deviations; nothing where nothing is estimated."""
+        if not self.learnt.size:
+            return {}
+        found = dict[str, tuple[float, float]]()
+        if self.free.any():
+            (mean, cov), space = self.sensor_pose(filter_), self.space
+            place, turn, dim = space.translation(mean), space.rotation(mean), len(self.space.translation(mean))
+            within = np.sqrt(np.diagonal(turn @ cov[-dim:, -dim:] @ turn.T))
+            found |= dict(zip(["x_m", "y_m", "z_m"], zip(place, within, strict=True), strict=False))
+            if self.free[-dim - 1].any():
+                yaw, std = np.arctan2(turn[1, 0], turn[0, 0]), np.sqrt(cov[-dim - 1, -dim - 1])
+                found["yaw_deg"] = np.rad2deg(yaw), np.rad2deg(std)
+        if (self.learnt >= self.space.dim).any():
+            (drift, left, right), (std_drift, std_left, std_right) = self.wheels(filter_)
+            found["heading_deg_per_m"] = np.rad2deg(drift), np.rad2deg(std_drift)
+            found |= {"turn_left": (left, std_left), "turn_right": (right, std_right)}
+        stds = {f"std_{name}": float(std) for name, (_, std) in found.items()}
+        return {"calibration": {name: float(value) for name, (value, _) in found.items()} | stds}
+
+    def _joint(self, filter_: Filter) -> JointMap:
+        joint = filter_.marginals.parts[Part.LANDMARK]
+        assert isinstance(joint, JointMap)
+        return joint
+
+    def _moments(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (m,) and covariance (m, m), as they are known by now."""
+        return self._joint(filter_).moments(filter_.particles, Part.SUBSTATE)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint: which are uncertain."""
+        return {"learnt": self.learnt} if self.learnt.size else {}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Raises InputError: the checkpoint is of another calibration."""
+        if self.learnt.size and not np.array_equal(read_one(arrays, "learnt", integers("learnt")), self.learnt):
+            raise InputError(
+                "the checkpoint is of a robot that estimates other things of itself: set calibrate as it was"
+            )
