@@ -39,7 +39,7 @@ class Present:
             self.cov[np.ix_(used, used)],
             given=old.given(given),
             constants=self.mean[d : d + k],
-            known=old.known if old.maps else None,
+            known=old.known,
         )
 
     def pass_on(self, old: SubMaps, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:

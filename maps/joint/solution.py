@@ -34,6 +34,9 @@ class Constants(NamedTuple):
     cov: np.ndarray
 
 
+NOTHING = Constants(np.zeros(0), np.zeros((0, 0)))
+
+
 class SubMap(NamedTuple):
     """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
 
@@ -46,8 +49,8 @@ class SubMap(NamedTuple):
     cov: np.ndarray
     tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
     given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
-    constants: np.ndarray = np.zeros(0)
-    known: Constants | None = None  #: what was known of these before it; None in the first one, whose prior is its own.
+    constants: np.ndarray = NOTHING.mean
+    known: Constants = NOTHING  #: what was known of these before it.
 
     def seeing(self, seen: Given) -> "SubMap":
         """With landmarks that are seen from its end besides."""
@@ -150,8 +153,8 @@ def solve(
     """Gauss-Newton over all starts and some landmarks (M,); the others of a sub-map are left out of its factor.
 
     It begins at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
-    `constants` (k,). What sub-maps were given, or knew of constants before, is taken off. Where that leaves no minimum, as
-    when a filter has diverged, it is not.
+    `constants` (k,). What sub-maps were given is taken off, and what all but the first knew of constants before. Where that
+    leaves no minimum, as when a filter has diverged, it is not.
     """
     d, dim, k, first_guess = space.dim, world.shape[1], constants.size, (starts, world, constants)
     starts, world = starts.copy(), world.copy()
@@ -182,7 +185,7 @@ def solve(
             at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
             taken.append((number, each.given.points, at, columns, inverse_of(each.given.cov)))
-    before = [(each.known.mean, inverse_of(each.known.cov)) for each in maps if each.known is not None and is_whole]
+    before = [(each.known.mean, inverse_of(each.known.cov)) for each in maps[1:] if k and is_whole]
     known = sum((info for _, info in before), np.zeros((k, k)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken] + [common]
     where = np.concatenate([np.repeat(columns, columns.size) for columns in blocks])
@@ -258,7 +261,7 @@ def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, betw
     points[rows] = space.transform(between, old.points)
     points[: new.ids.size] = new.points
     starts = np.array([space.identity(), new.end, space.compose(new.end, between)])
-    both = [new._replace(known=None), old._replace(tied=False, given=None)]
+    both = [new, old._replace(tied=False, given=None)]
     solution = solve(space, both, ids, starts, space.transform(new.end, points), new.constants)
     seen, cov = solution.seen_from(space, 1, np.arange(ids.size))
     return SubMap(solution.starts[1], ids, seen, cov, constants=solution.constants, known=new.known)

@@ -26,6 +26,7 @@ from rbpf.maps.joint.solution import (
     CLOSE_ENOUGH,
     EXACT,
     ITERATIONS,
+    NOTHING,
     Constants,
     Given,
     Solution,
@@ -99,7 +100,7 @@ class SubMaps:
         dim: int,
         most: int,
         unnamed: bool = False,
-        constants: Constants = Constants(np.zeros(0), np.zeros((0, 0))),  # noqa: B008
+        constants: Constants = NOTHING,
     ) -> None:
         self.space, self.dim, self.most, self.unnamed = space, dim, most, unnamed
         self.frame: Estimate | None = None
@@ -555,14 +556,11 @@ class SubMaps:
             "given_covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in given)]),
             "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
         }  # fmt: skip
-        if self.constants.size:
-            # What the first one knew of them is its own.
-            before = [each.known or Constants(each.constants, np.eye(each.constants.size)) for each in self.maps]
+        if k := self.constants.size:
             named |= {
-                "constants": np.array([each.constants for each in self.maps]).reshape(-1, self.constants.size),
-                "known": np.array([each.mean for each in before]).reshape(-1, self.constants.size),
-                "known_covs": np.array([each.cov for each in before]).reshape(-1, *2 * [self.constants.size]),
-                "near_constants": self.constants,
+                "constants": np.array([self.constants, *(each.constants for each in self.maps)]),
+                "known": np.array([each.known.mean for each in self.maps]).reshape(-1, k),
+                "known_covs": np.array([each.known.cov for each in self.maps]).reshape(-1, k, k),
             }
         named = {f"submaps/{name}": array for name, array in named.items()}
         if self.frame is not None:
@@ -586,8 +584,8 @@ class SubMaps:
         }  # fmt: skip
         if k := self.constants.size:
             schema |= {
-                "constants": checkpoint.numbers("maps", k), "near_constants": checkpoint.numbers(k),
-                "known": checkpoint.numbers("maps", k), "known_covs": checkpoint.numbers("maps", k, k),
+                "constants": checkpoint.numbers("starts", k), "known": checkpoint.numbers("maps", k),
+                "known_covs": checkpoint.numbers("maps", k, k),
             }  # fmt: skip
         found = checkpoint.read(arrays, schema, "submaps/")
         d, dim, counts, known = self.space.dim, self.dim, found["counts"], found["given"]
@@ -606,10 +604,9 @@ class SubMaps:
             own = Given(others, before, prior.reshape(before.size, before.size)) if others.size else None
             self._hold(SubMap(end, names, places, cov.reshape(d + places.size + k, -1), bool(tied), own))
         if k:
-            before = [None, *map(Constants, found["known"][1:], found["known_covs"][1:])][: len(self.maps)]
-            every = zip(self.maps, found["constants"], before, strict=True)
-            self.maps = [each._replace(constants=own, known=prior) for each, own, prior in every]
-            self.constants = found["near_constants"]
+            self.constants, *means = found["constants"]
+            every = zip(self.maps, means, map(Constants, found["known"], found["known_covs"]), strict=True)
+            self.maps = [each._replace(constants=mean, known=known) for each, mean, known in every]
         if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
             raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
         self.starts, self.near = list(found["starts"]), found["near"]
