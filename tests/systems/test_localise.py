@@ -123,7 +123,7 @@ def test_the_file_keeps_every_bit(tmp_path, camera, count):
         ({"positions": np.zeros((12, 2))}, "positions must hold numbers of shape"),
         ({"cov": np.tile(-np.eye(3), (12, 1, 1))}, "none less than zero"),
         ({"alignment": np.array("upside down")}, "is damaged"),
-        ({"camera": np.array([-1.0, 1, 1, 1, 0, 0, 0, 0, 0])}, "must be positive"),
+        ({"camera": np.array([-1.0, 1, 1, 1, 0, 0, 0, 0, 0])}, "must be above 0"),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, change, words):
