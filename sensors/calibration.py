@@ -51,7 +51,7 @@ class Board:
     square_m: Positive
 
     def __post_init__(self) -> None:
-        check_ranges(self, "of a chessboard ")
+        check_ranges(self, "a chessboard's ")
         if min(self.columns, self.rows) < 3:
             raise InputError(
                 f"a chessboard needs at least 3x3 inner corners, got {self.columns}x{self.rows}: count the places "
@@ -160,7 +160,7 @@ class MarkerBoard:
     dictionary: str = "4X4_50"
 
     def __post_init__(self) -> None:
-        check_ranges(self, "of a board of markers ")
+        check_ranges(self, "the board of markers: ")
         if self.dictionary not in DICTIONARIES:
             raise InputError(f"there is no dictionary {self.dictionary!r} of markers; known: {', '.join(DICTIONARIES)}")
 

@@ -51,7 +51,8 @@ def numeric_jacobians(
             difference = nu[1] - nu[0]
         else:  # half as many residuals
             ahead = model.predict(moved_state, moved_landmark, const, moved_substate)
-            difference = model.residual(ahead[0], ahead[1] if predicted is None else predicted)
+            back = ahead[1] if predicted is None else np.broadcast_to(predicted, ahead[0].shape)
+            difference = model.residual(ahead[0], back)
         blocks.append(np.moveaxis(difference, 0, -1) / (STEP * steps.size))
     return Jacobians(*blocks)
 

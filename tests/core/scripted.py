@@ -59,8 +59,7 @@ class Polar(ObservationModel):
         return np.stack([np.hypot(point[..., 0], point[..., 1]), np.arctan2(point[..., 1], point[..., 0])], axis=-1)
 
     def residual(self, z, predicted):
-        difference = z - predicted
-        return np.stack([difference[..., 0], wrap_angle(difference[..., 1])], axis=-1)
+        return np.stack([z[..., 0] - predicted[..., 0], wrap_angle(z[..., 1] - predicted[..., 1])], axis=-1)
 
     def invert(self, state, z):
         point = np.stack([z[..., 0] * np.cos(z[..., 1]), z[..., 0] * np.sin(z[..., 1])], axis=-1)

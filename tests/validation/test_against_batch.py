@@ -243,8 +243,7 @@ def test_nees_is_told_of_a_run_in_a_world_and_scale_of_its_own(moved_run, alignm
 @pytest.mark.parametrize("alignment", ["none", "rigid", "similarity"])
 def test_a_truth_that_errs_tells_nothing_of_a_better_filter(moved_run, alignment, std, claimed, outcome):
     """Motion capture good to a centimetre made filters good to a millimetre look over-confident, or any claim right."""
-    rng = np.random.default_rng(5)
-    truth, mean, cov = drawn(rng, std)
+    truth, mean, cov = drawn(rng := np.random.default_rng(5), std)
     there = {"none": Similarity(1.0, np.eye(3), np.zeros(3)), "rigid": replace(AWAY, scale=1.0)}.get(alignment, AWAY)
     seen, own = there.transform_poses(truth), Precision(0.01, 0.002)
     measured = SE3.retract(seen, rng.normal(size=(STEPS, 6)) * np.repeat([own.std_rad, own.std_m], 3))
@@ -254,8 +253,12 @@ def test_a_truth_that_errs_tells_nothing_of_a_better_filter(moved_run, alignment
     exact, known = (compare_with_truth(record, truth_errors(record, *stated)) for stated in ((), (own,)))
     assert exact.statistics[0].outcome == ("supports" if outcome == "supports" else "contradicts")
     assert [s.outcome for s in known.statistics] == [outcome]  # no regions, which are of both
-    figures = known.figures
-    assert (figures["truth_std_m"], figures["truth_std_deg"]) == (own.std_m, pytest.approx(np.degrees(own.std_rad)))
+    assert known.figures["truth_std_m"] == own.std_m and known.figures["truth_std_deg"] == np.degrees(own.std_rad)
+    write_truth(moved_run, RunTruth(np.arange(STEPS), seen, {}, alignment))  # exact, and stated to be coarse
+    for factor, told in ((1.0, ["leaves open"]), (0.0, [])):
+        write_trajectory(moved_run, np.arange(STEPS), mean, factor * cov)
+        errors = truth_errors(load(moved_run), Precision(5.0, 1.0))
+        assert [s.outcome for s in compare_with_truth(load(moved_run), errors).statistics] == told
 
 
 def in_another_world(moved_run):

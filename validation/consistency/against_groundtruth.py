@@ -156,7 +156,7 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
     nees, ranks = (values[known] if known.any() else np.zeros(1) for values in (white.nees, white.ranks))
     statistics = pose_statistics(white, errors.fitted)
     if any(errors.stated):  # regions are of both
-        statistics = [_of_filter(ratio, errors.claimed) for ratio in statistics[:1]]
+        statistics = [_of_filter(ratio, errors.claimed) for ratio in statistics[:1]] if errors.claimed else []
     figures |= {"pose_nees_mean": float(nees.mean()), "pose_nees_median": float(np.median(nees))}
     figures["pose_nees_right"] = float(ranks.mean())
     if errors.landmarks is not None:
@@ -187,10 +187,10 @@ def _of_filter(ratio: statistic.Statistic, claimed: float) -> statistic.Statisti
     """A ratio of errors to what filter and truth expect together, without what the truth errs.
 
     The interval has room for a truth whose standard deviations are stated wrong by `STATE_FACTOR`: one that is coarser than
-    the filter's claim neither supports nor contradicts it.
+    the filter's claim neither supports nor contradicts it. One that errs less than half of what is stated may be exact.
     """
     rest, most = 1.0 - claimed, statistic.STATE_FACTOR**2
-    offs = {"value": rest, "low": most * rest, "high": rest / most}
+    offs = {"value": rest, "low": most * rest, "high": rest / most if ratio.high > rest / most else 0.0}
     found = {name: max(getattr(ratio, name) - off, 0.0) / claimed for name, off in offs.items()}
     return replace(ratio, samples=claimed**2 * ratio.samples, **found)
 
