@@ -90,6 +90,7 @@ class JointMap(Map):
         substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
             frame; None has none. It may be observed together with a landmark.
         is_constant: the substate never changes, as what a sensor or the wheels get wrong: all sub-maps have it in common.
+            They begin with nothing else: landmarks cannot be `put_away`, brought back or recognised.
         compiled: use the models' fused kernels where they have one.
         submap: landmarks with which a sub-map ends at the latest (`LOCAL`), so that a step costs the same however large the
             map becomes; None keeps one Gaussian. Nothing may be observed in the world.
@@ -306,7 +307,7 @@ class JointMap(Map):
         observed = np.isin(leaving, self._observed)
         self._returning, self.leaving, leaving = leaving[:0], leaving[observed], leaving[~observed]
         far = int((~np.isin(returning, self.old.near)).sum()) >= FEWEST
-        present = self._present()
+        present = self._lasting()
         if leaving.size or far:
             present.pass_on(self.old, leaving, returning if far else None)
         present.bring_in(self.old, returning[np.isin(returning, self.old.near)])
@@ -320,6 +321,14 @@ class JointMap(Map):
         """The present sub-map, when a window has just ended and all particles are alike."""
         return Present(self.origin, self.held, self.mean[0], self.cov, self._given_ids)
 
+    def _lasting(self) -> Present:
+        """The present sub-map, of which something is to go over into the next one."""
+        if self.old.constants.size:
+            raise InputError(
+                "sub-maps that share constants exchange no landmarks: leave out is_constant, or put none away"
+            )
+        return self._present()
+
     def _take(self, present: Present) -> None:
         """All particles are as the present sub-map is."""
         self.origin, self.held, self.cov, self._given_ids = present.origin, present.held, present.cov, present.given
@@ -332,7 +341,7 @@ class JointMap(Map):
         held again. Not `tied`, what is seen is a sub-map of its own, as how the robot came here is not known: the substate
         alone is held on.
         """
-        present = self._present()
+        present = self._lasting()
         if tied:
             present.pass_on(self.old, seen.ids[:0], seen.ids, seen)
             present.bring_in(self.old, seen.ids)

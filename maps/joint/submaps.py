@@ -275,7 +275,7 @@ class SubMaps:
         columns = columns_of(d, dim, mine, self.cov, k)[d:]
         held = self._factor_of_given
         if held is None or held[0] is not self.cov or not np.array_equal(held[1], columns):
-            own = self.cov[np.ix_(columns, columns)] + ROUNDING * np.eye(columns.size)
+            own = self.cov[np.ix_(columns, columns)] + np.diag(np.where(columns < len(self.cov) - k, ROUNDING, 0.0))
             self._factor_of_given = held = self.cov, columns, gaussian.cholesky(own)
         cross = self.cov[np.ix_(columns, rows)]
         gain = cho_solve((held[2], True), cross, check_finite=False).T
@@ -585,7 +585,7 @@ class SubMaps:
         if k := self.constants.size:
             schema |= {
                 "constants": checkpoint.numbers("starts", k), "known": checkpoint.numbers("maps", k),
-                "known_covs": checkpoint.numbers("maps", k, k),
+                "known_covs": checkpoint.covariances("maps", k, k),
             }  # fmt: skip
         found = checkpoint.read(arrays, schema, "submaps/")
         d, dim, counts, known = self.space.dim, self.dim, found["counts"], found["given"]

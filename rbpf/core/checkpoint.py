@@ -335,10 +335,10 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
     if entry.ascending:
         _require(np.diff(array, prepend=array[:1] - 1) > 0, array, name, "ascending numbers")
     if entry.ordered:
-        _require(np.diff(array, prepend=array[:1]) >= 0, array, name, "numbers in order")
+        _require(np.diff(array, prepend=array[:1]) >= 0, array, name, "numbers in order (sort what they are of)")
     if entry.distinct:
         is_first = np.isin(np.arange(array.size), np.unique(array, return_index=True)[1])
-        _require(is_first, array, name, "numbers that come once")
+        _require(is_first, array, name, "numbers that come once (keep one of each)")
     if entry.covariance:
         try:
             gaussian.psd_factor(array)

@@ -109,6 +109,9 @@ def test_joined_they_say_what_one_gaussian_says(submap, window, motion, start):
     for row, own in enumerate(covs[order]):
         at = slice(2 + 2 * row, 4 + 2 * row)
         np.testing.assert_allclose(own, cov[at, at], rtol=1e-6, atol=0.0 if window == 1 else tolerance)
+    if start is not None:
+        with pytest.raises(InputError, match="sub-maps that share constants exchange no landmarks"):
+            joint.recognise(Given(ids[:0], places[:0], np.zeros((0, 0))))
 
 
 def ring(space, seed: int, size: float = 0.05, count: int = 14) -> tuple[list[SubMap], np.ndarray, np.ndarray]:

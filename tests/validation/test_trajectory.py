@@ -70,7 +70,7 @@ def test_pairs_are_close_in_order_and_one_to_one(first, second, limit_ms):
     ("stamps_ns", "poses", "words"),
     [
         (np.arange(3), SE3.identity((2,)), r"world_from_body must hold numbers of shape \(T = 3, 7\), got \(2, 7\)"),
-        (np.array([5, 6, 4]), SE3.identity((3,)), "stamps_ns must hold numbers in order, got 4 at 2"),
+        (np.array([5, 6, 4]), SE3.identity((3,)), "stamps_ns must hold numbers in order .sort .*, got 4 at 2"),
     ],
 )
 def test_what_is_no_trajectory_is_said(stamps_ns, poses, words):
