@@ -25,14 +25,12 @@ def numeric_jacobians(
     const: np.ndarray | None = None,
     substate: np.ndarray | None = None,
     by: frozenset[Part] = EVERYTHING,
-    predicted: np.ndarray | None = None,
 ) -> Jacobians:
     """Central differences of −ν for z = h, in the right chart at the state; `model.residual` wraps.
 
-    Those by a part that `by` does not name are left out: each costs two predictions per coordinate, or one where h is
-    `predicted`: differences are one-sided then, and off by ½ `STEP` times the curvature.
+    Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
     """
-    steps = np.array([STEP, -STEP] if predicted is None else [STEP])
+    steps = np.array([STEP, -STEP])
     constrains = type(model).innovation is not ObservationModel.innovation
     z = model.predict(state, landmark, const, substate) if constrains else None
     blocks: list[np.ndarray | None] = []
@@ -41,7 +39,7 @@ def numeric_jacobians(
             blocks.append(None)
             continue
         dim = space.dim if part == Part.STATE else at.shape[-1]
-        offsets = (steps[:, None, None] * np.eye(dim)).reshape(steps.size, dim, *(1,) * (at.ndim - 1), dim)
+        offsets = (steps[:, None, None] * np.eye(dim)).reshape(2, dim, *(1,) * (at.ndim - 1), dim)
         moved = space.retract(at, offsets) if part == Part.STATE else at + offsets
         moved_state = moved if part == Part.STATE else state
         moved_landmark = moved if part == Part.LANDMARK else landmark
@@ -50,10 +48,8 @@ def numeric_jacobians(
             nu = model.innovation(z, moved_state, moved_landmark, const, moved_substate)
             difference = nu[1] - nu[0]
         else:  # half as many residuals
-            ahead = model.predict(moved_state, moved_landmark, const, moved_substate)
-            back = ahead[1] if predicted is None else np.broadcast_to(predicted, ahead[0].shape)
-            difference = model.residual(ahead[0], back)
-        blocks.append(np.moveaxis(difference, 0, -1) / (STEP * steps.size))
+            difference = model.residual(*model.predict(moved_state, moved_landmark, const, moved_substate))
+        blocks.append(np.moveaxis(difference, 0, -1) / (2 * STEP))
     return Jacobians(*blocks)
 
 
@@ -71,12 +67,7 @@ def linearise(
 
     Numeric Jacobians by a part that `by` does not name are left out. Raises InputError: a result has the wrong shape.
     """
-    predicted = None
-    if type(model).innovation is ObservationModel.innovation:
-        predicted = model.predict(state, landmark, const, substate)
-        nu = model.residual(z, predicted)
-    else:
-        nu = model.innovation(z, state, landmark, const, substate)
+    nu = model.innovation(z, state, landmark, const, substate)
     name = type(model).__name__
     parts = (state, landmark, substate)
     if nu.dtype != np.float64:
@@ -86,7 +77,7 @@ def linearise(
         raise InputError(f"{name}.predict returned shape {nu.shape}, expected {expected}")
     jacobians = model.jacobians(state, landmark, const, substate)
     if jacobians is None:
-        jacobians = numeric_jacobians(model, space, state, landmark, const, substate, by, predicted)
+        jacobians = numeric_jacobians(model, space, state, landmark, const, substate, by)
     sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
     blocks: list[np.ndarray | None] = []
     for block, size in zip(jacobians, sizes, strict=True):

@@ -227,7 +227,7 @@ class ObservationModel(ABC):
         return None
 
     def residual(self, z: Measured, predicted: Measured) -> Result:
-        """Z − h (…, p), neither of which is written to; override to wrap angles."""
+        """Z − h (…, p); override to wrap angles."""
         return z - predicted
 
     def innovation(
