@@ -62,7 +62,7 @@ class Batch:
     ids: np.ndarray
     mask: np.ndarray | None = None
     #: What the drivers take of it in every stage of a step, in parts; found when it is first asked for.
-    given: "list[Given]" = field(default_factory=list)
+    for_drivers: "list[ForDrivers]" = field(default_factory=list)
 
     def some(self, rows: np.ndarray | slice) -> "Batch":
         """A part of its rows."""
@@ -70,7 +70,7 @@ class Batch:
         return Batch(self.group, self.ks[rows], self.ids[rows], mask)
 
 
-class Given(NamedTuple):
+class ForDrivers(NamedTuple):
     """What the drivers take of a part of a batch, whatever the states are."""
 
     ids: np.ndarray
@@ -197,10 +197,10 @@ class RowEngine:
                 total.add(self._information_numpy(batch, group, state, prior))
                 continue
             factor = np.ascontiguousarray(prior.factor)
-            for given in self._given(batch, group):
-                fused, measured = self._observed(given, group, state, EVERYTHING)
-                access, pairs = tuple(self.store.access(given.ids)), state.shape[0] * given.ids.size
-                run_driver(refine, pairs, fused, access, measured, factor, given.sizes, out, alone=refine_alone)
+            for taken in self._for_drivers(batch, group):
+                fused, measured = self._observed(taken, group, state, EVERYTHING)
+                access, pairs = tuple(self.store.access(taken.ids)), state.shape[0] * taken.ids.size
+                run_driver(refine, pairs, fused, access, measured, factor, taken.sizes, out, alone=refine_alone)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
@@ -226,11 +226,11 @@ class RowEngine:
                 for part in _one_after_the_other(batch):
                     self._correct_once(part, group, state, log_density)
                 continue
-            for given in self._given(batch, group):
-                fused, measured = self._observed(given, group, state, MAP)
-                access, targets = self.store.rewrite(given.ids)
-                what = fused, tuple(access), targets, measured, given.sizes, log_density
-                run_driver(update, state.shape[0] * given.ids.size, *what, alone=update_alone)
+            for taken in self._for_drivers(batch, group):
+                fused, measured = self._observed(taken, group, state, MAP)
+                access, targets = self.store.rewrite(taken.ids)
+                what = fused, tuple(access), targets, measured, taken.sizes, log_density
+                run_driver(update, state.shape[0] * taken.ids.size, *what, alone=update_alone)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
         after_sampling = np.zeros(state.shape[0])
@@ -241,9 +241,9 @@ class RowEngine:
     def _is_compiled(self, group: Observations) -> bool:
         return self.compiled and _likelihood(group).kernel_id >= 0
 
-    def _given(self, batch: Batch, group: Observations) -> list[Given]:
+    def _for_drivers(self, batch: Batch, group: Observations) -> list[ForDrivers]:
         """Of a batch as the drivers take it: whole, or so much of it at once as NumPy linearises in the cache."""
-        if not batch.given:
+        if not batch.for_drivers:
             kernel, parts = fused_kernel(group.model), [batch]
             if kernel is None:
                 size = max(1, PAIRS_AT_ONCE // self.store.n)
@@ -258,19 +258,19 @@ class RowEngine:
             for part in parts:
                 mask = _NO_MASK if part.mask is None else np.ascontiguousarray(part.mask.T)
                 measured = group.z[part.ks], group.cov[part.ks], mask, likelihood.kernel_id, params
-                batch.given.append(Given(part.ids, kernel, measured, sizes))
-        return batch.given
+                batch.for_drivers.append(ForDrivers(part.ids, kernel, measured, sizes))
+        return batch.for_drivers
 
     def _observed(
-        self, given: Given, group: Observations, state: np.ndarray, by: frozenset[Part]
+        self, part: ForDrivers, group: Observations, state: np.ndarray, by: frozenset[Part]
     ) -> tuple[tuple[int, np.ndarray, np.ndarray], tuple[Any, ...]]:
         """What both drivers take: the kernel and the states; the measurements and their likelihood.
 
         A model without a kernel is linearised in NumPy, and its rows are handed on.
         """
-        kernel, (z, *likelihood) = given.kernel, given.measured
+        kernel, (z, *likelihood) = part.kernel, part.measured
         if kernel is None:
-            mean, const = self.layout_of(int(given.ids[0])).estimates(self.store.read_all(given.ids))
+            mean, const = self.layout_of(int(part.ids[0])).estimates(self.store.read_all(part.ids))
             nu, jac = linearise(group.model, self.space, z, state[:, None], mean, const, by=by)
             rows = np.concatenate([nu[..., None], *(block for block in jac if block is not None)], axis=-1)
             z = np.zeros_like(z)
