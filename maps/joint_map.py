@@ -96,7 +96,8 @@ class JointMap(Map):
             map becomes; None keeps one Gaussian. Nothing may be observed in the world.
         passed_on: a sub-map ends when landmarks are `put_away`, and what stays goes over into the next one, as always with a
             substate that changes; else that begins with nothing.
-        unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`.
+        unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`;
+            not beside constants.
 
     Attributes:
         old: the sub-maps that are finished. All else is of the present one, where the world is the place where it began.
@@ -123,6 +124,8 @@ class JointMap(Map):
         mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
+        if unnamed and is_constant and mean.size:
+            raise InputError("unnamed landmarks of old sub-maps are kept without constants: leave out is_constant")
         gaussian.psd_factor(cov)
         self._substate, self._first = (mean, cov), space.dim + mean.size
         self.held = JointColumns(space, self._first, [self.point])
