@@ -26,7 +26,7 @@ from rbpf.systems.laser.config import LaserConfig
 from rbpf.systems.laser.slam import LaserSlam
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageScreen
-from rbpf.systems.mono.known_map import KnownMap, read_known_map
+from rbpf.systems.mono.known_map import KnownMap, map_file, read_known_map
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
@@ -148,7 +148,8 @@ class MonoRecording:
             found |= {"aruco": f"{board.columns}x{board.rows}", "marker_m": board.side_m, "gap_m": board.gap_m}
             found["dictionary"] = board.dictionary
         if self.map is not None:
-            found |= {"known_map": str(self.map), "localize": True}
+            # Of the folder of a run nothing else is read: times in its tables, and its pictures, may change.
+            found |= {"known_map": str(map_file(self.map)), "localize": True}
         return found | self.topics.entries() | self.part.entries()
 
 

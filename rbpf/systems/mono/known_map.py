@@ -105,13 +105,17 @@ def known_map_arrays(found: KnownMap) -> dict[str, np.ndarray]:
     }
 
 
+def map_file(path: Path) -> Path:
+    """The file itself, or that of a run's folder."""
+    return path / NAME if path.is_dir() else path
+
+
 def read_known_map(path: Path) -> KnownMap:
     """Reads the file, or that of a run's folder.
 
     Raises InputError: it is missing, damaged, of another version, or holds too few points.
     """
-    if path.is_dir():
-        path = path / NAME
+    path = map_file(path)
     if not path.is_file():
         raise InputError(
             f"{path}: there is no such map; expected the folder of a finished `rbpf run mono`, or its {NAME}"
