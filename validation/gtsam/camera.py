@@ -179,7 +179,7 @@ class CameraProblem:
                 state = self.state(values)
                 return observations.reprojection(self.table, state.path, state.points)
 
-            factor = together(evaluate)
+            factor = solvers.together(evaluate)
             return self.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point], model))
         return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
 
@@ -197,31 +197,6 @@ class CameraProblem:
                 models[code] = solvers.huber(solvers.noise(ordered), self.robust)
             out.append(make(row, models[code], self.pose_keys[step], self.point_keys[index]))
         return out
-
-
-def together(evaluate: Callable[[Any], observations.Residuals]) -> Callable[[int, list[int], Any], Any]:
-    """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
-
-    GTSAM hands every factor the same object as long as Python holds it, as the loops of `solvers` do; an
-    optimiser that changes its values in place would be shown old residuals.
-    """
-    held: Any = None
-    found: observations.Residuals = np.empty(0), []
-
-    def factor(row: int, keys: list[int], model: Any) -> Any:
-        def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            nonlocal held, found
-            if values is not held:
-                held, found = values, evaluate(values)
-            residuals, slopes = found
-            if jacobians is not None:
-                for place, slope in enumerate(slopes):
-                    jacobians[place] = slope[row]
-            return residuals[row]
-
-        return gtsam.CustomFactor(model, keys, error)
-
-    return factor
 
 
 class Adjusted(NamedTuple):

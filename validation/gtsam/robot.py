@@ -24,7 +24,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, skew
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
 from rbpf.validation.gtsam import solvers
-from rbpf.validation.gtsam.observations import SINGULAR
+from rbpf.validation.gtsam.observations import SINGULAR, Residuals
 
 SOFT = 0.1  #: Standard deviation of a softened constraint as a fraction of the step's largest.
 CHUNK = 50  #: Steps that an incremental start adds at once.
@@ -187,21 +187,21 @@ class RobotProblem:
         return self._by_step[self._bounds[step] : self._bounds[step + 1]]
 
     def graph(self, soft: bool = False) -> Any:
-        """All factors."""
-        graph = gtsam.NonlinearFactorGraph()
+        """All factors; not for ISAM2, see `solvers.together`."""
+        graph, factor = gtsam.NonlinearFactorGraph(), solvers.together(self._observed)
         for step in range(len(self.m.stamps_ns)):
-            self.add_step(graph, step, soft)
+            self.add_step(graph, step, soft, factor)
         return graph
 
-    def add_step(self, graph: Any, step: int, soft: bool = False) -> None:
-        """Factors of one step: its motion (the known start at step 0) and its observations."""
+    def add_step(self, graph: Any, step: int, soft: bool = False, together: Any = None) -> None:
+        """Factors of one step: its motion (the known start at step 0) and its observations, evaluated `together` or singly."""
         if step:
             graph.push_back(self._odometry(step, soft))
         else:
             hard = gtsam.noiseModel.Constrained.All(self.m.space.dim)
             graph.push_back(self.chart.prior(self.pose_keys[0], self.chart.pose(self.m.start), hard))
         for row in self.observations(step).tolist():
-            graph.push_back(self._observation(row))
+            graph.push_back(self._observation(row, together))
 
     def values(self, initial: InitialEstimate) -> Any:
         """GTSAM's values of an estimate; an InputError says which pose or landmark it lacks."""
@@ -247,16 +247,28 @@ class RobotProblem:
         mixed = gtsam.noiseModel.Constrained.MixedSigmas(_PENALTY, np.sqrt(np.where(null, 0.0, variances)))
         return gtsam.CustomFactor(mixed, keys, error)
 
-    def _observation(self, row: int) -> Any:
+    def _observed(self, values: Any) -> Residuals:
+        """Of all observations."""
+        chart, steps = self.chart, self.m.steps
+        poses = np.array([chart.storage(values, key) for key in self.pose_keys])[steps]
+        points = np.array([chart.point(values, key) for key in self.landmark_keys])[self.index]
+        by_pose, by_point = self.sensor.slopes(poses, points)
+        # GTSAM takes the memory of a Jacobian as it lies.
+        by_gtsams_pose = np.ascontiguousarray(by_pose[..., chart.order])
+        return self.sensor.residual(poses, points, self.m.z), [by_gtsams_pose, by_point]
+
+    def _observation(self, row: int, together: Any) -> Any:
         sensor, chart, z = self.sensor, self.chart, self.m.z[row]
-        pose_key, landmark_key = self.pose_keys[self.m.steps[row]], self.landmark_keys[self.index[row]]
+        keys = [self.pose_keys[self.m.steps[row]], self.landmark_keys[self.index[row]]]
+        loss = solvers.huber(solvers.noise(self.m.cov_z[row]), self.robust)
+        if together is not None:
+            return together(row, keys, loss)
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            state, landmark = chart.storage(values, pose_key), chart.point(values, landmark_key)
+            state, landmark = chart.storage(values, keys[0]), chart.point(values, keys[1])
             if jacobians is not None:
                 by_state, by_landmark = sensor.slopes(state, landmark)
                 jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
             return sensor.residual(state, landmark, z)
 
-        loss = solvers.huber(solvers.noise(self.m.cov_z[row]), self.robust)
-        return gtsam.CustomFactor(loss, [pose_key, landmark_key], error)
+        return gtsam.CustomFactor(loss, keys, error)

@@ -17,9 +17,9 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME, camera_text
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam.batch_problem import Optimum, softened, solve_problem
-from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, adjust, begin, together
+from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, adjust, begin
 from rbpf.validation.gtsam.observations import HUBER, Residuals, known_by_name, observation_table, reprojection
-from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
+from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals, together
 
 ITERATIONS = 200  #: Most of the adjustment.
 _STEP = 1e-6  #: Of focal length and k1, for the residuals' derivatives by them.

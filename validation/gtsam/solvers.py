@@ -22,6 +22,7 @@ from scipy.sparse import bsr_array, csc_array
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.validation.gtsam.observations import Residuals
 
 ROUGH = 1e-4  #: Fraction of the error that still counts as progress far from the optimum.
 EXACT = 1e-11  #: The same near by.
@@ -125,6 +126,31 @@ def huber(base: Any, threshold: float | None) -> Any:
     if not threshold > 0:
         raise InputError(f"Expected a robust threshold above 0 standard deviations, found {threshold}.")
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(threshold), base)
+
+
+def together(evaluate: Callable[[Any], Residuals]) -> Callable[[int, list[int], Any], Any]:
+    """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
+
+    GTSAM hands every factor the same object as long as Python holds it, as the loops below do. An optimiser that changes
+    its values in place, as ISAM2 does, would be shown old residuals.
+    """
+    held: Any = None
+    found: Residuals = np.empty(0), []
+
+    def factor(row: int, keys: list[int], model: Any) -> Any:
+        def error(factor: Any, values: Any, jacobians: Any) -> Array:
+            nonlocal held, found
+            if values is not held:
+                held, found = values, evaluate(values)
+            residuals, slopes = found
+            if jacobians is not None:
+                for place, slope in enumerate(slopes):
+                    jacobians[place] = slope[row]
+            return residuals[row]
+
+        return gtsam.CustomFactor(model, keys, error)
+
+    return factor
 
 
 def levenberg_marquardt(
