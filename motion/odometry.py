@@ -22,6 +22,8 @@ class Odometry:
 
     delta: np.ndarray
     cov: np.ndarray
+    #: (d, k) how it moves, in that chart, with the constants of an `OdometryMotion` that has some; None where it does not.
+    by_constants: np.ndarray | None = None
 
     @classmethod
     def at_rest(cls, space: LieGroup = SE3) -> "Odometry":
@@ -108,23 +110,27 @@ class OdometryMotion(MotionModel):
             factor = gaussian.psd_factor(moved.cov)
         except InputError as error:
             raise InputError(f"the covariance of the odometry is not one: {error}") from error
-        return self._with_constants(self.space.compose(state, moved.delta), factor, moved.delta)
+        return self._with_constants(self.space.compose(state, moved.delta), factor, moved.delta, moved.by_constants)
 
-    def _with_constants(self, mean: np.ndarray, factor: np.ndarray, delta: np.ndarray) -> Transition:
+    def _with_constants(
+        self, mean: np.ndarray, factor: np.ndarray, delta: np.ndarray, coupling: np.ndarray | None = None
+    ) -> Transition:
         d, k = self.space.dim, self.constants
         if not k:
             return Transition(mean, factor[None])
-        coupling = np.zeros((d, k)) if self.by_constants is None else self.by_constants(delta)
+        if coupling is None:
+            coupling = np.zeros((d, k)) if self.by_constants is None else self.by_constants(delta)
         factor = np.pad(factor, ((0, k), (0, 0)))
         return Transition(mean, factor[None], coupling[None], np.eye(k)[None], np.zeros((1, k)))
 
     def constrained(self, measured: Odometry) -> Odometry:
         """The increment and the covariance that particles are moved by, of a measured one."""
-        cov = measured.cov + self.cov_added
+        cov, by_constants = measured.cov + self.cov_added, measured.by_constants
         if self._free is None:
-            return Odometry(measured.delta, cov)
+            return Odometry(measured.delta, cov, by_constants)
         delta = self.space.exp(self._free @ self.space.log(measured.delta))
-        return Odometry(delta, self._free @ cov @ self._free)
+        by_constants = None if by_constants is None else self._free @ by_constants
+        return Odometry(delta, self._free @ cov @ self._free, by_constants)
 
 
 def wheel_errors(delta: np.ndarray) -> np.ndarray:

@@ -108,6 +108,15 @@ def estimate_motion(
     return replace(found, others=tuple(others))
 
 
+def refine_motion(matches: Matches, start: Array, config: VoConfig | None = None) -> MotionEstimate:
+    """As `estimate_motion`, near a motion (7,) that is known well enough to tell which matches are false."""
+    config = config or VoConfig()
+    plausible = matches.plausible(config.gate)
+    if plausible.sum() < config.min_matches:
+        return _failed(start, matches, f"{plausible.sum()} matches are there, {config.min_matches} are needed")
+    return _refined(matches, plausible, start, start, config)[0]
+
+
 def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[Array, Array]:
     """By what noise of the pixels moves an estimate, of the K matches that agree with it: Mathematics (vo-gain).
 
@@ -294,15 +303,27 @@ class VisualOdometry:
 def _joined(found: MotionEstimate, expected: Odometry) -> CandidateMotion:
     """The estimate, or in case it is the weaker one anywhere, the product of its Gaussian and the expected one."""
     measured = Odometry(found.previous_camera_from_camera, found.cov)
+    joined, worst = product(measured, expected)
+    if worst <= 1.0:
+        return CandidateMotion(measured, found.inliers, "")
+    times = f"a standard deviation {np.sqrt(worst):.1f} times the expected one"
+    note = f"the matches leave the motion open ({times}); it is joined with the expected one"
+    return CandidateMotion(joined, found.inliers, note)
+
+
+def product(measured: Odometry, expected: Odometry) -> tuple[Odometry, float]:
+    """What both say, their errors being independent; and the largest variance of `measured`, where the expected one is 1.
+
+    `expected` has a diagonal covariance. The product moves with constants as much as `measured` has a say in it.
+    """
     # In units of the expected standard deviations the expected covariance is I.
     std = np.sqrt(np.diagonal(expected.cov))
-    values, axes = np.linalg.eigh(found.cov / np.outer(std, std))
-    if values[-1] <= 1.0:
-        return CandidateMotion(measured, found.inliers, "")
+    values, axes = np.linalg.eigh(measured.cov / np.outer(std, std))
     values = np.maximum(values, ROUNDING * values[-1])
     off = axes.T @ (SE3.local(expected.delta, measured.delta) / std)
     half = std[:, None] * axes * np.sqrt(values / (1.0 + values))
     joined = SE3.retract(expected.delta, std * (axes @ (off / (1.0 + values))))
-    worst = f"a standard deviation {np.sqrt(values[-1]):.1f} times the expected one"
-    note = f"the matches leave the motion open ({worst}); it is joined with the expected one"
-    return CandidateMotion(Odometry(joined, half @ half.T), found.inliers, note)
+    slope = measured.by_constants
+    if slope is not None:
+        slope = std[:, None] * (axes / (1.0 + values)) @ axes.T @ (slope / std[:, None])
+    return Odometry(joined, half @ half.T, slope), float(values[-1])

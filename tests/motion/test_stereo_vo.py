@@ -9,8 +9,9 @@ from scipy.optimize import least_squares
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.least_squares import Rule
+from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit
+from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit, product
 from rbpf.sensors.camera import RectifiedStereo
 from tests.motion.stereo_pairs import (
     CAR,
@@ -256,9 +257,8 @@ class TestVisualOdometry:
 
     def test_without_a_motion_there_is_the_prior(self):
         none = simulate(ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(0))
-        found = VisualOdometry(prior=MotionPrior(0.5, 2.0)).candidates(
-            none, np.full(6, 0.3), self.DT, np.random.default_rng(0)
-        )
+        odometry, rng = VisualOdometry(prior=MotionPrior(0.5, 2.0)), np.random.default_rng(0)
+        found = odometry.candidates(none, np.full(6, 0.3), self.DT, rng)
         assert found.motions == () and found.failure == "0 matches are there, 8 are needed"
         np.testing.assert_allclose(found.prior.delta, SE3.exp(np.full(6, 0.03)))
         np.testing.assert_allclose(found.prior.cov, np.diag(self.DT**2 * np.repeat([0.25, 4.0], 3)))
@@ -275,6 +275,11 @@ class TestVisualOdometry:
         off = SE3.local(prior.delta, estimate.previous_camera_from_camera)
         mean = np.linalg.solve(info, np.linalg.solve(estimate.cov, off))
         np.testing.assert_allclose(SE3.local(prior.delta, motion.odometry.delta), mean, atol=1e-9)
+        measured = Odometry(
+            estimate.previous_camera_from_camera, estimate.cov, np.linspace(-1.0, 1.0, 12).reshape(6, 2)
+        )
+        slope = np.linalg.solve(info, np.linalg.solve(estimate.cov, measured.by_constants))
+        np.testing.assert_allclose(product(measured, prior)[0].by_constants, slope, atol=1e-9)
 
     def test_what_makes_no_sense_is_refused(self):
         matches = simulate(ROOM, 20, np.random.default_rng(0)).matches

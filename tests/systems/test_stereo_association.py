@@ -47,8 +47,7 @@ def view(features: StereoFeatures) -> Pair[StereoFeatures]:
 
 def few(slam: StereoSlam) -> StereoFeatures:
     """Of the last pair, one fewer than must agree, all of landmarks."""
-    known = np.flatnonzero(slam.front_end.landmarks.ids >= 0)
-    return slam._kept.features.take(known[:FEW])
+    return slam._kept.features.take(np.flatnonzero(slam.front_end.landmarks.ids >= 0)[:FEW])
 
 
 def test_false_matches_do_not_agree(slam):
@@ -58,8 +57,7 @@ def test_false_matches_do_not_agree(slam):
     right = np.abs(exchanged.z - slam._kept.features.z).max(axis=1) == 0.0
     slam.filter.step(view(exchanged), WIDE)
     taken = (landmarks.ids >= 0) & (landmarks.ids < known)
-    assert taken.sum() > FEW
-    assert right[taken].mean() > 0.9
+    assert taken.sum() > FEW and right[taken].mean() > 0.9
     off = SE3.local(before, slam.filter.estimate().mean)
     assert np.linalg.norm(off[:3]) < 0.01 and np.linalg.norm(off[3:]) < 0.02
 
@@ -138,10 +136,22 @@ def test_what_was_put_away_is_held_again_when_it_is_seen():
             told = slam.take(frame)
             held.append(slam.joint.holds(gone).mean() if t >= COUNT else 1.0)
         assert held[-1] > 0.5 and np.isin(gone, slam.map().ids).all()
-        seen = np.isin(gone, landmarks.ids)
-        assert seen.mean() > 0.3
+        assert np.isin(gone, landmarks.ids).mean() > 0.3
         off = SE3.between(SE3.between(sequence.truth.poses[0], sequence.truth.poses[-1]), told.pose)
         assert np.linalg.norm(SE3.translation(off)) < 0.02
+
+
+def test_a_pixel_tells_the_motion_or_the_map(monkeypatch):
+    """What no landmark has used is followed to the next update, and makes the motion better known; nothing is used twice."""
+    sequence, covs = pairs(8), []
+    for _ in range(2):
+        slam = StereoSlam(sequence.rig, replace(CONFIG, map=MapConfig(kind="joint")))
+        for t, frame in enumerate(sequence.frames()):
+            told, followed = slam.take(frame), slam.reckoning.left_over.any(axis=(1, 2))
+            assert t < 2 or (followed.sum() > 20 and not followed[slam.front_end.landmarks.ids != NULL].any())
+        covs.append(told.cov[3:, 3:])
+        monkeypatch.setattr(StereoSlam, "_joined", lambda self, prior, *others: prior)
+    assert np.trace(covs[0]) < 0.95 * np.trace(covs[1])
 
 
 # Tracks: what odometry and map say is one point, told once for each pair that shows it.
@@ -172,43 +182,37 @@ def tracks(pairs) -> dict[int, tuple[float | None, ...]]:
 
 
 @pytest.mark.parametrize(
-    ("pairs", "expected", "named"),
+    ("pairs", "told"),
     [
         (  # odometry alone makes tracks; single sightings are left out
             [((1, 2, 3), (NO, NO, NO)), ((11, 12), (NO, NO), [(2, 0)]), ((21, 22), (NO, NO), [(0, 1), (1, 0)]), None],
-            {(3, 11, 22, None), (None, 12, 21, None)},
-            {},
+            ({(3, 11, 22, None), (None, 12, 21, None)}, {}),
         ),
         (  # the map closes gaps and gives its names
             [((1,), (7,)), ((), ()), None, ((31, 32), (NO, 7))],
-            {(1, None, None, 32)},
-            {7: 1},
+            ({(1, None, None, 32)}, {7: 1}),
         ),
         (  # lost for a pair, followed anew, and named a pair later: all of it is one track
             [((1,), (7,)), ((11,), (NO,)), ((21,), (7,), [(0, 0)]), None],
-            {(1, 11, 21, None)},
-            {7: 1},
+            ({(1, 11, 21, None)}, {7: 1}),
         ),
         (  # odometry and map disagree which of two features the point is: neither takes the other's place
             [((1, 2), (7, NO)), ((11, 12), (NO, 7), [(0, 0), (1, 1)]), ((21, 22), (NO, NO), [(0, 0), (1, 1)]), None],
-            {(1, 11, 21, None), (2, 12, 22, None)},
-            {7: 1},
+            ({(1, 11, 21, None), (2, 12, 22, None)}, {7: 1}),
         ),
         (  # names of the map and of other tracks do not meet
             [((1, 2, 3), (0, NO, 1)), ((11, 12, 13), (0, NO, 1), [(0, 0), (1, 1), (2, 2)]), None, None],
-            {(1, 11, None, None), (2, 12, None, None), (3, 13, None, None)},
-            {0: 1, 1: 3},
+            ({(1, 11, None, None), (2, 12, None, None), (3, 13, None, None)}, {0: 1, 1: 3}),
         ),
         (  # a pair that was not measured is passed over
             [((1,), (NO,)), None, ((21,), (NO,), [(0, 0)]), None],
-            {(1, None, 21, None)},
-            {},
+            ({(1, None, 21, None)}, {}),
         ),
-        ([None] * 4, set(), {}),
+        ([None] * 4, (set(), {})),
     ],
 )
-def test_tracks(pairs, expected, named):
-    """`named`: the first column of tracks whose names are known."""
-    found = tracks(pairs)
+def test_tracks(pairs, told):
+    """Told are the columns of all tracks, and the first one of those whose names are known."""
+    found, (expected, named) = tracks(pairs), told
     assert set(found.values()) == expected and len(found) == len(expected)
     assert {name: found[name][0] for name in named} == named

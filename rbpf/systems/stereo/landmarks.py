@@ -11,7 +11,7 @@ they follow each particle's path, without a say in the particles' weights.
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import partial
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, final
@@ -88,6 +88,7 @@ class Pair(Generic[F]):
     uncertain: bool = False
     #: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
     landmarks: np.ndarray | None = None
+    starts: np.ndarray | None = None  #: rows of features that start landmarks; None where that is still to be found.
 
     def __len__(self) -> int:
         return len(self.features)
@@ -101,6 +102,7 @@ class Landmarks(Sensor, ABC, Generic[F]):
     landmark: Landmark  #: its parametrisation.
     ids: np.ndarray  #: (K,) landmark of each feature of the pair that the filter took last, NULL where there is none.
     seconds: float = 0.0  #: that finding them took.
+    noise: LearntNoise | None = None  #: of the features, beside what they say, where that is learnt.
 
     @abstractmethod
     def associate(self, pair: Pair[F], belief: Belief) -> np.ndarray:
@@ -109,6 +111,10 @@ class Landmarks(Sensor, ABC, Generic[F]):
     def put_away(self, pair: Pair[F], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
         """Landmark (K,) of some features, (K,) bool, of those that a joint map has put away; else, as by default, NULL."""
         return np.full(len(pair), NULL, dtype=np.int64)
+
+    def left_over(self, pair: Pair[F]) -> tuple[Pair[F], np.ndarray]:
+        """The pair with those of its features that start landmarks, and which (K,) the map does not use; by default none."""
+        return pair, np.zeros(len(pair), dtype=bool)
 
     @abstractmethod
     def seen_again(self) -> np.ndarray:
@@ -368,16 +374,10 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         make_room(belief.map, self.manager.names[confirmed], self.manager.unseen_for[confirmed])
         if frame.uncertain:
             return []
-        # Those whose depth is known well enough for a Gaussian in space, and which the manager chooses.
-        features = frame.features
-        deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
-        rows = np.flatnonzero(~known & deep & frame.for_map)
-        if rows.size:
-            descriptors, px = features.descriptors[rows], features.z[:, :2]
-            rows = rows[self.manager.select(px[rows], descriptors, self.manager.nearest(descriptors), px[known])]
+        rows = self._starts(frame, known) if frame.starts is None else frame.starts
         if not rows.size:
             return []
-        features = features.take(rows)
+        features = frame.features.take(rows)
         # The manager counts as the map does: its numbers are the map's.
         ids = self.manager.add(features.descriptors)
         self.places.put(self.manager.rows(ids), SE3.transform(pose, features.points), pose)
@@ -386,6 +386,23 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if self.noise is not None:
             cov = cov * self.noise.factor(ids)[:, None, None]
         return [NewLandmarks(features.z, cov, self.model, self.landmark, ids=ids)]
+
+    def _starts(self, pair: Pair[StereoFeatures], known: np.ndarray) -> np.ndarray:
+        """Rows of features whose depth is known well enough for a Gaussian in space, and which the manager chooses."""
+        features = pair.features
+        deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
+        rows = np.flatnonzero(~known & deep & pair.for_map)
+        if not rows.size:
+            return rows
+        descriptors, px = features.descriptors[rows], features.z[:, :2]
+        return rows[self.manager.select(px[rows], descriptors, self.manager.nearest(descriptors), px[known])]
+
+    def left_over(self, pair: Pair[StereoFeatures]) -> tuple[Pair[StereoFeatures], np.ndarray]:
+        assert pair.landmarks is not None
+        free = pair.landmarks == NULL
+        pair = replace(pair, starts=self._starts(pair, ~free))
+        free[pair.starts] = False
+        return pair, free
 
     def associate(self, pair: Pair[StereoFeatures], belief: Belief) -> np.ndarray:
         """By their descriptors, where the particles expect them."""

@@ -21,7 +21,8 @@ from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
-from rbpf.motion.stereo_vo import VisualOdometry, pixel_gains
+from rbpf.motion.stereo_geometry import Matches
+from rbpf.motion.stereo_vo import VisualOdometry, pixel_gains, product, refine_motion
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
@@ -72,6 +73,7 @@ _RECKONING = {
     "missed": integers(4, least=0),
     "velocity_at_update": numbers(6),
     "noise": numbers("noisy", 6, 3),
+    "left_over": numbers("followed", 3, 4),
 }
 
 
@@ -96,6 +98,9 @@ class DeadReckoning:
     #: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the last
     #: measured pair, which the next step shares; none where the step was not chained or not measured.
     noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 6, 3)))
+    #: (K, 3, 4) pixels and their covariance, at the filter's last update, of each feature of the last measured pair that was
+    #: followed from there on and was of no use to a joint map then; zeros for others, and none with other maps.
+    left_over: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4)))
 
     def seconds(self, stamp_ns: int) -> float:
         """Time since the last pair that was measured; infinite before the first."""
@@ -110,11 +115,12 @@ class DeadReckoning:
         hidden: bool = False,
         cross: np.ndarray | None = None,
         noise: np.ndarray | None = None,
+        left_over: np.ndarray | None = None,
     ) -> "DeadReckoning":
         """At a pair, `step` after the last measured one, which it was matched with, or that is passed over.
 
         `step` is what was expected where it `is_assumed`; `cross` (6, 6) is the covariance of the last step's error and this
-        one's, None for independent ones, `noise` that of this step, as the attribute.
+        one's, None for independent ones; `noise` and `left_over` are those after this step, as the attributes.
         """
         missed = 1 + self.passed_over if is_assumed else 0
         return DeadReckoning(
@@ -127,6 +133,7 @@ class DeadReckoning:
             hidden=hidden,
             velocity_at_update=self.velocity_at_update,
             noise=np.zeros((0, 6, 3)) if noise is None else noise,
+            left_over=np.zeros((0, 3, 4)) if left_over is None else left_over,
         )
 
     def updated(self) -> "DeadReckoning":
@@ -144,6 +151,7 @@ class DeadReckoning:
             "reckoning/missed": np.array([self.assumed, self.waiting, self.hidden, self.passed_over]),
             "reckoning/velocity_at_update": self.velocity_at_update,
             "reckoning/noise": self.noise,
+            "reckoning/left_over": self.left_over,
         }
 
     @classmethod
@@ -330,7 +338,7 @@ class StereoSlam(System):
                 begun = time.perf_counter()
                 proposal = config.recovery.proposal.build() if uncertain else None
                 if self._once and self.filter.steps and not uncertain:
-                    view, control, proposal = self._proposed(view, control)
+                    view, control, proposal = self._proposed(view, control, at.left_over)
                 report = self.filter.step(view, control if self.filter.steps else None, pair.stamp_ns, proposal)
                 self.reckoning, self._last_update = at.updated(), self.frames
                 found = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
@@ -342,6 +350,10 @@ class StereoSlam(System):
         if measured:
             static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
             features = self._calibration.retuned(self.filter, pair.features, offset_px) if updated else pair.features
+            if updated and view.starts is not None:
+                left_over = np.concatenate([features.z[..., None], features.cov], axis=2)
+                left_over[landmarks.ids != NULL] = 0.0
+                self.reckoning = replace(self.reckoning, left_over=left_over)
             self._kept = replace(pair, features=features, labels=motion.labelled(len(pair), static))
         self.frames += 1
 
@@ -518,7 +530,12 @@ class StereoSlam(System):
                 cross = self._free @ np.einsum("kap,kbp->ab", shared, earlier) @ self._free
             noise = np.zeros((len(pair), 6, 3))
             noise[rows[1][motion.inliers]] = later @ used.cov_now
-        at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity, cross=cross, noise=noise)
+        left_over = None
+        if before.left_over.size:
+            left_over = np.zeros((len(pair), 3, 4))
+            left_over[rows[1][motion.inliers]] = before.left_over[rows[0][motion.inliers]]
+        step = self._constrained(motion.odometry)
+        at = before.moved(stamp_ns, step, velocity, cross=cross, noise=noise, left_over=left_over)
         return _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
 
     def _found_again(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
@@ -567,7 +584,9 @@ class StereoSlam(System):
                 away &= ids == NULL
         return replace(view, landmarks=ids, for_map=view.for_map & ~away), int((ids != NULL).sum())
 
-    def _proposed(self, view: Pair[Any], moved: Odometry) -> tuple[Pair[Any], Odometry, Proposal | None]:
+    def _proposed(
+        self, view: Pair[Any], moved: Odometry, left_over: np.ndarray
+    ) -> tuple[Pair[Any], Odometry, Proposal | None]:
         """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
 
         Where the map has too few landmarks in view to tell the motion, what the odometry has used is not in it either:
@@ -580,8 +599,37 @@ class StereoSlam(System):
         dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
         # Of a camera that has not been seen to move nothing is known: the prior is about what the odometry says.
         velocity = self.reckoning.velocity_at_update if self.filter.steps > 1 else SE3.log(moved.delta) / dt
-        prior = self._constrained(self.visual_odometry.prior.increment(velocity, dt))
+        prior = self.visual_odometry.prior.increment(velocity, dt)
+        if self.joint is not None:
+            view, free = self.front_end.landmarks.left_over(view)
+            if left_over.size:
+                rows = np.flatnonzero(free & left_over.any(axis=(1, 2)))
+                prior = self._joined(prior, moved, left_over[rows], view.features.take(rows))
+        prior = self._constrained(prior)
         return view, prior, self._proposal.build(SE3.local(prior.delta, moved.delta))
+
+    def _joined(self, prior: Odometry, moved: Odometry, before: np.ndarray, features: Any) -> Odometry:
+        """The prior, joined with what matches since the last update say of whose two pixels a joint map uses neither.
+
+        They are `before` (k, 3, 4), as `DeadReckoning.left_over`, and the features of the pair. Those of the next update begin
+        with pixels that these end with, whose noise has opposite signs in both. Taken as independent, they claim too little.
+        """
+        noise, config = self.front_end.landmarks.noise, self.config.odometry.estimate
+        factor = 1.0 if noise is None else noise.mean
+        covs = factor * before[..., 1:], factor * features.cov
+        matches = Matches.checked(self.rig, before[..., 0], features.z, *covs)
+        found = refine_motion(matches, moved.delta, config)
+        if not found.found:
+            return prior
+        measured = Odometry(found.previous_camera_from_camera, found.cov)
+        if not self._calibration.is_online:
+            return product(measured, prior)[0]
+        # The pixels are free of the disparities' error as it is known now. The motion moves with what it is besides.
+        earlier, later = pixel_gains(matches.take(found.inliers), measured, config)
+        slope = -(earlier + later).sum(axis=0)[:, 2:]
+        joined, _ = product(replace(measured, by_constants=slope), prior)
+        assert joined.by_constants is not None
+        return replace(joined, delta=SE3.retract(joined.delta, -joined.by_constants[:, 0] * self.calibration()[0]))
 
 
 _NO_ROWS, _NO_MATCHES = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)
