@@ -169,9 +169,10 @@ def turning(space, each: SubMap, known: Constants, by: np.ndarray) -> SubMap:
     return each._replace(end=end, cov=cov, constants=known.mean, known=known)
 
 
-@pytest.mark.parametrize("by", [0.0, 0.1])
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("space", "count", "most"), [(SE2, 14, 10), (SE3, 14, 10), pytest.param(SE2, 30, 50, marks=pytest.mark.slow)]
+    ("space", "count", "most", "by"),
+    [(SE2, 14, 10, 0.0), (SE2, 14, 10, 0.1), (SE3, 14, 10, 0.0), (SE3, 14, 10, 0.1), (SE2, 30, 50, 0.1)],
 )
 def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most, by):
     """NEES per degree of freedom of the last start and the landmarks about it, over the runs; going round holds no more."""

@@ -185,6 +185,7 @@ def run(log: RobotLog, config: RangeBearingConfig) -> tuple[float, RangeBearingS
     return np.sqrt(np.square(shift).sum(axis=1).mean()), done.system, done.log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spatial", [False, True])
 def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     """To within what is stated, with sub-maps, too; a run that does not ask is off by more, one that need not by little."""
@@ -195,10 +196,11 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     log = elsewhere(there, mount)
 
     off, given = replace(SENSOR, calibrate="off"), []
+    unasked = run(log, off)[0]
     for submap in (150, 10):
         config = replace(SENSOR, submap=submap)
         path, slam, steps = run(log, config)
-        assert path < 0.7 * run(log, off)[0] and bool(slam.joint.old.maps) == (submap == 10)
+        assert path < 0.7 * unasked and bool(slam.joint.old.maps) == (submap == 10)
         pose, cov = slam.calibration.sensor_pose(slam.filter)
         error, within = space.local(pose, mount)[-dim:], cov[-dim:, -dim:]
         assert error @ np.linalg.solve(within, error) < 4.0 * dim and np.trace(within) < dim * 0.01**2
@@ -217,23 +219,24 @@ def test_where_a_sensor_stands_is_found_while_running(spatial, tmp_path):
     assert run(there, SENSOR)[0] < 1.5 * run(there, off)[0]
 
 
-@pytest.mark.parametrize(
-    ("submap", "calibrate", "costs"), [(150, "odometry", 1.3), (10, "odometry", 1.3), (150, "online", 2.5)]
-)
-def test_what_wheels_get_wrong_is_found_while_running(submap, calibrate, costs):
+@pytest.mark.slow
+@pytest.mark.parametrize(("submap", "costs"), [(150, {"odometry": 1.3, "online": 2.5}), (10, {"odometry": 1.3})])
+def test_what_wheels_get_wrong_is_found_while_running(submap, costs):
     """To within what is stated, with sub-maps, too; what asking costs a robot whose wheels are right."""
     right = simulated_log(RobotWorld(300, 40, std_translation_m=0.01, std_rotation_deg=0.1), 1)
     frames, wrong = right.frames[:1], [0.02, 0.04, 0.0]
     for each in right.frames[1:]:
         frames.append(replace(each, delta=SE2.compose(each.delta, SE2.exp(-wheel_errors(each.delta) @ wrong))))
-    log, config = replace(right, frames=frames), replace(SENSOR, window=5, calibrate=calibrate, submap=submap)
-    off = replace(config, calibrate="off")
-    path, slam, steps = run(log, config)
-    found, std = slam.calibration.wheels(slam.filter)
+    log, off = replace(right, frames=frames), replace(SENSOR, window=5, calibrate="off", submap=submap)
+    unasked, needless = run(log, off)[0], run(right, off)[0]
     # On a circle only how far the heading drifts in all is told, and nothing of turns to the right.
     told = wheel_errors(right.frames[1].delta)[0]
-    assert abs(told @ (found - wrong)) < 0.1 * told @ wrong and std[2] == pytest.approx(0.05)
-    assert path < 0.5 * run(log, off)[0] and run(right, config)[0] < costs * run(right, off)[0]
-    assert slam.summary(steps)["calibration"]["turn_left"] == found[1]
-    before, after = np.array([each.delta for each in frames[1:]]), slam.measurements("log", steps).deltas
-    np.testing.assert_allclose(SE2.local(before, after), wheel_errors(before) @ found, atol=1e-12)
+    for calibrate, most in costs.items():
+        config = replace(off, calibrate=calibrate)
+        path, slam, steps = run(log, config)
+        found, std = slam.calibration.wheels(slam.filter)
+        assert abs(told @ (found - wrong)) < 0.1 * told @ wrong and std[2] == pytest.approx(0.05)
+        assert path < 0.5 * unasked and run(right, config)[0] < most * needless
+        assert slam.summary(steps)["calibration"]["turn_left"] == found[1]
+        before, after = np.array([each.delta for each in frames[1:]]), slam.measurements("log", steps).deltas
+        np.testing.assert_allclose(SE2.local(before, after), wheel_errors(before) @ found, atol=1e-12)
