@@ -57,7 +57,7 @@ from rbpf.maps.joint.rows import (
     spread_of,
     turned,
 )
-from rbpf.maps.joint.solution import Constants, Given, SubMap
+from rbpf.maps.joint.solution import Constants, Given, SubMap, exchanged, moved
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
 from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations
@@ -167,6 +167,15 @@ class JointMap(Map):
         self._in_step = False  # from prediction to correction: what is observed is associated with what is held
         self._gain: np.ndarray | None = None
         self._reading: Reading | None = None  # of what is observed in this step
+
+    def presume(self, prior: Constants) -> None:
+        """When a window has ended: all that was observed, had a constant substate had this prior."""
+        before, d = self.old.known, self.space.dim
+        self.old.presume(prior)
+        mean, cov = exchanged(self.mean, self.cov, slice(d, self._first), before, self.old.known)
+        self.origin, turn = moved(self.space, self.origin, mean[0, :d], cov)
+        mean[:, :d] = 0.0
+        self.mean, self.cov = mean, turn
 
     def driving(self) -> np.ndarray | None:
         return self.mean[:, self.space.dim : self._first] if self._first > self.space.dim else None

@@ -37,6 +37,34 @@ class Constants(NamedTuple):
 NOTHING = Constants(np.zeros(0), np.zeros((0, 0)))
 
 
+def exchanged(
+    mean: np.ndarray, cov: np.ndarray, own: slice, before: Constants, after: Constants
+) -> tuple[np.ndarray, np.ndarray]:
+    """A Gaussian (…, n), (n, n) had the constants that are `own` of it this prior `after`, Mathematics (exchange).
+
+    What the draws of paths seem to have told without there being anything to tell it by is no information.
+    """
+    here, unit = inverse_of(cov[own, own]), gaussian.cholesky(after.cov)
+    values, vectors = np.linalg.eigh(unit.T @ (here - inverse_of(before.cov)) @ unit)
+    told = np.linalg.solve(unit.T, vectors[:, values > 0.0])
+    told = (told * values[values > 0.0]) @ told.T
+    spread = inverse_of(gaussian.symmetrise(told + inverse_of(after.cov)))
+    centre = (mean[own] if mean.ndim == 1 else mean[0, own]) - before.mean
+    by_told = before.mean + np.linalg.lstsq(told, here @ centre)[0]
+    found = after.mean + spread @ told @ (by_told - after.mean)
+    slope = np.linalg.solve(cov[own, own], cov[own]).T
+    cov = gaussian.symmetrise(cov + slope @ (spread - cov[own, own]) @ slope.T)
+    return mean + slope @ (found - centre - before.mean), np.asarray(cov)
+
+
+def moved(
+    space: SE2Group | SE3Group | Euclidean, pose: np.ndarray, by: np.ndarray, cov: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A pose (E,) moved by (d,) in its right chart, and the covariance (n, n) that begins with its own, there."""
+    turn = block_diag(space.right_jacobian(by), np.eye(len(cov) - len(by)))
+    return space.retract(pose, by), turn @ cov @ turn.T
+
+
 class SubMap(NamedTuple):
     """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
 

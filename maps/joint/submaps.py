@@ -32,8 +32,10 @@ from rbpf.maps.joint.solution import (
     Solution,
     SubMap,
     columns_of,
+    exchanged,
     fused,
     inverse_of,
+    moved,
     solve,
 )
 
@@ -124,6 +126,27 @@ class SubMaps:
         """The constants, by all that is finished."""
         own = slice(len(self.cov) - self.constants.size, None)
         return Constants(self.constants, self.cov[own, own])
+
+    def presume(self, prior: Constants) -> None:
+        """All that is finished, had the constants had this prior before the first one."""
+        d, k = self.space.dim, self.constants.size
+
+        def anew(end: Array, points: Array, constants: Array, cov: Array, before: Constants) -> tuple[Array, ...]:
+            mean = np.concatenate([np.zeros(d), points.ravel(), constants])
+            mean, cov = exchanged(mean, cov, slice(len(cov) - k, len(cov)), before, prior)
+            end, cov = moved(self.space, end, mean[:d], cov)
+            return end, mean[d : len(mean) - k].reshape(points.shape), mean[len(mean) - k :], cov
+
+        before = self.maps[0].known if self.maps else self.known
+        about = anew(self.start, self.points, self.constants, self.cov, before)
+        self.starts[-1], self.points, self.constants, self.cov = about
+        maps = self.maps
+        self.maps = []
+        for each in maps:
+            end, points, constants, cov = anew(each.end, each.points, each.constants, each.cov, each.known)
+            self.maps.append(each._replace(end=end, points=points, constants=constants, cov=cov, known=prior))
+        if maps:
+            self.solve()
 
     def returned(self, ids: np.ndarray) -> np.ndarray:
         """Which landmarks (K,) are of old sub-maps, and not among those about the start."""

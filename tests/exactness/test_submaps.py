@@ -29,6 +29,7 @@ STEADY = LinearMotion(
     np.eye(2), np.vstack([np.linalg.cholesky(Q), np.zeros((2, 2))]), np.eye(2), np.eye(2), np.zeros(2)
 )
 """A `Walk` whose steps are alike, and not known."""
+DRIFT = STEP + 0.3, 0.2 * np.eye(2)
 
 
 class Reading:
@@ -82,17 +83,26 @@ def walk(steps: int = 14) -> tuple[list[Reading], np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("window", [1, 4])
 @pytest.mark.parametrize("submap", [4, 7, 100])
-@pytest.mark.parametrize(("motion", "start"), [(Walk(), None), (STEADY, (STEP + 0.3, 0.2 * np.eye(2)))])
-def test_joined_they_say_what_one_gaussian_says(submap, window, motion, start):
+@pytest.mark.parametrize(
+    ("motion", "start", "first"),
+    [(Walk(), None, None), (STEADY, DRIFT, None), (STEADY, DRIFT, (STEP, 1e-4 * np.eye(2)))],
+)
+def test_joined_they_say_what_one_gaussian_says(submap, window, motion, start, first):
+    """Also where constants had another prior at `first`, which is exchanged."""
     readings, mean, cov = walk()
-    n, tolerance = (10, 1e-6) if window == 1 else (2000, 0.05)  # a window's samples tell no more
-    whole, joint = (JointMap(Euclidean(2), start, submap=most, is_constant=True) for most in (None, submap))
+    n, tolerance = (10, 1e-6) if window == 1 else (4000, 0.05)  # a window's samples tell no more
+    whole = JointMap(Euclidean(2), start, is_constant=True)
+    joint = JointMap(Euclidean(2), first or start, submap=submap, is_constant=True)
     options = {"n": n, "rng": np.random.default_rng(0), "consolidation": Consolidation(window)}
     filters = [Filter(motion, NamedLandmarkSensor(Relative(), Point(2)), held, **options) for held in (whole, joint)]
     for t, reading in enumerate(readings):
         for filter_ in filters:
             filter_.step(reading)
-        if t < 12:  # the sub-maps of landmarks that then return are asked when the window ends
+        if t == 7 and first:
+            filters[1].consolidate()
+            joint.presume(Constants(*start))
+        # The sub-maps of landmarks that return in the end are asked when the window ends.
+        if (7 if first else 0) <= t < 12:
             told, pose = (held.estimate(each.particles) for held, each in zip((whole, joint), filters, strict=True))
             np.testing.assert_allclose(np.append(pose.mean, pose.cov), np.append(told.mean, told.cov), atol=tolerance)
     filter_.consolidate()

@@ -4,35 +4,44 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, read_one
+from rbpf.core.checkpoint import integers, numbers, read_one
+from rbpf.core.diagnostics import Correction
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
+from rbpf.maps.joint.solution import Constants
 from rbpf.maps.joint_map import JointMap
 from rbpf.motion.odometry import wheel_errors
 from rbpf.sensors.range_bearing import RigidPointModel
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+
+DECISIVE = 6.0
+"""Standard deviations by which observations are off to one side of what the wheels say when that is no chance any more."""
+AS_GOOD_AS_KNOWN = 1e-3
+"""How uncertain it is before, as a fraction of what it is then."""
 
 
 @final
 class RobotCalibration:
     """Constants (m,) of a joint map: coordinates of the sensor's place, then `wheel_errors`, whichever are uncertain.
 
-    `is_possible` is whether the map is a joint one of landmarks with names. Raises InputError: what is asked for is not
-    possible, or leaves nothing to estimate.
+    By default (`calibrate=auto`) they are as good as known until a score test, Mathematics (wheel-score), says otherwise.
+    `is_possible` is whether the map is a joint one of landmarks with names. Raises InputError: what is asked for by name is
+    not possible, or leaves nothing to estimate.
     """
 
     def __init__(
         self, config: RangeBearingConfig, space: SE2Group | SE3Group, model: RigidPointModel, is_possible: bool
     ) -> None:
-        std = config.uncertain(space)
-        if config.calibrate != "off" and not is_possible:
+        is_asked = config.calibrate not in ("auto", "off")
+        std = config.uncertain(space) if is_possible else np.zeros(space.dim + 3)
+        if is_asked and not is_possible:
             raise InputError(
                 f"calibrate={config.calibrate} takes a joint map of landmarks with names: leave out map=particles, lag and "
                 "association=ml"
             )
-        if config.calibrate != "off" and not std.any():
+        if is_asked and not std.any():
             raise InputError(
                 f"calibrate={config.calibrate} leaves nothing to estimate: ask for calibrate=sensor in space, and for a "
                 "self_calibration above 0"
@@ -40,13 +49,20 @@ class RobotCalibration:
         self.space, self.model = space, model
         self.learnt = np.flatnonzero(std)  #: (m,) which of all (d + 3,) are uncertain.
         self.free = np.eye(space.dim, std.size)[:, self.learnt]  #: (d, m) how the sensor's place moves with them.
-        self.prior = np.zeros(self.learnt.size), np.diag(std[self.learnt] ** 2)
+        self.is_estimated = is_asked
+        #: Its sum, the variance that right wheels have of it, and the sum of squares.
+        self.score = np.zeros((3, self.learnt.size))
+        self._cov = np.diag(std[self.learnt] ** 2)
+        self._moves = np.zeros((space.dim, self.learnt.size))  # of the last odometry
+        scale = 1.0 if is_asked else AS_GOOD_AS_KNOWN
+        self.prior = np.zeros(self.learnt.size), scale**2 * self._cov
 
     def by_constants(self, delta: np.ndarray) -> np.ndarray:
         """How odometry (E,) moves with them, (d, m) in the right chart at its end."""
         d = self.space.dim
         by_wheels = wheel_errors(delta) if isinstance(self.space, SE2Group) else np.zeros((d, 3))
-        return np.concatenate([np.zeros((d, d)), by_wheels], axis=1)[:, self.learnt]
+        self._moves = np.concatenate([np.zeros((d, d)), by_wheels], axis=1)[:, self.learnt]
+        return self._moves
 
     def tuned(self, filter_: Filter) -> RigidPointModel:
         """The sensor where the particles have it on average."""
@@ -56,10 +72,26 @@ class RobotCalibration:
         assert own is not None
         return self.model.tuned(filter_.particles.weights @ own, self.free)
 
+    def watch(self, filter_: Filter, factor: np.ndarray, found: Correction | None) -> bool:
+        """Tests a step by odometry, by what was found about its noise, whose covariance has a factor (d, r).
+
+        Whether what the wheels get wrong is estimated from here on, and was not before.
+        """
+        if self.is_estimated or not self.learnt.size or found is None:
+            return False
+        whitened = np.linalg.lstsq(factor, self._moves)[0]
+        score, variance = whitened.T @ found.mean, np.einsum("ac,ab,bc->c", whitened, found.cov, whitened)
+        self.score += score, np.maximum(variance, 0.0), score**2
+        self.is_estimated = bool((self.score[0] ** 2 > DECISIVE**2 * self.score[1:].max(axis=0)).any())
+        if self.is_estimated:
+            filter_.consolidate()
+            self._joint(filter_).presume(Constants(np.zeros(self.learnt.size), self._cov))
+        return self.is_estimated
+
     def wheels(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
         """What the wheels get wrong as far as it is found (3,), as in `wheel_errors`, and its standard deviations (3,)."""
         found, std, own = np.zeros(3), np.zeros(3), self.learnt >= self.space.dim
-        if own.any():
+        if own.any() and self.is_estimated:
             (mean, cov), at = self._moments(filter_), self.learnt[own] - self.space.dim
             found[at], std[at] = mean[own], np.sqrt(np.diagonal(cov))[own]
         return found, std
@@ -79,7 +111,7 @@ class RobotCalibration:
 
     def entries(self, filter_: Filter) -> dict[str, Any]:
         """For summary.json: what was found, with standard deviations; nothing where nothing is estimated."""
-        if not self.learnt.size:
+        if not self.is_estimated:
             return {}
         found = dict[str, tuple[float, float]]()
         if self.free.any():
@@ -107,12 +139,17 @@ class RobotCalibration:
         return self._joint(filter_).moments(filter_.particles, Part.SUBSTATE)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint: which are uncertain."""
-        return {"learnt": self.learnt} if self.learnt.size else {}
+        """For a checkpoint: which are uncertain, and what is known of whether they should be."""
+        named = {"learnt": self.learnt, "score": self.score, "is_estimated": np.array([int(self.is_estimated)])}
+        return named if self.learnt.size else {}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Raises InputError: the checkpoint is of another calibration."""
-        if self.learnt.size and not np.array_equal(read_one(arrays, "learnt", integers("learnt")), self.learnt):
+        if not self.learnt.size:
+            return
+        if not np.array_equal(read_one(arrays, "learnt", integers("learnt")), self.learnt):
             raise InputError(
                 "the checkpoint is of a robot that estimates other things of itself: set calibrate as it was"
             )
+        self.score = read_one(arrays, "score", numbers(3, self.learnt.size))
+        self.is_estimated = bool(read_one(arrays, "is_estimated", integers(1, least=0))[0])

@@ -84,10 +84,11 @@ class RangeBearingConfig(RunConfig):
     #: of a joint map: landmarks with which a sub-map ends and the next begins, so that a step costs the same however large
     #: the map becomes; with 20 it ends where it reaches three times as far as the sensor. None keeps one Gaussian of all.
     submap: Count | None = 150
-    #: of a joint map: what is estimated with everything else: in the plane what the wheels get wrong alike in all steps
-    #: (odometry), or the sensor's place on the robot (sensor), or both (online; in space
-    #: the sensor's place alone).
-    calibrate: Literal["off", "odometry", "sensor", "online"] = "off"
+    #: of a joint map of landmarks with names: what is estimated with everything else: in the plane what the wheels get
+    #: wrong alike in all steps (odometry), or the sensor's place on the robot (sensor), or both (online; in space
+    #: the sensor's place alone). By default (auto) the odometry is taken as it is until what is observed is decidedly off to
+    #: one side of it, and from then on as with odometry.
+    calibrate: Literal["auto", "off", "odometry", "sensor", "online"] = "auto"
     #: what is known of a robot that calibrates itself.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
@@ -109,7 +110,7 @@ class RangeBearingConfig(RunConfig):
         sensor, wheels = self.self_calibration.of_sensor(space), self.self_calibration.of_wheels()
         if self.calibrate not in ("sensor", "online"):
             sensor[:] = 0.0
-        if self.calibrate not in ("odometry", "online") or not isinstance(space, SE2Group):
+        if self.calibrate in ("off", "sensor") or not isinstance(space, SE2Group):
             wheels[:] = 0.0
         return np.concatenate([sensor, wheels])
 

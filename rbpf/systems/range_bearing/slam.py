@@ -151,15 +151,19 @@ class RangeBearingSlam(System):
         else:
             used, report = self.hypotheses.step(z, cov_z, odometry, stamp_ns)
             self.filter = self.hypotheses.held[0].filter
+        correction, messages = motion_correction(report.mixture), tuple[str, ...]()
         if odometry is not None:
             self._odometry = self.space.compose(self._odometry, odometry.delta)
+            if self.calibration.watch(self.filter, report.mixture[0].factor[0], correction):
+                messages = (
+                    "the odometry errs alike in all steps: what the wheels get wrong is estimated from here on",
+                )
 
         estimate = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
         if self.joint is not None and self.joint.old.maps:
             # A landmark that a further sub-map begins anew has been measured before, which its density does not know.
             report = replace(report, log_evidence=np.nan)
         d, e = self.space.dim, self.space.size
-        correction = motion_correction(report.mixture)
         return Tracked(
             report.stamp_ns,
             estimate.mean,
@@ -175,6 +179,7 @@ class RangeBearingSlam(System):
                 "cov_delta": np.full((d, d), np.nan) if odometry is None else odometry.cov,
             },
             {"landmarks": used, "z": z, "cov_z": cov_z},
+            messages,
         )
 
     def take(self, frame: Frame) -> Tracked:
