@@ -18,7 +18,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 
 DECISIVE = 6.0
 """Standard deviations by which observations are off to one side of what the wheels say when that is no chance any more."""
-AS_GOOD_AS_KNOWN = 1e-3
+AS_GOOD_AS_KNOWN = 1e-4
 """How uncertain it is before, as a fraction of what it is then."""
 
 
