@@ -1,16 +1,14 @@
-"""What finished sub-maps say together: all their starts and landmarks by Gauss-Newton, sparse, Mathematics (submaps)."""
+"""What finished sub-maps say together: all their starts and landmarks by Gauss-Newton, Mathematics (submaps)."""
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.linalg import block_diag, solve_triangular
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.linalg import LinAlgError, block_diag, solve_triangular
 
 from rbpf import gaussian
 from rbpf.errors import InputError
-from rbpf.kernels.sparse import filled, selected_inverse
 from rbpf.lie import Euclidean, SE2Group, SE3Group
+from rbpf.maps.joint.elimination import Elimination, cliques_of
 
 CLOSE_ENOUGH = 1e-6
 """Largest step [m, rad] at which a solution is taken, and iterations until it is."""
@@ -119,15 +117,14 @@ class Factor(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Landmarks (M,) in the world (M, D), all starts, the constants, the information (n, n) of all, what solves with it."""
+    """Landmarks (M,) in the world (M, D), all starts, the constants, and the information (n, n) of all, eliminated."""
 
     ids: np.ndarray
     world: np.ndarray
     starts: np.ndarray
     constants: np.ndarray
     factors: list[Factor]
-    information: sparse.csc_matrix
-    solver: SuperLU
+    eliminated: Elimination
     is_whole: bool  #: is a minimum of all that is known, and nothing counts twice.
 
     def seen_from(
@@ -142,31 +139,7 @@ class Solution(NamedTuple):
         turn, own = np.eye(columns.size), slice(d, d + points.size)
         turn[own, :d] = -space.transform_jacobian(seen).reshape(-1, d)
         turn[own, own] = np.kron(np.eye(rows.size), space.rotation(start).T)
-        return seen, gaussian.symmetrise(turn @ self.marginal(columns) @ turn.T)
-
-    def marginal(self, columns: np.ndarray) -> np.ndarray:
-        """The covariance (c, c) of some columns of what is solved for."""
-        unit = np.zeros((self.information.shape[0], columns.size))
-        unit[columns, np.arange(columns.size)] = 1.0
-        return np.asarray(self.solver.solve(unit)[columns])
-
-    def covariance(self) -> sparse.csr_matrix:
-        """The entries of the inverse that belong together in a factor, and more, at the work of factoring."""
-        n, turned = self.solver.shape[0], self.solver.perm_c
-        if not np.array_equal(turned, self.solver.perm_r):
-            raise InputError("the sub-maps leave a start or a landmark undetermined")
-        entries = self.information.tocoo()
-        above = sparse.coo_matrix((np.ones(entries.nnz), (turned[entries.row], turned[entries.col])), (n, n))
-        starts, rows = filled(*(lambda low: (low.indptr, low.indices))(sparse.tril(above, format="csc")))
-        columns = np.repeat(np.arange(n), np.diff(starts))
-        pattern = sparse.csc_matrix((np.arange(1.0, rows.size + 1.0), rows, starts), (n, n))
-        lower = np.zeros(rows.size)
-        held = self.solver.L.tocoo()
-        lower[np.asarray(pattern[held.row, held.col], dtype=np.int64).ravel() - 1] = held.data
-        found = selected_inverse(starts, rows, lower, self.solver.U.diagonal())
-        back = np.argsort(turned)
-        half = sparse.csr_matrix((found, (back[rows], back[columns])), (n, n))
-        return half + half.T - sparse.diags_array(half.diagonal(), format="csr")
+        return seen, gaussian.symmetrise(turn @ self.eliminated.marginal(columns) @ turn.T)
 
 
 def solve(
@@ -216,11 +189,11 @@ def solve(
     before = [(each.known.mean, inverse_of(each.known.cov)) for each in maps[1:] if k and is_whole]
     known = sum((info for _, info in before), np.zeros((k, k)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken] + [common]
-    where = np.concatenate([np.repeat(columns, columns.size) for columns in blocks])
-    across = np.concatenate([np.tile(columns, columns.size) for columns in blocks])
-    free = (where >= 0) & (across >= 0)  # the first start is where the world is
+    free = [columns >= 0 for columns in blocks]  # the first start is where the world is
+    blocks = [columns[own] for columns, own in zip(blocks, free, strict=True)]
+    cliques = cliques_of(size, blocks)
     for _ in range(ITERATIONS):
-        factors, entries, gradient = list[Factor](), list[np.ndarray](), np.zeros(size + d)
+        factors, summands, gradient = list[Factor](), list[np.ndarray](), np.zeros(size + d)
         for number, (rows, at, own, columns, info) in enumerate(parts):
             each = maps[number]
             begin, end = starts[number], starts[number + 1]
@@ -232,28 +205,31 @@ def solve(
             by_ends[:d, d:] = back
             by_ends[d : d + seen.size, d:] = -space.transform_jacobian(seen).reshape(-1, d)
             slope, half, product = _weighed(info, by_ends, space.rotation(end), d, k)
-            entries.append(product.ravel())
+            summands.append(product)
             gradient[columns] += half @ residual  # columns below zero fall behind the end
             factors.append(Factor(own, columns, info, residual, slope))
         for number, points, at, columns, info in taken:
             seen = space.inverse_transform(starts[number], world[at])
             by_start = -space.transform_jacobian(seen).reshape(-1, d)
             _, half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0, 0)
-            entries.append(product.ravel())
+            summands.append(product)
             gradient[columns] += half @ (seen - points).ravel()
-        entries.append(-known.ravel())
+        summands.append(-known)
         gradient[common] -= sum((info @ (constants - mean) for mean, info in before), np.zeros(k))
-        information = sparse.csc_matrix((np.concatenate(entries)[free], (where[free], across[free])), (size, size))
-        solver = splu(information, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
-        if (taken or before) and not solver.U.diagonal().min() > 0.0:
-            return solve(space, maps, ids, *first_guess, is_whole=False)
-        step = -solver.solve(gradient[:size])
+        summands = [part if own.all() else part[np.ix_(own, own)] for part, own in zip(summands, free, strict=True)]
+        try:
+            eliminated = Elimination(size, blocks, cliques, summands)
+        except LinAlgError as error:
+            if taken or before:
+                return solve(space, maps, ids, *first_guess, is_whole=False)
+            raise InputError("the sub-maps leave a start or a landmark undetermined") from error
+        step = -eliminated.solve(gradient[:size])
         starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
         world += step[first : size - k].reshape(-1, dim)
         constants = constants + step[size - k :]
         if np.abs(step).max() < CLOSE_ENOUGH:
             break
-    return Solution(ids, world, starts, constants, factors, information, solver, is_whole)
+    return Solution(ids, world, starts, constants, factors, eliminated, is_whole)
 
 
 def _weighed(

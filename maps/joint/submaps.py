@@ -277,7 +277,7 @@ class SubMaps:
         space, d, every = self.space, self.space.dim, self.copied()
         every._take(present)
         solution = every._solve(every._shared(alone=True))
-        cov = solution.marginal(np.append(d * number + np.arange(d), d * len(self.maps) + np.arange(d)))
+        cov = solution.eliminated.marginal(np.append(d * number + np.arange(d), d * len(self.maps) + np.arange(d)))
         mean = space.between(solution.starts[number + 1], solution.starts[-1])
         turn = np.concatenate([-space.adjoint(space.inverse(mean)), np.eye(d)], axis=1)
         return Estimate(mean, gaussian.symmetrise(turn @ cov @ turn.T))
@@ -383,7 +383,7 @@ class SubMaps:
             return every.landmarks()
         space, d, dim = self.space, self.space.dim, self.dim
         solution = self._solve(self._shared(alone=True))
-        joint, end_of = solution.covariance(), solution.starts[1:]
+        joint, end_of = solution.eliminated.within(), solution.starts[1:]
         names, places, covs = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
         for number, (each, factor) in enumerate(zip(self.maps, solution.factors, strict=True)):
             # Of the landmarks that this sub-map is the last to hold, given those solved for, with its start and end.
@@ -398,10 +398,9 @@ class SubMaps:
             seen = each.points[mine] + (gain @ factor.residual).reshape(-1, dim)
             by_all = (gain @ factor.slope).reshape(mine.size, dim, -1)
             by_all[:, :, d : 2 * d] += space.transform_jacobian(seen)
-            free = factor.columns >= 0
-            columns, by_all = factor.columns[free], by_all[:, :, free]
-            within = joint[columns[:, None], columns].toarray()
-            spread = (by_all.reshape(-1, columns.size) @ within).reshape(by_all.shape) @ np.swapaxes(by_all, 1, 2)
+            by_all = by_all[:, :, factor.columns >= 0]
+            half = (by_all.reshape(-1, by_all.shape[2]) @ joint[number]).reshape(by_all.shape)
+            spread = half @ np.swapaxes(by_all, 1, 2)
             turn = space.rotation(end_of[number])
             names.append(each.ids[mine])
             places.append(space.transform(end_of[number], seen))
