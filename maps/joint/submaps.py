@@ -548,7 +548,10 @@ class SubMaps:
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
         asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
-        solution = self._solve(np.union1d(self._shared(), asked))
+        try:
+            solution = self._solve(np.union1d(self._shared(), asked))
+        except InputError:  # as of a filter that has diverged: they stay as they are
+            return
         if not solution.is_whole:
             return
         ids, self.starts, self._places = solution.ids, list(solution.starts), None
