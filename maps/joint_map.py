@@ -209,6 +209,9 @@ class JointMap(Map):
         cov[here, here] += noise[d:, d:]
         cross[here] = A @ cross[here] + noise[d:, :d]
         values, vectors = np.linalg.eigh(increment)
+        if values[0] < 0.0:  # by rounding, where the motion is known exactly and the path tells the substate
+            values = np.maximum(values, 0.0)
+            increment = gaussian.symmetrise((vectors * values) @ vectors.T)
         known = values > SINGULAR * values[-1]
         root = vectors[:, known] / np.sqrt(values[known])
         half = cross @ root

@@ -14,7 +14,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.motion.odometry import OdometryMotion, wheel_errors
+from rbpf.motion.odometry import Odometry, OdometryMotion, wheel_errors
 from rbpf.runs.recordings import filter_opened, open_robot_log
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel, wrap_angle
@@ -244,3 +244,14 @@ def test_what_wheels_get_wrong_is_found_while_running(submap, costs, tmp_path):
         again = RangeBearingSlam.of_log(log, config)
         again.load(tmp_path / "checkpoint.npz")
         np.testing.assert_array_equal(again.calibration.wheels(again.filter), (found, std))
+
+
+def test_odometry_may_claim_to_be_exact():
+    """So that the first step tells, to rounding, what the wheels get wrong."""
+    rng, slam = np.random.default_rng(0), RangeBearingSlam(RangeBearingConfig(particles=20), measurement="position")
+    points, names, step = rng.uniform(-5.0, 5.0, (6, 2)), np.arange(6), np.array([0.0, 0.1, 0.0])
+    for t in range(20):
+        z = points - [0.1 * t, 0.0] + rng.normal(0.0, 0.02, (6, 2))
+        odometry = Odometry(step, np.zeros((3, 3))) if t else None
+        pose = slam.track(z, np.tile(4e-4 * np.eye(2), (6, 1, 1)), names, odometry).pose
+    np.testing.assert_allclose(pose, 19 * step, atol=1e-6)
