@@ -1,6 +1,5 @@
 """Motion by odometry, of wheels or of a camera: each control is a measured increment with its covariance."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -22,7 +21,8 @@ class Odometry:
 
     delta: np.ndarray
     cov: np.ndarray
-    #: (d, k) how it moves, in that chart, with the constants of an `OdometryMotion` that has some; None where it does not.
+    #: (d, k) how it moves, in that chart, with the constants of an `OdometryMotion` that has some, as by `wheel_errors`;
+    #: None where it does not.
     by_constants: np.ndarray | None = None
 
     @classmethod
@@ -76,20 +76,13 @@ class OdometryMotion(MotionModel):
             injects some and names no figure; none is the default, for covariances are tested.
         free: (d,) bool: the components of Log(delta) and of the noise that are kept, as `CAMERA_PLANE`, which keeps a
             camera in the x–z plane of its first pose (S05); the others are dropped. None keeps all.
-        constants: numbers k of a substate that stay what they are, as of a calibration.
-        by_constants: how an increment (E,) moves with these, (d, k) in the right chart at its end, as by `wheel_errors`;
-            None for constants that do not move the robot.
+        constants: numbers k of a substate that stay what they are, as of a calibration; `Odometry` moves with them.
     """
 
     def __init__(
-        self,
-        space: LieGroup,
-        std_added: ArrayLike = 0.0,
-        free: tuple[bool, ...] | None = None,
-        constants: int = 0,
-        by_constants: Callable[[np.ndarray], np.ndarray] | None = None,
+        self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None, constants: int = 0
     ) -> None:
-        self.space, self.constants, self.by_constants = space, constants, by_constants
+        self.space, self.constants = space, constants
         self.cov_added = np.diag(deviations(std_added, space.dim, "std_added") ** 2)
         self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
@@ -97,7 +90,7 @@ class OdometryMotion(MotionModel):
         """The increment, the same for all particles; refused is one that is not finite, or whose covariance is none."""
         d = self.space.dim
         if control is None:
-            return self._with_constants(state, np.zeros((d, d)), self.space.identity())
+            return self._with_constants(state, np.zeros((d, d)), None)
         if control.delta.shape != (self.space.size,) or control.cov.shape != (d, d):
             raise InputError(
                 f"odometry needs delta ({self.space.size},) and cov ({d}, {d}), "
@@ -110,16 +103,14 @@ class OdometryMotion(MotionModel):
             factor = gaussian.psd_factor(moved.cov)
         except InputError as error:
             raise InputError(f"the covariance of the odometry is not one: {error}") from error
-        return self._with_constants(self.space.compose(state, moved.delta), factor, moved.delta, moved.by_constants)
+        return self._with_constants(self.space.compose(state, moved.delta), factor, moved.by_constants)
 
-    def _with_constants(
-        self, mean: np.ndarray, factor: np.ndarray, delta: np.ndarray, coupling: np.ndarray | None = None
-    ) -> Transition:
-        d, k = self.space.dim, self.constants
+    def _with_constants(self, mean: np.ndarray, factor: np.ndarray, coupling: np.ndarray | None) -> Transition:
+        k = self.constants
         if not k:
             return Transition(mean, factor[None])
         if coupling is None:
-            coupling = np.zeros((d, k)) if self.by_constants is None else self.by_constants(delta)
+            coupling = np.zeros((self.space.dim, k))
         factor = np.pad(factor, ((0, k), (0, 0)))
         return Transition(mean, factor[None], coupling[None], np.eye(k)[None], np.zeros((1, k)))
 

@@ -1,5 +1,6 @@
 """A robot that calibrates itself: where its sensor is, and what its wheels get wrong, as constants of the joint map."""
 
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -12,7 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.maps.joint.solution import Constants
 from rbpf.maps.joint_map import JointMap
-from rbpf.motion.odometry import wheel_errors
+from rbpf.motion.odometry import Odometry, wheel_errors
 from rbpf.sensors.range_bearing import RigidPointModel
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 
@@ -53,16 +54,17 @@ class RobotCalibration:
         #: Its sum, the variance that right wheels have of it, and the sum of squares.
         self.score = np.zeros((3, self.learnt.size))
         self._cov = np.diag(std[self.learnt] ** 2)
-        self._moves = np.zeros((space.dim, self.learnt.size))  # of the last odometry
         scale = 1.0 if is_asked else AS_GOOD_AS_KNOWN
         self.prior = np.zeros(self.learnt.size), scale**2 * self._cov
 
-    def by_constants(self, delta: np.ndarray) -> np.ndarray:
-        """How odometry (E,) moves with them, (d, m) in the right chart at its end."""
-        d = self.space.dim
-        by_wheels = wheel_errors(delta) if isinstance(self.space, SE2Group) else np.zeros((d, 3))
-        self._moves = np.concatenate([np.zeros((d, d)), by_wheels], axis=1)[:, self.learnt]
-        return self._moves
+    def driven(self, odometry: Odometry | None) -> Odometry | None:
+        """The odometry, which says how it moves with them; one of another shape as it is: the motion model refuses it."""
+        wheels = self.learnt >= self.space.dim
+        if odometry is None or not wheels.any() or np.shape(odometry.delta) != (self.space.size,):
+            return odometry
+        by_constants = np.zeros((self.space.dim, self.learnt.size))
+        by_constants[:, wheels] = wheel_errors(odometry.delta)[:, self.learnt[wheels] - self.space.dim]
+        return replace(odometry, by_constants=by_constants)
 
     def tuned(self, filter_: Filter) -> RigidPointModel:
         """The sensor where the particles have it on average."""
@@ -72,14 +74,14 @@ class RobotCalibration:
         assert own is not None
         return self.model.tuned(filter_.particles.weights @ own, self.free)
 
-    def watch(self, filter_: Filter, factor: np.ndarray, found: Correction | None) -> bool:
+    def watch(self, filter_: Filter, odometry: Odometry, factor: np.ndarray, found: Correction | None) -> bool:
         """Tests a step by odometry, by what was found about its noise, whose covariance has a factor (d, r).
 
         Whether what the wheels get wrong is estimated from here on, and was not before.
         """
-        if self.is_estimated or not self.learnt.size or found is None:
+        if self.is_estimated or odometry.by_constants is None or found is None:
             return False
-        whitened = np.linalg.lstsq(factor, self._moves)[0]
+        whitened = np.linalg.lstsq(factor, odometry.by_constants)[0]
         score, variance = whitened.T @ found.mean, np.einsum("ac,ab,bc->c", whitened, found.cov, whitened)
         self.score += score, np.maximum(variance, 0.0), score**2
         self.is_estimated = bool((self.score[0] ** 2 > DECISIVE**2 * self.score[1:].max(axis=0)).any())

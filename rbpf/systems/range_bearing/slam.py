@@ -89,7 +89,7 @@ class RangeBearingSlam(System):
             landmark_map.register(self.point)
         self.likelihood = likelihood = config.of_innovations(misread)  #: of an innovation.
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
-        motion = OdometryMotion(space, constants=calibration.learnt.size, by_constants=calibration.by_constants)
+        motion = OdometryMotion(space, constants=calibration.learnt.size)
         self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
         self.hypotheses: Hypotheses | None = None
         if is_unnamed:
@@ -140,7 +140,7 @@ class RangeBearingSlam(System):
         Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
-        self.sensor.model = self.calibration.tuned(self.filter)
+        self.sensor.model, odometry = self.calibration.tuned(self.filter), self.calibration.driven(odometry)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
             # One that comes a second time in the frame that starts its landmark is not used.
@@ -154,7 +154,7 @@ class RangeBearingSlam(System):
         correction, messages = motion_correction(report.mixture), tuple[str, ...]()
         if odometry is not None:
             self._odometry = self.space.compose(self._odometry, odometry.delta)
-            if self.calibration.watch(self.filter, report.mixture[0].factor[0], correction):
+            if self.calibration.watch(self.filter, odometry, report.mixture[0].factor[0], correction):
                 messages = (
                     "the odometry errs alike in all steps: what the wheels get wrong is estimated from here on",
                 )
