@@ -6,6 +6,7 @@ candidate. Here candidates are 60 at most, and new ones are spread over the imag
 whole numbers that are never used again.
 """
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Annotated, final
 
@@ -113,6 +114,12 @@ class LandmarkManager:
     def nearest(self, descriptors: np.ndarray) -> np.ndarray:
         """Distance (K,) of each descriptor (K, d) to the nearest one held, infinite where none is."""
         return distances(two_best(descriptors, self.descriptors)[0])
+
+    def copied(self) -> "LandmarkManager":
+        """To be asked what a frame would do to it."""
+        other = copy(self)
+        other._table = self._table.copy()  # all else is never changed in place
+        return other
 
     def observe(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Begins a frame in which landmarks (k,) were seen again; returns names (j,) and rows (j,) of those dropped.

@@ -374,7 +374,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         make_room(belief.map, self.manager.names[confirmed], self.manager.unseen_for[confirmed])
         if frame.uncertain:
             return []
-        rows = self._starts(frame, known) if frame.starts is None else frame.starts
+        rows = self._starts(frame, known, self.manager) if frame.starts is None else frame.starts
         if not rows.size:
             return []
         features = frame.features.take(rows)
@@ -387,7 +387,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             cov = cov * self.noise.factor(ids)[:, None, None]
         return [NewLandmarks(features.z, cov, self.model, self.landmark, ids=ids)]
 
-    def _starts(self, pair: Pair[StereoFeatures], known: np.ndarray) -> np.ndarray:
+    def _starts(self, pair: Pair[StereoFeatures], known: np.ndarray, manager: LandmarkManager) -> np.ndarray:
         """Rows of features whose depth is known well enough for a Gaussian in space, and which the manager chooses."""
         features = pair.features
         deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
@@ -395,12 +395,13 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if not rows.size:
             return rows
         descriptors, px = features.descriptors[rows], features.z[:, :2]
-        return rows[self.manager.select(px[rows], descriptors, self.manager.nearest(descriptors), px[known])]
+        return rows[manager.select(px[rows], descriptors, manager.nearest(descriptors), px[known])]
 
     def left_over(self, pair: Pair[StereoFeatures]) -> tuple[Pair[StereoFeatures], np.ndarray]:
         assert pair.landmarks is not None
-        free = pair.landmarks == NULL
-        pair = replace(pair, starts=self._starts(pair, ~free))
+        free, manager = pair.landmarks == NULL, self.manager.copied()
+        manager.observe(pair.landmarks[~free])  # those that it confirms or drops make room for new ones
+        pair = replace(pair, starts=self._starts(pair, ~free, manager))
         free[pair.starts] = False
         return pair, free
 
