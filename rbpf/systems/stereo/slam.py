@@ -338,7 +338,7 @@ class StereoSlam(System):
                 begun = time.perf_counter()
                 proposal = config.recovery.proposal.build() if uncertain else None
                 if self._once and self.filter.steps and not uncertain:
-                    view, control, proposal = self._proposed(view, control, at.left_over)
+                    view, control, proposal = self._proposed(view, control, at.left_over, offset_px)
                 report = self.filter.step(view, control if self.filter.steps else None, pair.stamp_ns, proposal)
                 self.reckoning, self._last_update = at.updated(), self.frames
                 found = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
@@ -585,7 +585,7 @@ class StereoSlam(System):
         return replace(view, landmarks=ids, for_map=view.for_map & ~away), int((ids != NULL).sum())
 
     def _proposed(
-        self, view: Pair[Any], moved: Odometry, left_over: np.ndarray
+        self, view: Pair[Any], moved: Odometry, left_over: np.ndarray, offset_px: float
     ) -> tuple[Pair[Any], Odometry, Proposal | None]:
         """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
 
@@ -604,11 +604,13 @@ class StereoSlam(System):
             view, free = self.front_end.landmarks.left_over(view)
             if left_over.size:
                 rows = np.flatnonzero(free & left_over.any(axis=(1, 2)))
-                prior = self._joined(prior, moved, left_over[rows], view.features.take(rows))
+                prior = self._joined(prior, moved, left_over[rows], view.features.take(rows), offset_px)
         prior = self._constrained(prior)
         return view, prior, self._proposal.build(SE3.local(prior.delta, moved.delta))
 
-    def _joined(self, prior: Odometry, moved: Odometry, before: np.ndarray, features: Any) -> Odometry:
+    def _joined(
+        self, prior: Odometry, moved: Odometry, before: np.ndarray, features: Any, offset_px: float
+    ) -> Odometry:
         """The prior, joined with what matches since the last update say of whose two pixels a joint map uses neither.
 
         They are `before` (k, 3, 4), as `DeadReckoning.left_over`, and the features of the pair. Those of the next update begin
@@ -624,12 +626,13 @@ class StereoSlam(System):
         measured = Odometry(found.previous_camera_from_camera, found.cov)
         if not self._calibration.is_online:
             return product(measured, prior)[0]
-        # The pixels are free of the disparities' error as it is known now. The motion moves with what it is besides.
+        # The pixels are free of the disparities' error as it was known when the pair was measured, before old landmarks were
+        # brought back, which says more of it. The motion moves with what it is besides.
         earlier, later = pixel_gains(matches.take(found.inliers), measured, config)
         slope = -(earlier + later).sum(axis=0)[:, 2:]
         joined, _ = product(replace(measured, by_constants=slope), prior)
         assert joined.by_constants is not None
-        return replace(joined, delta=SE3.retract(joined.delta, -joined.by_constants[:, 0] * self.calibration()[0]))
+        return replace(joined, delta=SE3.retract(joined.delta, -joined.by_constants[:, 0] * offset_px))
 
 
 _NO_ROWS, _NO_MATCHES = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)
