@@ -50,7 +50,8 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     if not hints:
         return function
     names, test, calls, result = list(inspect.signature(function).parameters), -1, 0, None
-    own, passed = re.findall(r"{self\.(\w+)}", str(hints)), set[Any]()
+    own, named = re.findall(r"{self\.(\w+)}", str(hints)), re.findall(r"{(\w+)}", str(hints))
+    passed = set[Any]()
 
     @wraps(function)
     def some(*args: Any, **kwargs: Any) -> Any:
@@ -62,7 +63,8 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
         given = function(*args, **kwargs)
         if switch.on:
             values = {**dict(zip(names, args, strict=False)), **kwargs, "return": given}
-            seen = *(getattr(args[0], name) for name in own), *(outline(values.get(name, some)) for name in hints)
+            seen = *(getattr(args[0], name) for name in own), *(values.get(name) for name in named)
+            seen += tuple(outline(values.get(name, some)) for name in hints)
             if seen not in passed:
                 result = given
                 check(*args, **kwargs)

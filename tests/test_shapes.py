@@ -7,6 +7,7 @@ from typing import get_args, get_origin
 
 import numpy as np
 import pytest
+from jaxtyping import Float
 
 import rbpf.core.models
 import rbpf.gaussian
@@ -63,3 +64,14 @@ def test_a_result_is_compared_with_the_arguments_broadcast():
     camera = Pinhole(320, 240, 200.0, 200.0, 159.5, 119.5)
     with pytest.raises(ShapeError, match="point"):
         camera.project(np.zeros((5, 4)))  # the fourth number would be ignored
+
+
+@on
+def test_what_passed_with_one_argument_does_not_pass_with_another():
+    def zeros(n: int) -> Float[np.ndarray, " {n}"]:
+        return np.zeros(3)
+
+    watched = checked(zeros)
+    watched(3)
+    with pytest.raises(ShapeError, match="return"):
+        watched(2)
