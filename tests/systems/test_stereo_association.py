@@ -141,6 +141,15 @@ def test_what_was_put_away_is_held_again_when_it_is_seen():
         assert np.linalg.norm(SE3.translation(off)) < 0.02
 
 
+def test_landmarks_that_are_confirmed_make_room_for_candidates_at_once():
+    sequence = pairs(8)
+    few = replace(CONFIG.new_landmarks, max_candidates=10)
+    slam = StereoSlam(sequence.rig, replace(CONFIG, map=MapConfig(kind="joint"), new_landmarks=few))
+    for frame in sequence.frames():
+        slam.take(frame)
+        assert (~slam.front_end.landmarks.manager.confirmed).sum() == 10
+
+
 def test_a_pixel_tells_the_motion_or_the_map(monkeypatch):
     """What no landmark has used is followed to the next update, and makes the motion better known; nothing is used twice."""
     sequence, covs = pairs(8), []
