@@ -125,15 +125,17 @@ class OdometryMotion(MotionModel):
 
 
 def wheel_errors(delta: np.ndarray) -> np.ndarray:
-    """How an increment (…, 3) in the plane moves with what wheels get wrong alike in all steps: (…, 3, 3).
+    """How an increment (…, 3) in the plane moves with what wheels get wrong alike in all steps: (…, 3, 4).
 
     In the chart at its end the heading is off, in this order: per metre ahead [rad/m], as by wheels of unequal size or a
     steering that is not straight, and by fractions of what is turned to the left and to the right, as by a track or a
-    steering ratio that is wrong (J. Borenstein and L. Feng 1996).
+    steering ratio that is wrong (J. Borenstein and L. Feng 1996); then the place, by a fraction of the way, as by wheels
+    that are larger than they are said to be.
     """
     turn, ahead = np.moveaxis(SE2.log(delta), -1, 0)[:2]
-    by_errors = np.zeros((*np.shape(delta), 3))
-    by_errors[..., 0, :] = np.stack([ahead, np.maximum(turn, 0.0), np.minimum(turn, 0.0)], axis=-1)
+    by_errors = np.zeros((*np.shape(delta), 4))
+    by_errors[..., 0, :3] = np.stack([ahead, np.maximum(turn, 0.0), np.minimum(turn, 0.0)], axis=-1)
+    by_errors[..., 1:, 3] = -SE2.translation(SE2.inverse(delta))
     return by_errors
 
 

@@ -400,7 +400,7 @@ def _run(
                 "stopped while the results were written; the same command with --resume filters only what is missing"
             ) from error
     problems = entries.get("problems", ())
-    odd = [f"{len(problems)} remarks on single frames, the first: {problems[0]}"] if problems else []
+    odd = [f"Remarks on single frames: {len(problems)}, the first: {problems[0]}"] if problems else []
     where = f"pictures and report.html are in {out}, all figures in its summary.json"
     answer(entries | {"out": str(out)}, options.json, *entries["sentences"], *odd, where)
     if run.failure is not None:

@@ -36,7 +36,7 @@ class RobotCalibration:
         self, config: RangeBearingConfig, space: SE2Group | SE3Group, model: RigidPointModel, is_possible: bool
     ) -> None:
         is_asked = config.calibrate not in ("auto", "off")
-        std = config.uncertain(space) if is_possible else np.zeros(space.dim + 3)
+        std = config.uncertain(space) if is_possible else np.zeros(space.dim + 4)
         if is_asked and not is_possible:
             raise InputError(
                 f"calibrate={config.calibrate} takes a joint map of landmarks with names: leave out map=particles, lag and "
@@ -48,7 +48,7 @@ class RobotCalibration:
                 "self_calibration above 0"
             )
         self.space, self.model = space, model
-        self.learnt = np.flatnonzero(std)  #: (m,) which of all (d + 3,) are uncertain.
+        self.learnt = np.flatnonzero(std)  #: (m,) which of all (d + 4,) are uncertain.
         self.free = np.eye(space.dim, std.size)[:, self.learnt]  #: (d, m) how the sensor's place moves with them.
         self.is_estimated = is_asked
         #: Its sum, the variance that right wheels have of it, and the sum of squares.
@@ -91,8 +91,8 @@ class RobotCalibration:
         return self.is_estimated
 
     def wheels(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
-        """What the wheels get wrong as far as it is found (3,), as in `wheel_errors`, and its standard deviations (3,)."""
-        found, std, own = np.zeros(3), np.zeros(3), self.learnt >= self.space.dim
+        """What the wheels get wrong as far as it is found (4,), as in `wheel_errors`, and its standard deviations (4,)."""
+        found, std, own = np.zeros(4), np.zeros(4), self.learnt >= self.space.dim
         if own.any() and self.is_estimated:
             (mean, cov), at = self._moments(filter_), self.learnt[own] - self.space.dim
             found[at], std[at] = mean[own], np.sqrt(np.diagonal(cov))[own]
@@ -125,9 +125,9 @@ class RobotCalibration:
                 yaw, std = np.arctan2(turn[1, 0], turn[0, 0]), np.sqrt(cov[-dim - 1, -dim - 1])
                 found["yaw_deg"] = np.rad2deg(yaw), np.rad2deg(std)
         if (self.learnt >= self.space.dim).any():
-            (drift, left, right), (std_drift, std_left, std_right) = self.wheels(filter_)
-            found["heading_deg_per_m"] = np.rad2deg(drift), np.rad2deg(std_drift)
-            found |= {"turn_left": (left, std_left), "turn_right": (right, std_right)}
+            wheels = np.array(self.wheels(filter_)).T
+            found["heading_deg_per_m"] = tuple(np.rad2deg(wheels[0]))
+            found |= dict(zip(("turn_left", "turn_right", "way"), map(tuple, wheels[1:]), strict=True))
         stds = {f"std_{name}": float(std) for name, (_, std) in found.items()}
         return {"calibration": {name: float(value) for name, (value, _) in found.items()} | stds}
 

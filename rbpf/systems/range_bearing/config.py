@@ -56,6 +56,7 @@ class CalibrationConfig(Ranged):
     yaw_deg: NotNegative = 0.0  #: turned to the left.
     heading_deg_per_m: NotNegative = 1.0  #: the odometry's heading drifts for every metre ahead, in the plane.
     turn: NotNegative = 0.05  #: fraction by which its turns are wrong, those to the left and those to the right.
+    way: NotNegative = 0.05  #: fraction by which the ways that it says are wrong.
 
     def of_sensor(self, space: SE2Group | SE3Group) -> np.ndarray:
         """(d,) in the right chart of the sensor's pose."""
@@ -63,8 +64,8 @@ class CalibrationConfig(Ranged):
         return np.array([yaw, *shift[:2]] if isinstance(space, SE2Group) else [0.0, 0.0, yaw, *shift])
 
     def of_wheels(self) -> np.ndarray:
-        """(3,) of `wheel_errors`."""
-        return np.array([np.deg2rad(self.heading_deg_per_m), self.turn, self.turn])
+        """(4,) of `wheel_errors`."""
+        return np.array([np.deg2rad(self.heading_deg_per_m), self.turn, self.turn, self.way])
 
 
 @dataclass(frozen=True)
@@ -106,12 +107,16 @@ class RangeBearingConfig(RunConfig):
         return cls(window=1) if given.get("calibrate") in ("sensor", "online") else cls()
 
     def uncertain(self, space: SE2Group | SE3Group) -> np.ndarray:
-        """Standard deviations (d + 3,) of what a robot may estimate of itself: its sensor's place, then its wheels."""
+        """Standard deviations (d + 4,) of what a robot may estimate of itself: its sensor's place, then its wheels."""
         sensor, wheels = self.self_calibration.of_sensor(space), self.self_calibration.of_wheels()
         if self.calibrate not in ("sensor", "online"):
             sensor[:] = 0.0
         if self.calibrate in ("off", "sensor") or not isinstance(space, SE2Group):
             wheels[:] = 0.0
+        if (
+            self.calibrate == "online"
+        ):  # a robot that turns one way cannot tell its way from a sensor that stands to the side
+            wheels[-1] = 0.0
         return np.concatenate([sensor, wheels])
 
     def kept_map(self) -> tuple[Literal["joint", "particles"], str]:
