@@ -112,6 +112,21 @@ def test_settings_that_say_a_thing_twice_or_are_nested(tmp_path, text, words):
         load_settings(MonoConfig, "mono", tmp_path / "config.yaml", (), {})
 
 
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        ("map=all", "settings: map must be auto or joint or particles, got 'all'"),
+        ("map.submap=10", "settings: map must be auto or joint or particles, got a group of settings"),
+        ("submap=few", "settings: submap must be a whole number or nothing, got a word"),
+        ("likelihood.kind=x", "settings: likelihood.kind must be gaussian or truncated or outliers, got 'x'"),
+        ("proposal=ekf", "proposal is a group of settings, of which each is set by itself: proposal.kind, .*"),
+    ],
+)
+def test_what_a_setting_may_be_is_said(pair, words):
+    with pytest.raises(InputError, match=f"^{words}$"):
+        load_settings(RangeBearingConfig, "range-bearing", None, [pair], {})
+
+
 def test_memory_is_estimated_before_it_is_taken():
     sensor = NamedLandmarkSensor(RangeBearing(SE2), Point(2))
     with pytest.raises(InputError, match=r"a filter of 10{12} particles would take .* GB of memory, this machine has"):

@@ -1,9 +1,10 @@
 """Settings from a YAML file, from key=value pairs and from the command line, in this order."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -21,6 +22,10 @@ HEADER = (
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+
+#: What msgspec's names of types are for who gives a setting.
+PLAIN = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "null": "nothing"}
+PLAIN |= {"array": "a list", "object": "a group of settings"}
 
 Config = TypeVar("Config", bound="DataclassInstance")
 
@@ -61,12 +66,18 @@ def load_settings(
     try:
         return msgspec.convert(_over(asdict(defaults_of(kind, values)), values), kind, strict=False)
     except msgspec.ValidationError as error:
-        # "Expected `int`, got `str` - at `$.search.measurements`", or a range's own words and the group's place.
+        # "Expected `int | null`, got `str` - at `$.search.measurements`", "Invalid enum value 'a' - at …", or a range's own
+        # words and the group's place.
         words, _, place = str(error).partition(" - at `$")
         name = place.rstrip("`").lstrip(".")
         if isinstance(error.__cause__, SettingError):
             name, words = f"{name}.{error.__cause__.name}".lstrip("."), error.__cause__.words
-        raise InputError(f"settings: {name} {words}".replace(" Expected", ": expected")) from error
+        elif choices := _choices(kind, name.split("[")[0]):
+            words = re.sub("^(Expected .*, got|Invalid enum value)", f"must be {' or '.join(choices)}, got", words)
+        words = re.sub(
+            "`(.+?)`", lambda types: " or ".join(PLAIN.get(one, one) for one in types[1].split(" | ")), words
+        )
+        raise InputError(f"settings: {name} {words.replace('Expected', 'must be')}") from error
 
 
 def defaults_of(kind: type[Config], values: Mapping[str, Any]) -> Config:
@@ -84,6 +95,15 @@ def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
     return both
 
 
+def _choices(kind: Any, name: str) -> list[str]:
+    """The words that a setting may be."""
+    *groups, last = name.split(".")
+    for group in groups:
+        kind = next(item.default_factory for item in fields(kind) if item.name == group)
+    hint = get_type_hints(kind)[last]
+    return [str(word) for one in (hint, *get_args(hint)) if get_origin(one) is Literal for word in get_args(one)]
+
+
 def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
     known = {item.name: item for item in fields(kind)}
     renamed = former_names(kind)
@@ -95,3 +115,6 @@ def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
         inner: Any = known[name].default_factory
         if isinstance(value, dict) and is_dataclass(inner):
             _refuse_unknown(value, inner, f"{prefix}{name}.")
+        elif is_dataclass(inner):
+            group = ", ".join(f"{prefix}{name}.{item.name}" for item in fields(inner))
+            raise InputError(f"{prefix}{name} is a group of settings, of which each is set by itself: {group}")
