@@ -40,7 +40,7 @@ def _horner(coefficients, x):
 
 
 @njit(cache=True, error_model="numpy")
-def _coefficients(x):
+def coefficients(x):
     """The coefficients c, d and e."""
     if x < 1.0:
         return _horner(_C, x), _horner(_D, x), _horner(_E, x)
@@ -350,7 +350,7 @@ def left_jacobian(xi, out):
     for i in range(out.shape[0]):
         w, v = (xi[i, 0], xi[i, 1], xi[i, 2]), (xi[i, 3], xi[i, 4], xi[i, 5])
         squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-        c, d, e = _coefficients(squared)
+        c, d, e = coefficients(squared)
         # (1 − cos θ)/θ² from the half angle, which does not cancel.
         theta = math.sqrt(squared + TINY)
         fraction = math.sin(0.5 * theta) / theta
@@ -371,7 +371,7 @@ def left_jacobian_inverse(xi, out):
         angle = 0.5 * math.sqrt(shifted)
         cotangent = (1.0 - angle * math.cos(angle) / math.sin(angle)) / shifted
         _fill_rotations(w, -0.5, cotangent, out[i])
-        c, d, e = _coefficients(squared)
+        c, d, e = coefficients(squared)
         _fill_coupling(w, v, c, d, e, middle)
         _product(out[i, :3, :3], middle, half)
         _product(half, out[i, :3, :3], middle)

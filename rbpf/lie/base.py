@@ -1,13 +1,14 @@
 """What a state space must offer, and what it gets from that."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbpf.arrays import Array, Float, Like
+from rbpf.errors import InputError
 
 States = Like[ArrayLike, "*#batch {self.size}"]  #: Elements (..., E), as they are given.
 Tangents = Like[ArrayLike, "*#batch {self.dim}"]  #: Tangent vectors (..., d), as they are given.
@@ -26,6 +27,48 @@ def join(parts: Sequence[Array]) -> Array:
         batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         parts = [np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts]
     return np.concatenate(parts, axis=-1)
+
+
+def of_rows(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:
+    """A function of rows, (..., size) -> (..., *out_shape)."""
+    x = np.asarray(x, dtype=float)
+    _require_size(x, size)
+    out = np.empty((x.size // size, *out_shape))
+    function(np.ascontiguousarray(x).reshape(-1, size), out)
+    return out.reshape(*x.shape[:-1], *out_shape)
+
+
+def of_two_rows(
+    function: Callable[[Array, Array, Array], None], x: ArrayLike, y: ArrayLike, sizes: tuple[int, int, int]
+) -> Array:
+    """A function of rows of two arrays whose leading axes broadcast; `sizes` are those of their rows and of the result's."""
+    x, y, (own, other, result) = np.asarray(x, dtype=float), np.asarray(y, dtype=float), sizes
+    _require_size(x, own)
+    _require_size(y, other)
+    shape = x.shape[:-1]
+    if x.ndim == 1:
+        shape = y.shape[:-1]
+    elif y.ndim > 1 and y.shape[:-1] != shape:
+        shape = np.broadcast_shapes(shape, y.shape[:-1])
+        x, y = _spread(x, shape), _spread(y, shape)
+    out = np.empty((*shape, result))
+    left, right = np.ascontiguousarray(x).reshape(-1, own), np.ascontiguousarray(y).reshape(-1, other)
+    function(left, right, out.reshape(-1, result))
+    return out
+
+
+def _spread(x: Array, shape: tuple[int, ...]) -> Array:
+    """With the leading axes `shape`; a single row stays one, the kernels repeat it."""
+    if x.size == x.shape[-1]:
+        return x
+    out = np.empty((*shape, x.shape[-1]))  # as np.broadcast_to, which takes as long as a kernel
+    out[...] = x
+    return out
+
+
+def _require_size(x: Array, size: int) -> None:
+    if x.ndim == 0 or x.shape[-1] != size:
+        raise InputError(f"expected an array (..., {size}), got {x.shape}")
 
 
 class LieGroup(ABC):

@@ -4,21 +4,28 @@ The plane is the complex numbers: a rotation is the factor exp(i theta), and Exp
 V = sin(h) / h exp(i h), h = omega / 2.
 """
 
-from math import factorial
 from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbpf.arrays import Array, Float, Like
-from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents
+from rbpf.kernels import se2 as kernels
+from rbpf.lie.base import (
+    MEAN,
+    LieGroup,
+    StateArray,
+    States,
+    TangentArray,
+    TangentMatrix,
+    Tangents,
+    of_rows,
+    of_two_rows,
+)
 
 Complex = NDArray[np.complex128]
 
 _TURN = 2.0 * np.pi
-#: Added to theta^2, so that no division sees zero: its root is far below any angle that changes a result.
-_TINY = 1e-300
-_C_SERIES = [(-1) ** k / factorial(2 * k + 3) for k in range(10)]
 
 
 @final
@@ -54,17 +61,23 @@ class SE2Group(LieGroup):
         return _pack(_wrap(-a[..., 0]), -_phasor(-a[..., 0]) * _planar(a))
 
     def retract(self, x: States, xi: Tangents) -> StateArray:
-        # The rotations exp(i theta) and exp(i omega / 2) of the increment are one.
-        x, xi = _contiguous(x), _contiguous(xi)
-        half = 0.5 * xi[..., 0]
-        step = _sinc(half) * _phasor(x[..., 0] + half) * _planar(xi)
-        return _pack(_wrap(x[..., 0] + xi[..., 0]), _planar(x) + step)
+        return of_two_rows(kernels.retract, x, xi, (3, 3, 3))
 
     def local(self, x: States, y: States) -> TangentArray:
-        x, y = _contiguous(x), _contiguous(y)
-        angle = _wrap(y[..., 0] - x[..., 0])
-        half = 0.5 * angle
-        return _pack(angle, _phasor(-x[..., 0] - half) * (_planar(y) - _planar(x)) / _sinc(half))
+        return of_two_rows(kernels.local, x, y, (3, 3, 3))
+
+    def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
+        # The angle does not depend on the place; once it is known, what is left is linear in the place.
+        points, angle, (iterations, tolerance) = _contiguous(points), float(mean[0]), MEAN
+        for _ in range(iterations):
+            half = 0.5 * _wrap(points[:, 0] - angle)
+            step = 2.0 * float((weights * half).sum())
+            angle += step
+            if abs(step) <= tolerance:
+                break
+        pull = weights / _sinc(half) * _phasor(-half)
+        apart = (pull * (_planar(points) - _planar(mean))).sum() / pull.sum()
+        return _pack(_wrap(np.asarray(angle)), _planar(mean) + apart)
 
     def normalise(self, x: States) -> StateArray:
         x = _contiguous(x)
@@ -72,18 +85,16 @@ class SE2Group(LieGroup):
 
     def adjoint(self, a: States) -> TangentMatrix:
         a = _contiguous(a)
-        return _block(_phasor(a[..., 0]), -1j * _planar(a))
+        out = np.zeros((*a.shape, 3))
+        out[..., 0, 0], out[..., 1, 0], out[..., 2, 0] = 1.0, a[..., 2], -a[..., 1]
+        out[..., 1:, 1:] = self.rotation(a)
+        return out
 
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        xi = _contiguous(xi)
-        half = 0.5 * xi[..., 0]
-        return _block(_sinc(half) * _phasor(half), _coupling(xi))
+        return of_rows(kernels.left_jacobian, xi, 3, (3, 3))
 
     def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        xi = _contiguous(xi)
-        half = 0.5 * xi[..., 0]
-        inverse = _phasor(-half) / _sinc(half)
-        return _block(inverse, -inverse * _coupling(xi))
+        return of_rows(kernels.left_jacobian_inverse, xi, 3, (3, 3))
 
     def transform(self, a: States, p: Like[ArrayLike, "*#batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """World points [m] of body points, with a = world_from_body."""
@@ -166,30 +177,3 @@ def _matrix(z: Complex) -> Array:
     out[..., 1, 0] = z.imag
     out[..., 0, 1] = -z.imag
     return out
-
-
-def _block(linear: Complex, column: Complex) -> Array:
-    # [[1, 0], [column, linear]] in the order [omega, v].
-    out = np.zeros((*np.shape(linear), 3, 3))
-    out[..., 0, 0] = 1.0
-    out[..., 1, 0] = column.real
-    out[..., 2, 0] = column.imag
-    out[..., 1:, 1:] = _matrix(linear)
-    return out
-
-
-def _coupling(xi: Array) -> Complex:
-    # d(translation)/d(omega) of the left Jacobian: v (theta c - i b).
-    squared = np.square(xi[..., 0])
-    # b = (1 - cos theta) / theta^2 = sum_k (-x)^k / (2k + 2)! of x = theta^2, from the half angle, which does not cancel.
-    theta = np.sqrt(squared + _TINY)
-    b = 2.0 * np.square(np.sin(0.5 * theta) / theta)
-    # c = (theta - sin theta) / theta^3 = sum_k (-x)^k / (2k + 3)!, by the series below x = 1, where it cancels; clipping
-    # keeps the branch that is not taken from overflowing.
-    small, large = np.minimum(squared, 1.0), np.maximum(squared, 1.0)
-    series = np.full_like(small, _C_SERIES[-1])
-    for coefficient in _C_SERIES[-2::-1]:
-        series = series * small + coefficient
-    theta = np.sqrt(large)
-    c = np.where(squared < 1.0, series, (theta - np.sin(theta)) / (large * theta))
-    return _planar(xi) * (xi[..., 0] * c - 1j * b)

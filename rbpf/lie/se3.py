@@ -1,15 +1,24 @@
 """SE(3), rigid motions of space; storage [qx, qy, qz, qw, tx, ty, tz], tangent [omega, v]."""
 
-from collections.abc import Callable
 from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbpf.arrays import Array, Float, Like
-from rbpf.errors import InputError
 from rbpf.kernels import se3 as kernels
-from rbpf.lie.base import MEAN, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
+from rbpf.lie.base import (
+    MEAN,
+    LieGroup,
+    StateArray,
+    States,
+    TangentArray,
+    TangentMatrix,
+    Tangents,
+    join,
+    of_rows,
+    of_two_rows,
+)
 
 
 @final
@@ -28,22 +37,22 @@ class SE3Group(LieGroup):
         return out
 
     def exp(self, xi: Tangents) -> StateArray:
-        return _one(kernels.exp, xi, 6, (7,))
+        return of_rows(kernels.exp, xi, 6, (7,))
 
     def log(self, x: States) -> TangentArray:
-        return _one(kernels.log, x, 7, (6,))
+        return of_rows(kernels.log, x, 7, (6,))
 
     def compose(self, a: States, b: States) -> StateArray:
-        return _two(kernels.compose, a, b, 7, 7)
+        return of_two_rows(kernels.compose, a, b, (7, 7, 7))
 
     def inverse(self, a: States) -> StateArray:
-        return _one(kernels.inverse, a, 7, (7,))
+        return of_rows(kernels.inverse, a, 7, (7,))
 
     def retract(self, x: States, xi: Tangents) -> StateArray:
-        return _two(kernels.retract, x, xi, 6, 7)
+        return of_two_rows(kernels.retract, x, xi, (7, 6, 7))
 
     def local(self, x: States, y: States) -> TangentArray:
-        return _two(kernels.local, x, y, 7, 6)
+        return of_two_rows(kernels.local, x, y, (7, 7, 6))
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
         mean = np.array(mean)[None]
@@ -56,20 +65,20 @@ class SE3Group(LieGroup):
         return out
 
     def adjoint(self, a: States) -> TangentMatrix:
-        return _one(kernels.adjoint, a, 7, (6, 6))
+        return of_rows(kernels.adjoint, a, 7, (6, 6))
 
     def left_jacobian(self, xi: Tangents) -> TangentMatrix:
-        return _one(kernels.left_jacobian, xi, 6, (6, 6))
+        return of_rows(kernels.left_jacobian, xi, 6, (6, 6))
 
     def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
-        return _one(kernels.left_jacobian_inverse, xi, 6, (6, 6))
+        return of_rows(kernels.left_jacobian_inverse, xi, 6, (6, 6))
 
     def transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """World points [m] of body points, with a = world_from_body."""
-        return _two(kernels.transform, a, p, 3, 3)
+        return of_two_rows(kernels.transform, a, p, (7, 3, 3))
 
     def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        return _two(kernels.inverse_transform, a, p, 3, 3)
+        return of_two_rows(kernels.inverse_transform, a, p, (7, 3, 3))
 
     def transform_jacobian(self, p: Like[ArrayLike, "*batch 3"]) -> Float[np.ndarray, "*batch 3 6"]:
         """∂(Exp(ε) p)/∂ε at ε = 0, of points p [m]: −[p]×, then I."""
@@ -82,7 +91,7 @@ class SE3Group(LieGroup):
 
     def rotation(self, a: States) -> Float[np.ndarray, "*batch 3 3"]:
         """Rotation matrix, (..., 7) -> (..., 3, 3)."""
-        return _one(kernels.rotations, a, 7, (3, 3))
+        return of_rows(kernels.rotations, a, 7, (3, 3))
 
     def matrix(self, a: States) -> Float[np.ndarray, "*batch 4 4"]:
         """Homogeneous matrix, (..., 7) -> (..., 4, 4)."""
@@ -98,7 +107,7 @@ class SE3Group(LieGroup):
         m = np.asarray(m, dtype=float)
         # An IndexError where there is no column of the translation, as in a 3 x 3 matrix of rotation.
         rows = np.concatenate([m[..., :3, :3], m[..., :3, 3][..., None]], axis=-1)
-        return _one(kernels.from_matrix, rows.reshape(*m.shape[:-2], 12), 12, (7,))
+        return of_rows(kernels.from_matrix, rows.reshape(*m.shape[:-2], 12), 12, (7,))
 
     def from_ypr(
         self,
@@ -145,48 +154,6 @@ class SE3Group(LieGroup):
         sign[..., 2] = np.sign(np.linalg.det(u @ vt))
         rotation = (u * sign[..., None, :]) @ vt
         return self.from_matrix(np.concatenate([rotation, (middle - rotation @ centre)[..., None]], axis=-1))
-
-
-def _one(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:
-    """A function of rows, (..., size) -> (..., *out_shape)."""
-    x = np.asarray(x, dtype=float)
-    _require_size(x, size)
-    out = np.empty((x.size // size, *out_shape))
-    function(np.ascontiguousarray(x).reshape(-1, size), out)
-    return out.reshape(*x.shape[:-1], *out_shape)
-
-
-def _two(
-    function: Callable[[Array, Array, Array], None], x: ArrayLike, y: ArrayLike, size: int, out_size: int
-) -> Array:
-    """A function of rows of elements (..., 7) and others (..., size), whose leading axes broadcast."""
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    _require_size(x, 7)
-    _require_size(y, size)
-    shape = x.shape[:-1]
-    if x.ndim == 1:
-        shape = y.shape[:-1]
-    elif y.ndim > 1 and y.shape[:-1] != shape:
-        shape = np.broadcast_shapes(shape, y.shape[:-1])
-        x, y = _spread(x, shape), _spread(y, shape)
-    out = np.empty((*shape, out_size))
-    left, right = np.ascontiguousarray(x).reshape(-1, 7), np.ascontiguousarray(y).reshape(-1, size)
-    function(left, right, out.reshape(-1, out_size))
-    return out
-
-
-def _spread(x: Array, shape: tuple[int, ...]) -> Array:
-    """With the leading axes `shape`; a single row stays one, the kernels repeat it."""
-    if x.size == x.shape[-1]:
-        return x
-    out = np.empty((*shape, x.shape[-1]))  # as np.broadcast_to, which takes as long as a kernel
-    out[...] = x
-    return out
-
-
-def _require_size(x: Array, size: int) -> None:
-    if x.ndim == 0 or x.shape[-1] != size:
-        raise InputError(f"SE3 expected an array (..., {size}), got {x.shape}")
 
 
 def skew(v: Array) -> Array:
