@@ -196,18 +196,21 @@ class JointMap(Map):
         here = slice(d, self._first)
         substate = self.mean[:, here, None]
         self._increment_mean = (coupling @ substate)[..., 0]
-        self._predicted = self.mean.copy()
-        self._predicted[:, here] = (dynamics @ substate)[..., 0] + drift
         # What particles may differ by here changes the covariance in the second order.
-        B, A, L = (block.mean(axis=0) for block in (coupling, dynamics, transition.noise_factor))
-        noise = L @ L.T
-        increment = gaussian.symmetrise(B @ self.cov[here, here] @ B.T) + noise[:d, :d]
-        cross = self.cov[:, here] @ B.T
-        cov = self.cov.copy()
-        cov[here] = A @ cov[here]
-        cov[:, here] = cov[:, here] @ A.T
-        cov[here, here] += noise[d:, d:]
-        cross[here] = A @ cross[here] + noise[d:, :d]
+        blocks = coupling, dynamics, transition.noise_factor
+        B, A, L = (block[0] if len(block) == 1 else block.mean(axis=0) for block in blocks)
+        noise, cov = L @ L.T, self.cov
+        increment = gaussian.symmetrise(B @ cov[here, here] @ B.T) + noise[:d, :d]
+        cross = cov[:, here] @ B.T
+        self._predicted = self.mean
+        if L[d:].any() or drift.any() or not (dynamics == np.eye(m)).all():  # else all stay what they are
+            self._predicted = self.mean.copy()
+            self._predicted[:, here] = (dynamics @ substate)[..., 0] + drift
+            cov = cov.copy()
+            cov[here] = A @ cov[here]
+            cov[:, here] = cov[:, here] @ A.T
+            cov[here, here] += noise[d:, d:]
+            cross[here] = A @ cross[here] + noise[d:, :d]
         values, vectors = np.linalg.eigh(increment)
         if values[0] < 0.0:  # by rounding, where the motion is known exactly and the path tells the substate
             values = np.maximum(values, 0.0)

@@ -111,7 +111,7 @@ class OdometryMotion(MotionModel):
             return Transition(mean, factor[None])
         if coupling is None:
             coupling = np.zeros((self.space.dim, k))
-        factor = np.pad(factor, ((0, k), (0, 0)))
+        factor = np.concatenate([factor, np.zeros((k, factor.shape[1]))])
         return Transition(mean, factor[None], coupling[None], np.eye(k)[None], np.zeros((1, k)))
 
     def constrained(self, measured: Odometry) -> Odometry:
@@ -132,9 +132,9 @@ def wheel_errors(delta: np.ndarray) -> np.ndarray:
     steering ratio that is wrong (J. Borenstein and L. Feng 1996); then the place, by a fraction of the way, as by wheels
     that are larger than they are said to be.
     """
-    turn, ahead = np.moveaxis(SE2.log(delta), -1, 0)[:2]
-    by_errors = np.zeros((*np.shape(delta), 4))
-    by_errors[..., 0, :3] = np.stack([ahead, np.maximum(turn, 0.0), np.minimum(turn, 0.0)], axis=-1)
+    log, by_errors = SE2.log(delta), np.zeros((*np.shape(delta), 4))
+    by_errors[..., 0, 0] = log[..., 1]
+    by_errors[..., 0, 1], by_errors[..., 0, 2] = np.maximum(log[..., 0], 0.0), np.minimum(log[..., 0], 0.0)
     by_errors[..., 1:, 3] = -SE2.translation(SE2.inverse(delta))
     return by_errors
 

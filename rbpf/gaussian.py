@@ -22,6 +22,7 @@ _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
+_NO_PIVOT = 5e-324  #: Times a variance: nothing, but infinite if that is.
 _UNROLLED, _MANY = 8, 200  #: Up to this size and from so many matrices on, loops take less time than LAPACK.
 _KEPT = 512  #: Entries of what is small enough for its factor to be looked up.
 
@@ -197,20 +198,21 @@ def _kept_factor(factor: Callable[[Array], Array], cov: bytes, shape: tuple[int,
 
 
 def _definite_factor(cov: Array) -> Array:
-    chol, definite = _factors(cov, 0.0)
+    chol, definite = _factors(cov, _NO_PIVOT)
     _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
     return chol
 
 
 def _semidefinite_factor(cov: Array) -> Array:
-    finite, swapped = np.isfinite(cov), np.swapaxes(cov, -1, -2)
+    swapped = np.swapaxes(cov, -1, -2)
     # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
-    if not (finite.all() and (cov == swapped).all()):
-        _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
+    if not (cov == swapped).all():
+        _require_finite(cov)
         skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
         _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
     factor, definite = _factors(cov, _SINGULAR)
     if not definite.all():
+        _require_finite(cov)
         singular = ~definite
         negative = np.zeros_like(singular)
         factor[singular], negative[singular] = _eigen_factor(cov[singular])
@@ -220,15 +222,15 @@ def _semidefinite_factor(cov: Array) -> Array:
 
 def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
     n = cov.shape[-1]
-    with np.errstate(invalid="ignore"):  # from entries that are infinite, which complaints cover
-        if n <= _UNROLLED and cov.size > _MANY * n * n:
-            return _cholesky_batch(cov, floor)
+    if n > _UNROLLED or cov.size <= _MANY * n * n:
         # An error does not say which one of the batch failed: the loops do.
         with suppress(np.linalg.LinAlgError):
             chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
-            variances, pivots = (each.diagonal(axis1=-2, axis2=-1) for each in (cov, chol))
-            if (pivots * pivots > floor * variances).all():  # what is not finite leaves its row a pivot that is not
+            pivots = chol.diagonal(axis1=-2, axis2=-1)
+            # What is not finite leaves its row a pivot that is not.
+            if (pivots * pivots > floor * cov.diagonal(axis1=-2, axis2=-1)).all():
                 return chol, np.ones(cov.shape[:-2], dtype=bool)
+    with np.errstate(invalid="ignore"):  # from entries that are infinite, which complaints cover
         return _cholesky_batch(cov, floor)
 
 
@@ -261,6 +263,10 @@ def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
     # Beside a variance that is rounding itself, correlations exceed one: there the plain one is nearer.
     sound = values[..., :1, None] >= -_NEGATIVE * values[..., -1:, None]
     return np.where(sound, scaled, plain), negative
+
+
+def _require_finite(cov: Array) -> None:
+    _require(np.isfinite(cov).all((-1, -2)), "has an entry that is not finite: check the input it came from")
 
 
 def _require(good: NDArray[np.bool_] | np.bool_, complaint: str) -> None:
