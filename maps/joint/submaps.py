@@ -277,7 +277,7 @@ class SubMaps:
         """Where the end of the present sub-map is as seen from that of an older one, by all that is known."""
         space, d, every = self.space, self.space.dim, self.copied()
         every._take(present)
-        solution = every._solve(every._shared(alone=True))
+        solution = every._solve(every._shared())
         cov = solution.eliminated.marginal(np.append(d * number + np.arange(d), d * len(self.maps) + np.arange(d)))
         mean = space.between(solution.starts[number + 1], solution.starts[-1])
         turn = np.concatenate([-space.adjoint(space.inverse(mean)), np.eye(d)], axis=1)
@@ -383,7 +383,7 @@ class SubMaps:
             every._take(present)
             return every.landmarks()
         space, d, dim = self.space, self.space.dim, self.dim
-        solution = self._solve(self._shared(alone=True))
+        solution = self._solve(self._shared())
         joint, end_of = solution.eliminated.within(), solution.starts[1:]
         names, places, covs = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
         for number, (each, factor) in enumerate(zip(self.maps, solution.factors, strict=True)):
@@ -508,15 +508,23 @@ class SubMaps:
             for each in held:
                 self._hold(each)
 
-    def _shared(self, alone: bool = False) -> np.ndarray:
-        """Landmarks that several sub-maps hold; if not they `alone`, those of the last one and nearest to its end, too."""
+    def _shared(self, asked: np.ndarray | None = None) -> np.ndarray:
+        """Landmarks that several sub-maps hold, and with some `asked` for (K,) those, and all that may be about its end."""
         ids, times = np.unique(np.concatenate([each.ids for each in self.maps]), return_counts=True)
-        wanted = times > 1
-        if not alone:
-            wanted |= np.isin(ids, self.maps[-1].ids)
+        wanted, last = times > 1, self.maps[-1].ids
+        if asked is not None:
+            wanted |= np.isin(ids, last) | np.isin(ids, asked)
             far = np.linalg.norm(self.space.inverse_transform(self.start, self._guess(ids)), axis=1)
-            wanted[np.argsort(far, kind="stable")[: max(self.most - self.maps[-1].ids.size, 0)]] = True
+            order = np.lexsort((far, -self._beside(ids, asked)))
+            wanted[order[: max(self.most - last.size, 0)]] = True
         return ids[wanted]
+
+    def _beside(self, ids: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        """With how many of those `asked` for a sub-map holds each landmark (K,): what was seen with them is seen next."""
+        most = np.zeros(ids.size, dtype=np.int64)
+        for each in self.maps:
+            most = np.maximum(most, np.isin(ids, each.ids) * np.isin(asked, each.ids).sum())
+        return most
 
     def _guess(self, ids: np.ndarray) -> np.ndarray:
         """Where landmarks (K,) are in the world (K, D), by the last sub-map that holds each."""
@@ -550,7 +558,7 @@ class SubMaps:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
         asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
         try:
-            solution = self._solve(np.union1d(self._shared(), asked))
+            solution = self._solve(self._shared(asked))
         except UndeterminedError:  # they stay as they are
             return
         if not solution.is_whole:
@@ -558,7 +566,8 @@ class SubMaps:
         ids, self.starts, self._places = solution.ids, list(solution.starts), None
         seen = self.space.inverse_transform(self.start, solution.world)
         last = np.isin(ids, self.maps[-1].ids) | np.isin(ids, asked)
-        order = np.argsort(np.where(last, -1.0, np.linalg.norm(seen, axis=1)), kind="stable")
+        far = np.where(last, -1.0, np.linalg.norm(seen, axis=1))
+        order = np.lexsort((far, -self._beside(ids, asked), ~last))
         kept = order[: max(self.most, int(last.sum()))]
         kept = kept[last[kept] | (ids[kept] >= 0)]
         self.near = ids[kept]
