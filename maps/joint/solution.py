@@ -10,9 +10,8 @@ from rbpf.errors import InputError
 from rbpf.lie import Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.elimination import Elimination, cliques_of
 
-CLOSE_ENOUGH = 1e-6
-"""Largest step [m, rad] at which a solution is taken, and iterations until it is."""
-ITERATIONS = 20
+ENOUGH, ITERATIONS = 0.1, 20
+"""Length of the last step to a solution, in standard deviations of all of it together, and how many there are at most."""
 EXACT = 1e-5
 """Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
 
@@ -231,7 +230,7 @@ def solve(
         starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
         world += step[first : size - k].reshape(-1, dim)
         constants = constants + step[size - k :]
-        if np.abs(step).max() < CLOSE_ENOUGH:
+        if -step @ gradient[:size] < ENOUGH**2:
             break
     return Solution(ids, world, starts, constants, factors, eliminated, is_whole)
 

@@ -23,7 +23,6 @@ from rbpf.errors import InputError
 from rbpf.lie import Array, Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.solution import (
-    CLOSE_ENOUGH,
     EXACT,
     ITERATIONS,
     NOTHING,
@@ -40,6 +39,8 @@ from rbpf.maps.joint.solution import (
     solve,
 )
 
+CLOSE_ENOUGH = 1e-6
+"""Largest step [m, rad] at which two Gaussians are tied."""
 ROUNDING = 1e-12
 """Variance [m²] below which nothing is told apart."""
 FORGOTTEN = -(2**40)
