@@ -247,6 +247,14 @@ def test_what_wheels_get_wrong_is_found_while_running(submap, costs, tmp_path):
         np.testing.assert_array_equal(again.calibration.wheels(again.filter), (found, std))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_of_steps_is_not_taken_for_what_wheels_get_wrong(seed):
+    """Steps of 8 cm with 3 cm of noise: what the odometry says has that noise in it."""
+    calibration = run(simulated_log(RobotWorld(250, laps=0.625), seed), RangeBearingConfig(particles=20))[1].calibration
+    assert (calibration.score[1] > 0.0).any() and not calibration.is_estimated
+
+
 def test_odometry_may_claim_to_be_exact():
     """So that the first step tells, to rounding, what the wheels get wrong."""
     rng, slam = np.random.default_rng(0), RangeBearingSlam(RangeBearingConfig(particles=20), measurement="position")

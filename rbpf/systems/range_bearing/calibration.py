@@ -53,6 +53,7 @@ class RobotCalibration:
         self.is_estimated = is_asked
         #: Its sum, the variance that right wheels have of it, and the sum of squares.
         self.score = np.zeros((3, self.learnt.size))
+        self._before = np.zeros((space.dim, self.learnt.size))  # how the odometry of the last step moves with them
         self._cov = np.diag(std[self.learnt] ** 2)
         scale = 1.0 if is_asked else AS_GOOD_AS_KNOWN
         self.prior = np.zeros(self.learnt.size), scale**2 * self._cov
@@ -81,7 +82,9 @@ class RobotCalibration:
         """
         if self.is_estimated or odometry.by_constants is None or found is None:
             return False
-        whitened = np.linalg.lstsq(factor, odometry.by_constants)[0]
+        # Of the step before: what the odometry says now has its own noise in it, which is what was found.
+        whitened = np.linalg.lstsq(factor, self._before)[0]
+        self._before = odometry.by_constants
         score, variance = whitened.T @ found.mean, np.einsum("ac,ab,bc->c", whitened, found.cov, whitened)
         self.score += score, np.maximum(variance, 0.0), score**2
         self.is_estimated = bool((self.score[0] ** 2 > DECISIVE**2 * self.score[1:].max(axis=0)).any())
@@ -142,7 +145,8 @@ class RobotCalibration:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint: which are uncertain, and what is known of whether they should be."""
-        named = {"learnt": self.learnt, "score": self.score, "is_estimated": np.array([int(self.is_estimated)])}
+        known = np.array([int(self.is_estimated)])
+        named = {"learnt": self.learnt, "score": self.score, "before": self._before, "is_estimated": known}
         return named if self.learnt.size else {}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -154,4 +158,5 @@ class RobotCalibration:
                 "the checkpoint is of a robot that estimates other things of itself: set calibrate as it was"
             )
         self.score = read_one(arrays, "score", numbers(3, self.learnt.size))
+        self._before = read_one(arrays, "before", numbers(*self._before.shape))
         self.is_estimated = bool(read_one(arrays, "is_estimated", integers(1, least=0))[0])
