@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
@@ -104,12 +105,19 @@ def test_an_option_that_is_out_of_its_range(capsys, arguments, words):
         ("\n".join(" " * depth + "a:" for depth in range(1200)), "line 21: .* nested"),
         ("- " * 400_000, "line 1: .* nested"),
         ("{a: " * 200_000, "line 1: .* nested"),
+        ("a: " + "[" * 5000 + "\n", "line 1: .* nested"),
+        ("particles: !!python/object/apply:os.system ['touch pwned']\n", "line 1: expected plain values"),
+        ("a: &a [x]\nb: [*a, *a]\n", "alias"),
+        ("particles: !!timestamp x\n", "none of its type"),
+        ("particles: 2001-99-99\n", "none of its type"),
+        ("#" * (2 << 20), "larger than 1 MiB"),
     ],
 )
-def test_settings_that_say_a_thing_twice_or_are_nested(tmp_path, text, words):
+def test_settings_say_a_thing_once_run_nothing_and_unfold_into_nothing(tmp_path, text, words):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(InputError, match=words):
         load_settings(MonoConfig, "mono", tmp_path / "config.yaml", (), {})
+    assert not Path("pwned").exists()
 
 
 @pytest.mark.parametrize(

@@ -48,24 +48,6 @@ def test_texts(tmp_path_factory, sound, read, data):
     read_or_refused(lambda: read(path))
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("particles: !!python/object/apply:os.system ['touch pwned']\n", "line 1: expected plain values"),
-        ("a: &a [x]\nb: [*a, *a]\n", "alias"),
-        ("particles: !!timestamp x\n", "none of its type"),
-        ("particles: 2001-99-99\n", "none of its type"),
-        ("a: " + "[" * 5000 + "\n", "nested lists"),
-        ("#" * (2 << 20), "larger than 1 MiB"),
-    ],
-)
-def test_settings_run_nothing_and_unfold_into_nothing(tmp_path, text, words):
-    (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(InputError, match=words):
-        load_settings(MonoConfig, "mono", tmp_path / "config.yaml", (), {})
-    assert not Path("pwned").exists()
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """The folder of a small run."""
