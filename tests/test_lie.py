@@ -76,9 +76,9 @@ def test_lists_and_views_are_accepted_and_never_written(group, rng):
     a.flags.writeable = xi.flags.writeable = False
     fortran = np.asfortranarray(a)[::2]
     np.testing.assert_array_equal(group.retract(fortran, xi[::2]), group.retract(a[::2].copy(), xi[::2]))
+    np.testing.assert_array_equal(group.mean(fortran, np.ones(3) / 3), group.mean(a[::2].copy(), np.ones(3) / 3))
     result = group.retract(a, xi)
-    assert result.flags.c_contiguous
-    assert result.flags.writeable
+    assert result.flags.c_contiguous and result.flags.writeable
 
 
 @every_group
@@ -177,9 +177,10 @@ def test_log_takes_the_shorter_way_for_both_signs_of_the_quaternion(rng):
     "angle", [np.pi, -np.pi, 3 * np.pi, np.nextafter(np.pi, 4.0), np.nextafter(-np.pi, 0.0), 100.0, -1e-300]
 )
 def test_plane_angles_stay_in_the_half_open_turn(angle):
-    theta = SE2.normalise([angle, 1.0, 2.0])[0]
-    assert -np.pi < theta <= np.pi
-    np.testing.assert_allclose(np.exp(1j * theta), np.exp(1j * angle), atol=1e-14)
+    for theta in SE2.normalise([angle, 1.0, 2.0])[0], SE2.retract([angle, 1.0, 2.0], np.zeros(3))[0]:
+        assert -np.pi < theta <= np.pi
+        np.testing.assert_allclose(np.exp(1j * theta), np.exp(1j * angle), atol=1e-14)
+    assert np.isnan(SE2.local(np.zeros(3), [np.inf, 1.0, 2.0])).all()
 
 
 @pytest.mark.parametrize("group", [SE2, SE3], ids=repr)

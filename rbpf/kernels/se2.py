@@ -5,6 +5,7 @@ An argument with one row belongs to all rows of the other one. Results go to the
 
 import math
 
+import numpy as np
 from numba import njit, void
 
 from rbpf.kernels.se3 import coefficients
@@ -14,7 +15,7 @@ from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY
 @njit(cache=True, error_model="numpy")
 def _wrap(angle):
     """To (−π, π]; what lies there comes back unrounded."""
-    return min(angle - 2.0 * math.pi * math.ceil(angle / (2.0 * math.pi) - 0.5), math.pi)
+    return min(angle - 2.0 * math.pi * np.ceil(angle / (2.0 * math.pi) - 0.5), math.pi)
 
 
 @njit(cache=True, error_model="numpy")

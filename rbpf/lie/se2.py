@@ -68,7 +68,7 @@ class SE2Group(LieGroup):
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
         # The angle does not depend on the place; once it is known, what is left is linear in the place.
-        points, angle, (iterations, tolerance) = _contiguous(points), float(mean[0]), MEAN
+        mean, points, angle, (iterations, tolerance) = _contiguous(mean), _contiguous(points), float(mean[0]), MEAN
         for _ in range(iterations):
             half = 0.5 * _wrap(points[:, 0] - angle)
             step = 2.0 * float((weights * half).sum())
