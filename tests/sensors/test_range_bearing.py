@@ -264,3 +264,5 @@ def test_odometry_may_claim_to_be_exact():
         odometry = Odometry(step, np.zeros((3, 3))) if t else None
         pose = slam.track(z, np.tile(4e-4 * np.eye(2), (6, 1, 1)), names, odometry).pose
     np.testing.assert_allclose(pose, 19 * step, atol=1e-6)
+    with pytest.raises(InputError, match="holds NaN"):
+        slam.track(z, np.tile(4e-4 * np.eye(2), (6, 1, 1)), names, Odometry(step * np.nan, np.zeros((3, 3))))

@@ -59,9 +59,11 @@ class RobotCalibration:
         self.prior = np.zeros(self.learnt.size), scale**2 * self._cov
 
     def driven(self, odometry: Odometry | None) -> Odometry | None:
-        """The odometry, which says how it moves with them; one of another shape as it is: the motion model refuses it."""
+        """The odometry, which says how it moves with them; as it is if it is no increment: the motion model refuses it."""
         wheels = self.learnt >= self.space.dim
         if odometry is None or not wheels.any() or np.shape(odometry.delta) != (self.space.size,):
+            return odometry
+        if not np.isfinite(odometry.delta).all():
             return odometry
         by_constants = np.zeros((self.space.dim, self.learnt.size))
         by_constants[:, wheels] = wheel_errors(odometry.delta)[:, self.learnt[wheels] - self.space.dim]

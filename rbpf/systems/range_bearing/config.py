@@ -56,7 +56,7 @@ class CalibrationConfig(Ranged):
     yaw_deg: NotNegative = 0.0  #: turned to the left.
     heading_deg_per_m: NotNegative = 1.0  #: the odometry's heading drifts for every metre ahead, in the plane.
     turn: NotNegative = 0.05  #: fraction by which its turns are wrong, those to the left and those to the right.
-    way: NotNegative = 0.05  #: fraction by which the ways that it says are wrong.
+    way: NotNegative = 0.05  #: fraction by which its ways are wrong; right with calibrate=online.
 
     def of_sensor(self, space: SE2Group | SE3Group) -> np.ndarray:
         """(d,) in the right chart of the sensor's pose."""
@@ -113,9 +113,7 @@ class RangeBearingConfig(RunConfig):
             sensor[:] = 0.0
         if self.calibrate in ("off", "sensor") or not isinstance(space, SE2Group):
             wheels[:] = 0.0
-        if (
-            self.calibrate == "online"
-        ):  # a robot that turns one way cannot tell its way from a sensor that stands to the side
+        if self.calibrate == "online":  # who turns one way cannot tell it from a sensor that stands to the side
             wheels[-1] = 0.0
         return np.concatenate([sensor, wheels])
 
