@@ -62,10 +62,6 @@ def moved(
     return space.retract(pose, by), turn @ cov @ turn.T
 
 
-class UndeterminedError(InputError):
-    """Sub-maps that do not say where a start or a landmark is, as of a filter that has diverged."""
-
-
 class SubMap(NamedTuple):
     """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
 
@@ -225,7 +221,7 @@ def solve(
         except LinAlgError as error:
             if taken or before:
                 return solve(space, maps, ids, *first_guess, is_whole=False)
-            raise UndeterminedError("the sub-maps leave a start or a landmark undetermined") from error
+            raise InputError("the sub-maps leave a start or a landmark undetermined") from error
         step = -eliminated.solve(gradient[:size])
         starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
         world += step[first : size - k].reshape(-1, dim)

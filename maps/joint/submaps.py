@@ -30,7 +30,6 @@ from rbpf.maps.joint.solution import (
     Given,
     Solution,
     SubMap,
-    UndeterminedError,
     columns_of,
     exchanged,
     fused,
@@ -560,7 +559,7 @@ class SubMaps:
         asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
         try:
             solution = self._solve(self._shared(asked))
-        except UndeterminedError:  # they stay as they are
+        except InputError:  # as of a filter that has diverged: they stay as they are
             return
         if not solution.is_whole:
             return

@@ -321,3 +321,6 @@ def test_what_was_given_and_cannot_be_taken_off_stays():
     maps.solve()
     np.testing.assert_equal((maps.start, maps.cov), (start, cov))
     assert np.linalg.eigvalsh(maps.landmarks()[2]).min() > 0.0
+    maps.maps[2] = maps.maps[2]._replace(cov=-maps.maps[2].cov)
+    maps.solve()
+    np.testing.assert_equal((maps.start, maps.cov), (start, cov))
