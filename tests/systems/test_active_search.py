@@ -193,18 +193,18 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     recording = open_images(tmp_path / "desk")
     # Particles with own maps of a world that is uncertain across the line of sight, too, may lose it whatever is trusted.
     known = replace(read_known_points(tmp_path / "desk" / "known_points.csv"), across_m=None)
-
-    def off(config: MonoConfig, first: int, seeds: int) -> np.ndarray:  # many: they differ more than the settings do
-        damaged, stamps = cover_view(1 / 3, first, 60)(recording), recording.stamps_ns
-        runs = [filter_opened(open_mono(damaged, replace(config, seed=seed), known)) for seed in range(seeds)]
-        paths = [[Trajectory(stamps, poses) for poses in (run.log.poses, run.truth.poses)] for run in runs]
-        return np.array([ate(*pair).rmse for pair in paths])
-
-    own = MonoConfig(map="particles")
-    usual, credulous = off(own, 60, 6), off(replace(own, search=SearchConfig(trusted_fraction=0.0)), 60, 6)
-    assert usual.mean() < 0.02 and np.median(usual) < 0.015 and credulous.mean() > 2.0 * usual.mean()
-    # At 20 no depth is known yet: 0.09 m where two views are enough to be trusted.
-    assert off(MonoConfig(), 60, 2).mean() < 0.025 and off(MonoConfig(), 20, 4).mean() < 0.05
+    damaged = cover_view(1 / 3, 60, 60)(recording)
+    stamps, own = recording.stamps_ns, MonoConfig(map="particles")
+    # Runs differ from seed to seed by more than the kinds do: their means over six.
+    kinds = {"credulous": replace(own, search=SearchConfig(trusted_fraction=0.0)), "usual": own, "joint": MonoConfig()}
+    off: dict[str, list[float]] = {name: [] for name in kinds}
+    for name, config in kinds.items():
+        for seed in range(6):
+            run = filter_opened(open_mono(damaged, replace(config, seed=seed), known))
+            off[name].append(ate(Trajectory(stamps, run.log.poses), Trajectory(stamps, run.truth.poses)).rmse)
+    assert np.mean(off["usual"]) < 0.02 and np.median(off["usual"]) < 0.015
+    assert np.mean(off["credulous"]) > 2.0 * np.mean(off["usual"])
+    assert np.mean(off["joint"]) < 0.025
 
 
 def test_what_is_often_missed_only_updates_the_map():
@@ -221,12 +221,12 @@ def test_what_is_often_missed_only_updates_the_map():
     before = of_state()
     sensor.table.attempts[untrusted] += 20
     assert of_state() == before - 2 * len(untrusted)
-    # Where few are trusted, all of them are; what two views have found is not.
+    # Where few are trusted, all of them are.
     table, rows = sensor.table, np.arange(8)
     assert table.trusted(rows, SEARCH.trusted_fraction).all()
     table.member[rows], table.attempts[rows], table.found[rows] = -1, 10, 2
     assert table.trusted(rows, SEARCH.trusted_fraction).all()
-    table.found[rows[:6]], table.attempts[6], table.found[6] = 10, 2, 2
+    table.found[rows[:6]] = 10
     np.testing.assert_array_equal(table.trusted(rows, SEARCH.trusted_fraction), rows < 6)
 
 

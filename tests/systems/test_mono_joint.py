@@ -210,10 +210,7 @@ def test_it_is_no_matter_of_counts(count):
 
 @pytest.mark.slow
 def test_a_lost_camera_is_found_in_an_old_sub_map():
-    """It has left the first wall of a gallery when the light goes out, and is back there when it comes on again.
-
-    A hard case: of seeds 0 to 7 it is found with 2, 4 and 5.
-    """
+    """It has left the first wall of a gallery when the light goes out, and is back there when it comes on again."""
     away, dark, end = 90, 130, 150
     frames = np.arange(end)
     side = np.where(
@@ -229,7 +226,7 @@ def test_a_lost_camera_is_found_in_an_old_sub_map():
     ]
     poses = SE3.retract(SE3.identity(), np.stack(shake, axis=-1))
     search = SearchConfig(measurements=15, min_in_view=20)
-    config = MonoConfig(map="joint", particles=30, settled_frames=4, submap=24, search=search, seed=2)
+    config = MonoConfig(map="joint", particles=30, settled_frames=4, submap=24, search=search)
     slam, held = MonoSlam(CAMERA, config, known_points()), 0
     for frame in Pictures(
         texture(), poses, lambda t, image: np.zeros_like(image) if away <= t < dark else image

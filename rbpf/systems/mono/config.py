@@ -105,8 +105,8 @@ class SearchConfig(Ranged):
     min_attempts: Annotated[Count, Formerly("trial")] = 10
     #: it is dropped from all particles when it was not found in more than this fraction.
     max_failure_ratio: Annotated[Fraction, Formerly("failure_ratio")] = 0.5
-    #: a feature says where the camera is only once three views have found it, and while it has been found in this fraction
-    #: of the attempts, (1 + found) / (2 + attempts): what moves by itself is soon not where a thing at rest would be.
+    #: a feature says where the camera is only while it has been found in this fraction of the attempts, (1 + found) /
+    #: (2 + attempts): what moves by itself is soon not where a thing at rest would be.
     trusted_fraction: Annotated[Fraction, Formerly("trusted_share")] = 0.6
     #: the camera is lost when fewer than this fraction of what was looked for is found …
     lost_fraction: Annotated[Fraction, Formerly("lost_share")] = 0.25

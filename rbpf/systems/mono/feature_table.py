@@ -19,9 +19,6 @@ PATCH_PX = 2 * PATCH_HALF_PX + 1
 #: Least inverse-depth weight of a homogeneous point for its patch to be placed in space: beyond, it is at infinity.
 MIN_WEIGHT = 1e-3
 ENOUGH_TRUSTED = 6  #: Trusted matches that determine the motion alone: three do, and half of them may be wrong.
-#: Views that must have found a feature for it to be trusted. Wherever on its line the second one finds it, some depth fits;
-#: the third is the first to test that depth.
-TRUSTED_VIEWS = 3
 _OFFSETS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 _COLUMNS = {
     "first_patch": grey("features", PATCH_PX, PATCH_PX),
@@ -100,8 +97,7 @@ class FeatureTable:
 
     def trusted(self, rows: np.ndarray, min_fraction: float) -> np.ndarray:
         """Which features (k,) may say where the camera is, by their records; all of them where those are too few."""
-        fraction = np.where(self.found[rows] >= TRUSTED_VIEWS, self.found_fraction(rows), 0.0)
-        trusted = (self.member[rows] >= 0) | (fraction >= min_fraction)
+        trusted = (self.member[rows] >= 0) | (self.found_fraction(rows) >= min_fraction)
         return trusted if trusted.sum() >= ENOUGH_TRUSTED else np.ones(rows.size, dtype=bool)
 
     def nearest_appearance(

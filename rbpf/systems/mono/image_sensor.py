@@ -20,7 +20,7 @@ from rbpf.sensors.patches.search import cut
 from rbpf.systems.mono.active_search import ActiveSearch, OutlierGate, SearchResult
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.feature_table import PATCH_HALF_PX, TRUSTED_VIEWS, FeatureTable, view_change
+from rbpf.systems.mono.feature_table import PATCH_HALF_PX, FeatureTable, view_change
 
 #: Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped.
 MIN_FIXED = 4
@@ -160,8 +160,6 @@ class ImageSensor(Sensor):
         """
         rows = self.table.add(patches, first_px, first_pose)
         self.table.position[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
-        # Those who made the map have seen them often enough.
-        self.table.attempts[rows] = self.table.found[rows] = TRUSTED_VIEWS
         self.bad_frames = self.config.lost_frames
 
     def observe(self, frame: Measurement, belief: Belief) -> Sequence[Observations]:
