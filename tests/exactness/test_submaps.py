@@ -171,6 +171,18 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
     np.testing.assert_allclose(covs, dense[at[:, :, None], at[:, None]], rtol=1e-4, atol=1e-6 * dense.max())
 
 
+def test_with_a_landmark_come_back_those_that_were_seen_with_it():
+    """Not the nearest, of which the next step would ask for none."""
+    finished, *_ = ring(SE2, 0, 1e-4)
+    maps = SubMaps(SE2, 2, finished[5].ids.size + 4)
+    for each in finished[:6]:
+        maps.join(each)
+    asked = np.setdiff1d(finished[0].ids, finished[1].ids)[:1]
+    maps.solve(asked)
+    back = np.setdiff1d(maps.near, finished[5].ids)
+    assert back.size == 4 and asked[0] in back and np.isin(back, finished[0].ids).all()
+
+
 def turning(space, each: SubMap, known: Constants, by: np.ndarray) -> SubMap:
     """What a robot makes of it whose turns are too large by as much in every sub-map, of which it knows something."""
     first, nothing = 0 if space is SE2 else 2, np.zeros(known.cov.shape)
