@@ -129,7 +129,7 @@ def wheel_errors(delta: np.ndarray) -> np.ndarray:
 
     In the chart at its end the heading is off, in this order: per metre ahead [rad/m], as by wheels of unequal size or a
     steering that is not straight, and by fractions of what is turned to the left and to the right, as by a track or a
-    steering ratio that is wrong (J. Borenstein and L. Feng 1996); then the place, by a fraction of the way, as by wheels
+    steering ratio that is wrong (J. Borenstein and L. Feng 1996); then the place, by a fraction of the distance, as by wheels
     that are larger than they are said to be.
     """
     log, by_errors = SE2.log(delta), np.zeros((*np.shape(delta), 4))

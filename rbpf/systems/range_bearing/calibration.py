@@ -132,7 +132,7 @@ class RobotCalibration:
         if (self.learnt >= self.space.dim).any():
             wheels = np.array(self.wheels(filter_)).T
             found["heading_deg_per_m"] = tuple(np.rad2deg(wheels[0]))
-            found |= dict(zip(("turn_left", "turn_right", "way"), map(tuple, wheels[1:]), strict=True))
+            found |= dict(zip(("turn_left", "turn_right", "distance"), map(tuple, wheels[1:]), strict=True))
         stds = {f"std_{name}": float(std) for name, (_, std) in found.items()}
         return {"calibration": {name: float(value) for name, (value, _) in found.items()} | stds}
 

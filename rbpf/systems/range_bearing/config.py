@@ -56,7 +56,7 @@ class CalibrationConfig(Ranged):
     yaw_deg: NotNegative = 0.0  #: turned to the left.
     heading_deg_per_m: NotNegative = 1.0  #: the odometry's heading drifts for every metre ahead, in the plane.
     turn: NotNegative = 0.05  #: fraction by which its turns are wrong, those to the left and those to the right.
-    way: NotNegative = 0.05  #: fraction by which its ways are wrong; right with calibrate=online.
+    distance: NotNegative = 0.05  #: fraction by which its distances are wrong; right with calibrate=online.
 
     def of_sensor(self, space: SE2Group | SE3Group) -> np.ndarray:
         """(d,) in the right chart of the sensor's pose."""
@@ -65,7 +65,7 @@ class CalibrationConfig(Ranged):
 
     def of_wheels(self) -> np.ndarray:
         """(4,) of `wheel_errors`."""
-        return np.array([np.deg2rad(self.heading_deg_per_m), self.turn, self.turn, self.way])
+        return np.array([np.deg2rad(self.heading_deg_per_m), self.turn, self.turn, self.distance])
 
 
 @dataclass(frozen=True)
