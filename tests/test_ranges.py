@@ -126,7 +126,10 @@ def test_settings_say_a_thing_once_run_nothing_and_unfold_into_nothing(tmp_path,
         ("map=all", "settings: map must be auto or joint or particles, got 'all'"),
         ("map.submap=10", "settings: map must be auto or joint or particles, got a group of settings"),
         ("submap=few", "settings: submap must be a whole number or nothing, got a word"),
-        ("likelihood.kind=x", "settings: likelihood.kind must be gaussian or truncated or outliers, got 'x'"),
+        (
+            "likelihood.kind=x",
+            "settings: likelihood.kind must be gaussian or truncated or outliers or nothing, got 'x'",
+        ),
         ("proposal=ekf", "proposal is a group of settings, of which each is set by itself: proposal.kind, .*"),
     ],
 )

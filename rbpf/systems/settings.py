@@ -101,7 +101,8 @@ def _choices(kind: Any, name: str) -> list[str]:
     for group in groups:
         kind = next(item.default_factory for item in fields(kind) if item.name == group)
     hint = get_type_hints(kind)[last]
-    return [str(word) for one in (hint, *get_args(hint)) if get_origin(one) is Literal for word in get_args(one)]
+    words = [str(word) for one in (hint, *get_args(hint)) if get_origin(one) is Literal for word in get_args(one)]
+    return [*words, "nothing"] if words and type(None) in get_args(hint) else words
 
 
 def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
