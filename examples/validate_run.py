@@ -12,8 +12,7 @@ from rbpf.runs.files import write_table
 from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.comparison import read_comparisons
-from rbpf.validation.finish import finish_run
-from rbpf.validation.report.validate import validate
+from rbpf.validation.finish import finish_run, validate
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 

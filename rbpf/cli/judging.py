@@ -35,7 +35,7 @@ class Validate(Printed):
     def __call__(self) -> None:
         from rbpf.runs.truth import Precision
         from rbpf.validation.consistency.comparison import read_comparisons
-        from rbpf.validation.report.validate import validate as compare
+        from rbpf.validation.finish import validate as compare
 
         if self.relations is not None and self.path is not None:
             raise InputError("a run is compared with one thing at a time: leave out --relations or --path")
