@@ -1,17 +1,6 @@
 """Sweeps: particles × seeds × sequences × options from a YAML file, run in parallel on this machine or on a cluster.
 
-system: range-bearing
-sequences: [log, other_log]            # beside this file; or {recording: IMAGES, known_points: FILE}
-particles: [50, 250]                   # by default the system's own number
-seeds: 5                               # 0 … 4; or a list
-options:                               # by default one, as it is
-  as it is: {}
-  one linearisation: {proposal.iterations: 1}
-settings: {window: 10}                 # of all runs
-
-rows.jsonl   one line per finished run, written as soon as it is done; a sweep that is called again computes the rest
-table.csv    one row per run, one column per figure: CSV, because pandas, polars, R and spreadsheets read it and
-             Parquet would take a library of 170 MB for a table of some hundred rows
+What stands in the file, and what comes of it, docs/how_to/sweep.md says.
 """
 
 import hashlib

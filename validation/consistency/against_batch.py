@@ -4,12 +4,10 @@ Frame and chart. Both are given in the run's own world. A pose's covariance is c
 pose to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
 
 What is conditioned on what. The map and the last pose know the same measurements in filter and batch, and are compared as
-Gaussians. An earlier online pose knows its past only, the optimum's also its future: of it the squared error is reported that
-the optimum's posterior expects, see `rbpf.validation.consistency.statistic.posterior_ratio`.
+Gaussians; of an earlier online pose, which knows its past only, see `rbpf.validation.consistency.statistic.posterior_ratio`.
 
-A second witness. The weights of draws from a robot's batch posterior say whether the posterior is the Gaussian that filter and
-covariances are compared with, see `rbpf.validation.gtsam.path_sampling`; where hardly a draw counts, it is not, and says
-nothing of the filter's uncertainty. They give the evidence of the measurements besides.
+A second witness. The weights of draws from a robot's batch posterior (`rbpf.validation.gtsam.path_sampling`) say whether it is
+the Gaussian that filter and covariances are compared with.
 
 Gauge. One camera without known points does not measure the scale: the filter's is its prior's, the batch's is held.
 Both begin at the same first pose; the filter is scaled about it, so that its path fits the optimum's best, and

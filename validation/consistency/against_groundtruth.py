@@ -2,10 +2,9 @@
 
 Gauge. A run that lives in the truth's world is compared with it as it is. Otherwise the truth is brought into the run's
 world, where the filter's covariances are given: by the rigid motion (after the scale that fits the positions, where the
-recording's is arbitrary) under which the truth is most likely by these covariances. The error that is left is then the
-least that any choice of the world leaves, and is taken for what it is: it can contradict the filter, and supports it only
-if it would also do so without the degrees of freedom that were fitted. Where the scale is arbitrary, errors are counted
-across the line from the first pose, which a change of scale does not move.
+recording's is arbitrary) under which the truth is most likely by these covariances. The error that is left can contradict the
+filter, and supports it only if it would also do so without the degrees of freedom that were fitted. Where the scale is
+arbitrary, errors are counted across the line from the first pose, which a change of scale does not move.
 """
 
 from dataclasses import dataclass, replace

@@ -1,21 +1,9 @@
 """Comparisons of a run with something else, in memory and in JSON; what its innovations say; and the verdict from all of it.
 
-The verdict is two lights, each with a sentence: how good the path is, and whether its uncertainty can be believed. They are
-independent: a path as good as the best may claim ten times too little, and a poor one may know how poor it is.
-
-The first compares the error with the path's own size: the root mean square distance of the true positions from their
-centre, which is the error of an estimate that stays there. It is never better than the frames that were lost allow.
-
-The second follows from the statistics of `rbpf.validation.consistency.statistic` alone:
-
-- do not trust: one of them contradicts the filter. It is *over-confident* if one of these says that errors are larger
-  than claimed, or biased. It is *cautious*, its uncertainty larger than needed, if all say so and one of them compares
-  poses or landmarks with the truth or the batch posterior. Innovations that are too small show that the noise is not
-  the stated one, and not more: they do not see a past that the particles have forgotten, nor errors that repeat;
-- trust: none contradicts, one that compares poses or landmarks with something else supports it, and none of these is itself
-  outside its zone. Where the truth supports it, noise that is stated too large is no contradiction: what comes of it is known;
-- cannot tell: otherwise. The run is too short or too much alike from step to step, or there is nothing to compare it
-  with: good innovations alone do not show that the particles follow the right path.
+The verdict is two lights, each with a sentence: how good the path is (`grade_path`), and whether its uncertainty can be
+believed (`judge`), which follows from the statistics of `rbpf.validation.consistency.statistic` alone. They are independent: a
+path as good as the best may claim ten times too little, and a poor one may know how poor it is. What each sentence means, and
+why, docs/how_to/report.md says.
 """
 
 import json

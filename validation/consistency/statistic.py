@@ -5,9 +5,8 @@ standard deviations are three times too small. From ν effective degrees of free
 
     [r ν / χ²_ν(0.975), r ν / χ²_ν(0.025)]
 
-An interval inside the statistic's zone supports the filter, one wholly outside contradicts it, and one across the
-zone's border leaves it open: there are too few independent samples. The zone says how wrong a standard deviation may be
-before it matters, the interval whether that can be decided; no threshold depends on a run.
+The zone of a statistic says how wrong a standard deviation may be before it matters, the interval whether that can be decided
+(docs/how_to/report.md); no threshold depends on a run.
 
 Errors of a filter are alike from one step to the next, so that T steps say less than T independent ones. For a sum of
 squares of zero-mean Gaussian numbers e_t with covariances C_ts = E[e_t e_sᵀ], the mean and the variance are those of a

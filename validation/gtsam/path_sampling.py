@@ -1,16 +1,9 @@
 """Whole paths and maps drawn from the batch's posterior, and the evidence of the measurements.
 
-At the optimum the posterior is nearly Gaussian: in the right charts of the poses there, Laplace's approximation is N(0,
-H⁻¹), H = JᵀJ with J the whitened Jacobian of the least-squares problem. A draw is what the problem answers when all of
-its residuals are noise, ξ = H⁻¹ Jᵀ η with η ~ N(0, I): no root of H⁻¹ is needed (G. Papandreou, A. Yuille, "Gaussian
-sampling by local perturbations", 2010). A draw's weight is the true joint density of path, map and measurements over
-its own, Mathematics (batch-weight): the mean weight is the evidence, without bias, and the weighted draws are the
-posterior, whatever H leaves out. Nearer to the posterior than draws of N(0, H⁻¹), at no cost in exactness:
-
-- Densities of motions are those of e_t, so that each pose comes with |J_r(ξ_t)| / |J_r(e_t)|. A robot that hardly slips
-  sideways follows a curve that no chart of single poses follows: where e_t bends by more than `BENT` of its noise, the linear
-  part of e_t is what is drawn, and the pose is laid there from the one before; likewise where a direction has no noise.
-- Landmarks keep their scatter and follow the path: they are moved to where they are most likely for it.
+A draw is what the least-squares problem, linearised at the optimum, answers when all of its residuals are noise:
+ξ = H⁻¹ Jᵀ η, η ~ N(0, I), with J its whitened Jacobian and H = JᵀJ, so that no root of H⁻¹ is needed (G. Papandreou,
+A. Yuille, "Gaussian sampling by local perturbations", 2010). What a draw weighs, and where it follows the posterior more
+closely than N(0, H⁻¹) does, Mathematics (batch-weight) says.
 
 Motions are kept out of H, so that directions without noise need no care: with A their whitened derivatives and D the
 identity, but zero for such directions, and J that of the observations,

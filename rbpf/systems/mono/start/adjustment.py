@@ -1,13 +1,7 @@
 """The first frames of a run, and their adjustment in one piece: path, features and, where it is not known, the camera.
 
 A feature is a direction d, a unit vector, and an inverse distance q, both from the first camera, which is the origin: the
-camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it is. Minimised is, Mathematics (start-cost),
-
-    Σ ρ(|z − h(c)|/σ) + ½ Σ ((q − q̄)/σ_q)² + ½ Σ |(v_k − v_{k−1})/σ_v|² + ½ ((s − 1)/σ_s)²,
-
-with Cauchy's loss ρ, the prior of an inverse distance, mean velocities v between frames that walk as in E06 (4) (their
-differences share something with the next ones, which is not written here), and the scale s = Σ q / (F q̄), which no
-image tells: it is held, unless there are known points, whose errors in their own frame come in its place.
+camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it is. What is minimised is Mathematics (start-cost).
 """
 
 from contextlib import suppress
