@@ -23,20 +23,8 @@ from matplotlib.colors import to_hex
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs import plots
 from rbpf.runs.files import GRID, write_text
-from rbpf.runs.plots import (
-    COLOURS,
-    FIGURES,
-    SIGMAS,
-    VECTORS,
-    Views,
-    World,
-    lost_frames,
-    moved_map,
-    near_box,
-    other_paths,
-    outline,
-)
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import SYSTEMS
@@ -106,11 +94,11 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     verdict = verdicts.verdict_of(record, comparisons)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
     own = {path.name for path in folder.glob("*.png")} - drawn
-    ordered = [name for name in FIGURES if name in own] + sorted(own - FIGURES.keys())
+    ordered = [name for name in plots.FIGURES if name in own] + sorted(own - plots.FIGURES.keys())
     try:
-        world = World.of(record)
+        world = plots.World.of(record)
     except InputError:
-        world = World()  # the truth is damaged, which is said among the problems
+        world = plots.World()  # the truth is damaged, which is said among the problems
     try:
         turned = scene(record, world)
     except InputError:
@@ -162,9 +150,9 @@ def _images(folder: Path, names: list[str]) -> list[Picture]:
             data = path.read_bytes()
             width, height = struct.unpack(">II", data[16:24]) if len(data) >= 24 else (1, 1)
             bare = path.stem.rpartition("_")[2]
-            drawn = FIGURES.get(name) or (None if bare in _CAPTIONS else FIGURES.get(f"{bare}.png"))
+            drawn = plots.FIGURES.get(name) or (None if bare in _CAPTIONS else plots.FIGURES.get(f"{bare}.png"))
             caption = _CAPTIONS.get(bare, "") if drawn is None else (drawn.__doc__ or "").splitlines()[0]
-            beside = path.with_suffix(f".{VECTORS}")
+            beside = path.with_suffix(f".{plots.VECTORS}")
             vectors = beside.name if beside.is_file() else ""
             found.append(Picture(path.stem, b64encode(data).decode(), caption, width > _WIDE * height, vectors))
     return found
@@ -228,7 +216,7 @@ PATH_POINTS, FRUSTUMS, LANDMARKS, ELLIPSOIDS, CELLS = 4000, 60, 20_000, 400, 40_
 #: Half the width and height of a frustum, and its depth, of its size; its size as a fraction of the scene's.
 _CORNERS = np.array([[-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
 _SIZE = 0.02
-_COLOURS = {name: to_hex(colour) for name, colour in COLOURS.items()}
+_COLOURS = {name: to_hex(colour) for name, colour in plots.COLOURS.items()}
 
 
 @cache
@@ -238,30 +226,30 @@ def program() -> str:
     return b64encode(gzip.compress(source, 6, mtime=0)).decode()
 
 
-def scene(found: RunFolder, world: World) -> str:
+def scene(found: RunFolder, world: plots.World) -> str:
     """Path, cameras, map, truth, odometry and batch optimum of a run in one world, as JSON with `data` and `layout`."""
     path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
-    at, views = path.positions, Views.of(found.system, path)
-    landmarks = moved_map(found.map, motion)
+    at, views = path.positions, plots.Views.of(found.system, path)
+    landmarks = plots.moved_map(found.map, motion)
     mean, cov = landmarks.points().in_space()
     has_grid = (found.folder / GRID).is_file()
     if has_grid:
         mean = motion.transform(np.pad(_some(found.grid.walls(), CELLS), ((0, 0), (0, 1))))
-    near, low, high = near_box(mean, at)
+    near, low, high = plots.near_box(mean, at)
     size = max(float((high - low).max()), 1e-3)
     traces = [_line(at, "path", "filter", 4)]
-    for name, label, positions in other_paths(found, world):
+    for name, label, positions in plots.other_paths(found, world):
         traces.append(_line(positions, label, name, 2))
-    if (lost := lost_frames(found)).any():
+    if (lost := plots.lost_frames(found)).any():
         traces.append(_points(at[lost], "lost", "map", 3))
     traces.append(_line(_frustums(path.world_from_body, found.system, _SIZE * size), "poses", "filter", 1))
     if has_grid:
         traces.append(_points(mean, "walls", "truth", 1))
     elif len(mean):
         traces.append(_points(_some(mean[near], LANDMARKS), "landmarks", "truth", 2))
-        name = f"{SIGMAS:g}σ"
+        name = f"{plots.SIGMAS:g}σ"
         if landmarks.mean.shape[1] == 2:
-            rings = np.pad(outline(mean[near][:, :2], cov[near][:, :2, :2]), ((0, 0), (0, 0), (0, 1)))
+            rings = np.pad(plots.outline(mean[near][:, :2], cov[near][:, :2, :2]), ((0, 0), (0, 0), (0, 1)))
             traces.append(_line(_strips(_some(rings, ELLIPSOIDS)), name, "truth", 1))
         else:
             traces.append(_ellipsoids(_some(mean[near], ELLIPSOIDS), _some(cov[near], ELLIPSOIDS), name))
@@ -341,7 +329,7 @@ def _ellipsoids(mean: np.ndarray, cov: np.ndarray, name: str) -> dict[str, Any]:
         [np.sin(height) * np.cos(turn), np.sin(height) * np.sin(turn), np.cos(height) + 0.0 * turn], axis=-1
     ).reshape(-1, 3)
     values, vectors = np.linalg.eigh(cov)
-    roots = SIGMAS * vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    roots = plots.SIGMAS * vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     corners = mean[:, None] + ball @ roots.mT
     ring, k = np.mgrid[: rings - 1, :around]
     here, right = around * ring + k, around * ring + (k + 1) % around
