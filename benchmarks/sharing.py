@@ -23,7 +23,7 @@ def run(settings: Settings) -> list[Row]:
     lineage = Lineage(N)
     lineage.retain(0)
     store = SharedStore(N, lineage)
-    columns = np.array([store.add(np.zeros((FIELDS, N))) for _ in range(M)])
+    columns = store.add(np.zeros((M, FIELDS, N)))
     written = np.zeros(M, dtype=int)
     for t in range(RESAMPLINGS):
         weights = np.exp(DISPERSION * rng.normal(size=N))

@@ -9,8 +9,6 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.genealogy import Lineage
-from rbpf.core.likelihoods import Gaussian
-from rbpf.core.linearisation import innovation_covariance, linearise
 from rbpf.core.models import (
     Belief,
     Jacobians,
@@ -90,10 +88,8 @@ class LandmarkMap(Map):
             raise InputError("landmarks of some particles only need a map with evidence=True")
         kind = self.register(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
-        count = columns.shape[0]
-        ids = rows.checked_new_ids(ids, count, self.store.columns.next_id, self.holds)
-        for column, landmark_id in zip(columns, ids.tolist(), strict=True):
-            self.store.add(column, landmark_id)
+        ids = rows.checked_new_ids(ids, len(columns), self.store.columns.next_id, self.holds)
+        self.store.add(columns, ids)
         self.store.columns.kind[self.store.columns.rows(ids)] = kind
         return ids
 
@@ -110,7 +106,7 @@ class LandmarkMap(Map):
             records = layout.landmark.promote(layout.unpack(column[None]))
             kind = self.register(to or Point(records.mean.shape[-1]))
             log_odds = column[-1][:, None] if self.evidence else None
-            self.store.replace(int(landmark_id), self.layouts[kind].pack(records, log_odds)[0])
+            self.store.replace(np.array([landmark_id]), self.layouts[kind].pack(records, log_odds))
             self.store.columns.kind[self.store.columns.row(int(landmark_id))] = kind
 
     def ready(self, weights: np.ndarray, fraction: float = 0.95) -> np.ndarray:
@@ -195,7 +191,7 @@ class LandmarkMap(Map):
             if np.array_equal(record[-1], column):
                 continue
             record[-1] = column
-            self.store.replace(landmark_id, record)
+            self.store.replace(np.array([landmark_id]), record[None])
         gone = ids[np.isneginf(log_odds).all(axis=0)]
         self.remove(gone)
 
@@ -241,13 +237,8 @@ class LandmarkMap(Map):
             raise InputError("a landmark observed twice in a step needs a Gaussian likelihood to be left as it is")
         total = plan.log_factor.copy()
         for batch in plan.batches:
-            group, records = groups[batch.group], self.read(batch.ids)
-            at, z = state[:, None, :], group.z[batch.ks]
-            nu, jac = linearise(group.model, self.space, z, at, records.mean, records.const)
-            assert jac.landmark is not None
-            cov = innovation_covariance(jac.landmark, records.cov, group.cov[batch.ks])
-            log_density = (group.likelihood or Gaussian()).log_density(nu, cov)
-            total += (log_density * (1.0 if batch.mask is None else batch.mask)).sum(axis=1)
+            *_, log_terms = self._engine.updated(batch, groups[batch.group], state)
+            total += log_terms.sum(axis=1)
         return total
 
     def resample(self, ancestors: np.ndarray) -> None:
@@ -268,13 +259,12 @@ class LandmarkMap(Map):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; the parametrisations must have been registered in the same order."""
         self.store.restore(arrays)
-        count = self.store.columns.count
-        entry = integers("landmarks", least=0, below="kinds")
-        kinds = read_one(arrays, "map/kinds", entry, landmarks=count, kinds=len(self.layouts))
+        entry = integers(len(self.ids), least=0, below=len(self.layouts))
+        kinds = read_one(arrays, "map/kinds", entry)
         sizes = np.array([layout.fields for layout in self.layouts], dtype=np.int64)[kinds]
-        if not np.array_equal(sizes, self.store.columns.fields[:count]):
+        if not np.array_equal(sizes, self.store.columns.fields):
             raise InputError("the landmarks' records have other sizes than their parametrisations")
-        self.store.columns.kind[:count] = kinds
+        self.store.columns.kind[:] = kinds
 
     def register(self, landmark: Landmark) -> int:
         """Names a parametrisation before it is first used, so that a checkpoint can be read back; returns its number.

@@ -29,7 +29,7 @@ from rbpf.core.models import (
     Part,
     Records,
 )
-from rbpf.core.particles import SUMMED, Information, Prior
+from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import given_rows, linearise_group, refine, refine_alone, update, update_alone
 from rbpf.kernels.signature import run_driver
@@ -288,36 +288,25 @@ class RowEngine:
         fields = np.concatenate([mean, gaussian.pack(cov)], axis=-1)
         fields = np.moveaxis(fields.reshape(*fields.shape[:2], -1), 0, -1)
         columns[:, : fields.shape[1]] = fields
-        for column, records in zip(ids.tolist(), columns, strict=True):
-            self.store.replace(column, records)
+        self.store.replace(ids, columns)
 
     def _information_numpy(self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior) -> Information:
         _, records = self._read(batch.ids)
-        z, noise = group.z[batch.ks], group.cov[batch.ks]
-        found = Information.zeros(state.shape[0], self.space.dim)
-        for part in _spans(state.shape[0], batch.ks.size):
-            mean, cov_map, const = _taken(records, part)
-            nu, jac = linearise(group.model, self.space, z, state[part, None], mean, const)
-            assert jac.state is not None and jac.landmark is not None
-            cov = linearisation.innovation_covariance(jac.landmark, cov_map, noise)
-            mask = None if batch.mask is None else batch.mask[part]
-            likelihood = _likelihood(group)
-            told = linearisation.information(nu, jac.state, cov, likelihood, prior.take(part), mask)
-            for name in SUMMED:
-                getattr(found, name)[part] = getattr(told, name)
-        return found
+        nu, jac = linearise(group.model, self.space, group.z[batch.ks], state[:, None], records.mean, records.const)
+        assert jac.state is not None and jac.landmark is not None
+        cov = linearisation.innovation_covariance(jac.landmark, records.cov, group.cov[batch.ks])
+        return linearisation.information(nu, jac.state, cov, _likelihood(group), prior, batch.mask)
 
     def _correct_once(self, batch: Batch, group: Observations, state: Array, log_density: Array) -> None:
-        ids, ks = batch.ids, batch.ks
-        columns, records = self._read(ids)
-        means, covs = [], []
-        for part in _spans(state.shape[0], ks.size):
-            mask = None if batch.mask is None else batch.mask[part]
-            mean, cov, log_terms = self._updated(group, ks, state[part], *_taken(records, part), mask)
-            log_density[part] += log_terms.sum(axis=1)
-            means.append(mean)
-            covs.append(cov)
-        self._write(ids, columns, np.concatenate(means), np.concatenate(covs))
+        columns, mean, cov, log_terms = self.updated(batch, group, state)
+        log_density += log_terms.sum(axis=1)
+        self._write(batch.ids, columns, mean, cov)
+
+    def updated(self, batch: Batch, group: Observations, state: Array) -> tuple[Array, Array, Array, Array]:
+        """The columns that a batch updates, and `linearisation.updated` of them; nothing is written."""
+        columns, records = self._read(batch.ids)
+        found = self._updated(group, batch.ks, state, records.mean, records.cov, records.const, batch.mask)
+        return columns, *found
 
     def _joint(
         self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, prior: Prior | None = None
@@ -409,16 +398,6 @@ def _one_after_the_other(batch: Batch) -> list[Batch]:
         parts.append(batch.some(pending[first]))
         pending = np.delete(pending, first)
     return parts
-
-
-def _spans(n: int, k: int) -> list[slice]:
-    """The particles in runs of as many as see `PAIRS_AT_ONCE` observations."""
-    size = max(1, PAIRS_AT_ONCE // max(1, k))
-    return [slice(first, first + size) for first in range(0, n, size)]
-
-
-def _taken(records: Records, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    return records.mean[part], records.cov[part], None if records.const is None else records.const[part]
 
 
 def _likelihood(group: Observations) -> Likelihood:

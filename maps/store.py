@@ -33,7 +33,6 @@ _COLD = {"kept": integers("kept", least=0, below="n", ascending=True), "data": n
 HOT_FRACTION = 0.75
 COLD_FRACTION = 0.9  #: A compacted column is compacted again when no more than this fraction of its rows survives.
 
-_FIRST_ROWS = 64
 _FIRST_SLABS = 32
 
 
@@ -118,92 +117,61 @@ class Layout:
 
 @final
 class Columns:
-    """Tables of columns, which come and go, in the order in which they came.
+    """Tables of the columns that are held, and of no others: a filter may run for ever in a world that changes.
 
-    Memory and time follow the columns that are held, not those that ever were: a filter may run for ever in a world that
-    changes. Row r of every table is the column with the r-th id. Ids are the caller's, or counted up from the largest used.
+    Row r of every table is the column with the r-th id, in the order in which they came. Ids are the caller's, or counted up
+    from the largest used.
     """
 
     def __init__(self) -> None:
-        self.count = 0  #: Columns held.
         self.next_id = 0  #: One more than the largest id that was ever used.
-        self._hold(np.zeros((5, _FIRST_ROWS), dtype=np.int64))
-        #: The ids ascending, and the rows of each; made when it is asked for, in one pass where they ascend already.
-        self._sorted: tuple[np.ndarray, np.ndarray] | None = None
-
-    @property
-    def ids(self) -> np.ndarray:
-        return self._ids[: self.count]
+        self._hold(np.zeros((5, 0), dtype=np.int64))
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
         """Rows (K,) of columns (K,), which must be held."""
-        ascending, rows = self._by_id()
-        return rows[ascending.searchsorted(ids)]
+        return self._order[self._ascending.searchsorted(ids)]
 
     def row(self, column: int) -> int:
         return int(self.rows(np.array(column)))
 
     def held(self, ids: np.ndarray) -> np.ndarray:
         """Whether each of some ids (K,) is that of a column held, (K,) bool."""
-        return self._found(ids)[1]
+        return self.kinds(ids) >= 0
 
     def kinds(self, ids: np.ndarray) -> np.ndarray:
         """What `kind` says of each of some ids (K,), −1 where there is no such column."""
-        rows, held = self._found(ids)
-        return np.where(held, self.kind[rows], -1)
+        if not self.ids.size:
+            return np.full(ids.shape, -1)
+        rows = self._order[np.minimum(self._ascending.searchsorted(ids), self.ids.size - 1)]
+        return np.where(self.ids[rows] == ids, self.kind[rows], -1)
 
-    def _found(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (K,) of ids (K,), and whether they are held; the rows of others mean nothing."""
-        if not self.count:
-            return np.zeros(ids.shape, dtype=np.int64), np.zeros(ids.shape, dtype=bool)
-        ascending, order = self._by_id()
-        rows = order[np.minimum(ascending.searchsorted(ids), self.count - 1)]
-        return rows, np.asarray(self.ids[rows] == ids)
-
-    def _by_id(self) -> tuple[np.ndarray, np.ndarray]:
-        if self._sorted is None:
-            order = self.ids.argsort(kind="stable")
-            self._sorted = self.ids[order], order
-        return self._sorted
-
-    def add(self, column: int | None = None) -> int:
-        """Makes room for a new column and returns its id: the one given, which must not be held, or the next one."""
-        if self.count == self._ids.size:
-            self._hold(np.concatenate([self._tables, np.zeros_like(self._tables)], axis=1))
-        row, column = self.count, self.next_id if column is None else column
-        self._ids[row], self.slab[row], self.kind[row] = column, -1, -1
-        self.count, self.next_id, self._sorted = row + 1, max(self.next_id, column + 1), None
-        return column
+    def add(self, count: int, ids: np.ndarray | None = None) -> np.ndarray:
+        """Makes room for new columns and returns their ids (K,): those given, none of which may be held, or the next ones."""
+        ids = np.arange(self.next_id, self.next_id + count) if ids is None else ids
+        new = np.zeros((5, count), dtype=np.int64)
+        new[0], new[2] = ids, -1
+        self.next_id = max(self.next_id, int(ids.max(initial=-1)) + 1)
+        self._hold(np.concatenate([self._tables, new], axis=1))
+        return ids
 
     def remove(self, ids: np.ndarray) -> None:
-        """Drops columns (K,), which must be held, each once; gives memory back when three quarters are empty."""
-        if not ids.size:
-            return
-        gone = np.sort(self.rows(ids))
-        first, count = int(gone.min()), self.count - ids.size
-        kept = np.delete(np.arange(first, self.count), gone - first)
-        room = self._ids.size
-        while room > max(_FIRST_ROWS, 4 * count):
-            room //= 2
-        self._tables[:, first:count] = self._tables[:, kept]
-        if room < self._ids.size:
-            self._hold(self._tables[:, :room].copy())
-        self.count, self._sorted = count, None
+        """Drops columns (K,), which must be held."""
+        self._hold(np.delete(self._tables, self.rows(ids), axis=1))
 
     def restore(self, ids: np.ndarray, next_id: int) -> None:
         """Holds the columns (M,) and no others; their tables have to be filled again. An id that comes twice is refused."""
         if np.unique(ids).size < ids.size:
             raise InputError("a landmark's id comes twice")
-        room = max(_FIRST_ROWS, 2 * ids.size)
-        self._hold(np.zeros((5, room), dtype=np.int64))
-        self.slab[:], self.kind[:] = -1, -1
-        self._ids[: ids.size] = ids
-        self.count, self.next_id, self._sorted = ids.size, next_id, None
+        self._hold(np.zeros((5, 0), dtype=np.int64))
+        self.add(ids.size, ids)
+        self.next_id = next_id
 
     def _hold(self, tables: np.ndarray) -> None:
         """Five tables, one below the other."""
         self._tables = tables
-        self._ids, self.fields, self.slab, self.generation, self.kind = tables
+        self.ids, self.fields, self.slab, self.generation, self.kind = tables
+        self._order = self.ids.argsort(kind="stable")
+        self._ascending = self.ids[self._order]
 
 
 class Pool:
@@ -273,24 +241,23 @@ class SharedStore:
     def ids(self) -> np.ndarray:
         return self.columns.ids.copy()
 
-    def add(self, records: np.ndarray, column: int | None = None) -> int:
-        """Stores a new column (fields, N) and returns its id: the one given, which must not be alive, or a new one."""
+    def add(self, records: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
+        """Stores new columns (K, fields, N) and returns their ids (K,): those given, none of them alive, or new ones."""
         self._checked(records)
-        column = self.columns.add(column)
-        self._occupy(column, records)
-        return column
+        ids = self.columns.add(len(records), ids)
+        self._occupy(ids, records)
+        return ids
 
     def remove(self, columns: np.ndarray) -> None:
         gone = np.unique(columns)
-        for column in gone.tolist():
-            self._vacate(column)
+        self._vacate(gone)
         self.columns.remove(gone)
 
-    def replace(self, column: int, records: np.ndarray) -> None:
-        """Overwrites a column in all particles (fields, N); the record size may change."""
+    def replace(self, columns: np.ndarray, records: np.ndarray) -> None:
+        """Overwrites columns (K,), each once, in all particles (K, fields, N); the record size may change."""
         self._checked(records)
-        self._vacate(column)
-        self._occupy(column, records)
+        self._vacate(columns)
+        self._occupy(columns, records)
 
     def read(self, column: int, particles: np.ndarray | slice = ALL) -> np.ndarray:
         """Records of all or some particles, (fields, N)."""
@@ -329,9 +296,8 @@ class SharedStore:
         at = self.columns.rows(columns)
         slabs = self.columns.slab[at]
         if slabs.min() < 0:
-            cold = sorted(set(columns[slabs < 0].tolist()))
-            for column, records in zip(cold, self.read_all(np.array(cold)), strict=True):
-                self.replace(column, records)
+            cold = np.unique(columns[slabs < 0])
+            self.replace(cold, self.read_all(cold))
             slabs = self.columns.slab[at]
         generations = self.columns.generation[at].tolist()
         number = {generation: k for k, generation in enumerate(dict.fromkeys(generations))}
@@ -409,15 +375,15 @@ class SharedStore:
     @property
     def dense_bytes(self) -> int:
         """Bytes that separate copies for all particles would take."""
-        return int(self.columns.fields[: self.columns.count].sum()) * 8 * self.n
+        return int(self.columns.fields.sum()) * 8 * self.n
 
     def arrays(self) -> dict[str, np.ndarray]:
         ids = self.ids
         out = {
             "store/size": np.array(self.columns.next_id),
             "store/ids": ids,
-            "store/fields": self.columns.fields[: ids.size].copy(),
-            "store/generation": self.columns.generation[: ids.size].copy(),
+            "store/fields": self.columns.fields.copy(),
+            "store/generation": self.columns.generation.copy(),
         }
         for row, column in enumerate(ids.tolist()):
             cold = self._cold.get(column)
@@ -436,8 +402,7 @@ class SharedStore:
         sizes = {"generations": self.lineage.generation + 1, "ids": next_id, "n": self.n}
         found = read(arrays, _TABLES, "store/", **sizes)
         self.columns.restore(found["ids"], next_id)
-        count = self.columns.count
-        self.columns.fields[:count], self.columns.generation[:count] = found["fields"], found["generation"]
+        self.columns.fields[:], self.columns.generation[:] = found["fields"], found["generation"]
         for row, column in enumerate(self.ids.tolist()):
             self._members.setdefault(int(self.columns.generation[row]), set()).add(column)
         for generation in self._members:
@@ -445,7 +410,7 @@ class SharedStore:
         for row, column in enumerate(self.ids.tolist()):
             name, sizes["fields"] = f"store/{column}/", int(self.columns.fields[row])
             if f"{name}kept" not in arrays:
-                self._fill(row, read(arrays, _HOT, name, **sizes)["data"])
+                self._fill(np.array([row]), read(arrays, _HOT, name, **sizes)["data"][None])
                 continue
             cold = Cold(*read(arrays, _COLD, name, **sizes).values())
             alive = self.lineage.survivors(int(self.columns.generation[row]))
@@ -460,34 +425,34 @@ class SharedStore:
         return self.pools[fields]
 
     def _checked(self, records: np.ndarray) -> None:
-        if records.ndim != 2 or records.shape[0] == 0 or records.shape[1] != self.n:
-            raise InputError(f"landmark records must be (fields, {self.n}), got {records.shape}")
+        if records.ndim != 3 or records.shape[1] == 0 or records.shape[2] != self.n:
+            raise InputError(f"landmark records must be (K, fields, {self.n}), got {records.shape}")
 
-    def _occupy(self, column: int, records: np.ndarray) -> None:
-        row = self.columns.row(column)
-        self.columns.fields[row] = records.shape[0]
-        self._fill(row, records)
-        self.columns.generation[row] = self.lineage.generation
-        self._join([column], self.lineage.generation)
+    def _occupy(self, columns: np.ndarray, records: np.ndarray) -> None:
+        if not columns.size:
+            return
+        rows = self.columns.rows(columns)
+        self.columns.fields[rows], self.columns.generation[rows] = records.shape[1], self.lineage.generation
+        self._fill(rows, records)
+        self._join(columns.tolist(), self.lineage.generation)
 
-    def _fill(self, row: int, records: np.ndarray) -> None:
-        pool = self._pool(row)
-        self.columns.slab[row] = pool.take(1)[0]
-        pool.data[self.columns.slab[row]] = records
+    def _fill(self, rows: np.ndarray, records: np.ndarray) -> None:
+        pool = self._pool(int(rows[0]))
+        self.columns.slab[rows] = slabs = pool.take(rows.size)
+        pool.data[slabs] = records
 
-    def _vacate(self, column: int) -> None:
-        row = self.columns.row(column)
-        self._leave(int(self.columns.generation[row]), [column])
-        if self._cold.pop(column, None) is None:
-            self._pool(row).give(self.columns.slab[row : row + 1])
-        self.columns.slab[row] = -1
+    def _vacate(self, columns: np.ndarray) -> None:
+        for column, row in zip(columns.tolist(), self.columns.rows(columns).tolist(), strict=True):
+            self._leave(int(self.columns.generation[row]), [column])
+            if self._cold.pop(column, None) is None:
+                self._pool(row).give(self.columns.slab[row : row + 1])
+            self.columns.slab[row] = -1
 
     def _join(self, columns: list[int], generation: int) -> None:
-        members = self._members.get(generation)
-        if members is None:
-            members = self._members[generation] = set()
+        if generation not in self._members:
+            self._members[generation] = set()
             self.lineage.retain(generation)
-        members.update(columns)
+        self._members[generation].update(columns)
 
     def _leave(self, generation: int, columns: list[int]) -> None:
         members = self._members[generation]

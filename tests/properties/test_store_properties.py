@@ -50,7 +50,7 @@ class Trial:
     def add(self) -> None:
         for _ in range(self.rng.integers(1, 12)):
             records = self.rng.normal(size=(self.rng.integers(1, 4), self.n))
-            column = self.store.add(records)
+            column = int(self.store.add(records[None])[0])
             assert column not in self.given
             self.given.append(column)
             self.copies.columns[column] = records.copy()
@@ -65,7 +65,7 @@ class Trial:
     def replace(self) -> None:
         column = int(self.rng.choice(list(self.copies.columns)))
         self.copies.columns[column] = self.rng.normal(size=(self.rng.integers(1, 4), self.n))
-        self.store.replace(column, self.copies.columns[column].copy())
+        self.store.replace(np.array([column]), self.copies.columns[column][None].copy())
 
     def rewrite(self) -> None:
         columns, fields = self.some()
@@ -152,7 +152,7 @@ def test_rewriting_one_landmark_leaves_the_others_shared():
     n = 64
     lineage = Lineage(n)
     store = SharedStore(n, lineage)
-    columns = np.array([store.add(rng.normal(size=(5, n))) for _ in range(20)])
+    columns = store.add(rng.normal(size=(20, 5, n)))
     for _ in range(200):
         lineage.advance(np.sort(rng.integers(0, n, n)))
         store.compact()
@@ -161,12 +161,12 @@ def test_rewriting_one_landmark_leaves_the_others_shared():
     assert dense <= store.stored_bytes <= dense + 19 * 0.2 * dense
 
 
-@pytest.mark.parametrize("shape", [(5,), (5, 2), (0, 3), (2, 5, 3)])
+@pytest.mark.parametrize("shape", [(5, 3), (1, 5, 2), (1, 0, 3), (1, 2, 5, 3)])
 def test_records_of_wrong_shape_change_nothing(shape):
     store = SharedStore(3, Lineage(3))
-    column = store.add(np.ones((2, 3)))
+    column = store.add(np.ones((1, 2, 3)))
     for change in (lambda: store.add(np.zeros(shape)), lambda: store.replace(column, np.zeros(shape))):
-        with pytest.raises(InputError, match=r"landmark records must be \(fields, 3\)"):
+        with pytest.raises(InputError, match=r"landmark records must be \(K, fields, 3\)"):
             change()
-        np.testing.assert_array_equal(store.read(column), np.ones((2, 3)))
-        assert store.ids.tolist() == [column]
+        np.testing.assert_array_equal(store.read_all(column), np.ones((1, 2, 3)))
+        assert store.ids.tolist() == column.tolist()
