@@ -141,19 +141,6 @@ def test_as_a_dictionary(edits):
         np.testing.assert_array_equal(columns.kinds(asked), [model.get(column, -1) for column in asked.tolist()])
 
 
-def test_memory_follows_what_is_held():
-    """A thousand columns at once; then one at a time."""
-    columns = Columns()
-    filled(columns, 1000)
-    columns.remove(np.arange(990))
-    for oldest in range(990, 1990):
-        filled(columns, 1)
-        columns.remove(np.array([oldest]))
-    assert columns.next_id == 2000
-    np.testing.assert_array_equal(columns.ids, np.arange(1990, 2000))
-    np.testing.assert_array_equal(columns.generation, 2 * columns.ids)
-
-
 @pytest.mark.parametrize("ids", [[1, 1], [3, 1, 3]])
 def test_ids_that_cannot_be(ids):
     with pytest.raises(InputError, match="comes twice"):
