@@ -5,7 +5,8 @@
 The bootstrap filter, FastSLAM 2.0 and the exact importance ratio, Mathematics (correction), differ in the proposal.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
@@ -183,7 +184,7 @@ class Filter:
         it was; otherwise it stands between two steps: `load` a checkpoint.
         """
         proposal = proposal or self.proposal
-        with _UnchangedByFailure(self):
+        with _unchanged_by_failure(self):
             # Predict, and observe given the prediction.
             stamp_ns, dt = self._clock(stamp_ns)
             prior = self._predict(control, dt)
@@ -328,7 +329,7 @@ class Filter:
         Raises InputError: the file is missing, damaged, or belongs to another filter.
         """
         arrays, rng_state = checkpoint.read_checkpoint(Path(path), self._fingerprint())
-        with _UnchangedByFailure(self), checkpoint.fitting(Path(path)):
+        with _unchanged_by_failure(self), checkpoint.fitting(Path(path)):
             self.restore(arrays)
             self.rng.bit_generator.state = rng_state
         return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
@@ -445,22 +446,19 @@ class Filter:
         return np.concatenate(ids)
 
 
-class _UnchangedByFailure:
+@contextmanager
+def _unchanged_by_failure(of: Filter) -> Iterator[None]:
     """Puts a filter back as it was where it is refused; what it would be takes new objects, never the old ones."""
-
-    def __init__(self, of: Filter) -> None:
-        self._held = [(item, dict(vars(item))) for item in (of, *of.marginals.parts.values())]
-        self._rng, self._rng_state = of.rng.bit_generator, of.rng.bit_generator.state
-
-    def __enter__(self) -> None:
-        """What to go back to is held already."""
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None and issubclass(kind, InputError):
-            for item, attributes in self._held:
-                vars(item).clear()
-                vars(item).update(attributes)
-            self._rng.state = self._rng_state
+    held = [(item, dict(vars(item))) for item in (of, *of.marginals.parts.values())]
+    generator, state = of.rng.bit_generator, of.rng.bit_generator.state
+    try:
+        yield
+    except InputError:
+        for item, attributes in held:
+            vars(item).clear()
+            vars(item).update(attributes)
+        generator.state = state
+        raise
 
 
 def are_explained(groups: Sequence[Observations]) -> bool:

@@ -254,16 +254,13 @@ def marginals_by_schur(
         raise undetermined
     try:
         inverse = np.linalg.inv(blocks.data)
-    except np.linalg.LinAlgError as error:
-        raise undetermined from error
-    seen = csc_array(of_points.T @ of_poses)
-    weights = csc_array(bsr_array((inverse, blocks.indices, blocks.indptr), shape=blocks.shape) @ seen)
-    reduced = (of_poses.T @ of_poses).toarray() - (seen.T @ weights).toarray()
-    diagonal = np.diagonal(reduced)
-    if not (diagonal > 0.0).all():
-        raise undetermined
-    scale = 1.0 / np.sqrt(diagonal)
-    try:
+        seen = csc_array(of_points.T @ of_poses)
+        weights = csc_array(bsr_array((inverse, blocks.indices, blocks.indptr), shape=blocks.shape) @ seen)
+        reduced = (of_poses.T @ of_poses).toarray() - (seen.T @ weights).toarray()
+        diagonal = np.diagonal(reduced)
+        if not (diagonal > 0.0).all():
+            raise undetermined
+        scale = 1.0 / np.sqrt(diagonal)
         factor = cho_factor(scale[:, None] * reduced * scale, lower=True)
     except np.linalg.LinAlgError as error:
         raise undetermined from error
