@@ -24,7 +24,10 @@ from rbpf.validation.consistency.comparison import (
     verdict_of,
 )
 from rbpf.validation.consistency.statistic import coverage, step_ratio, variance_ratio, whitened_errors
-from tests.validation.worlds import Receiver, Walk
+from tests.core.scripted import Scripted, seen
+from tests.exactness.models import LinearMotion, LinearObservation
+
+WALK, FIX = LinearMotion(np.eye(2), np.eye(2)), LinearObservation(by_state=np.eye(2))
 
 ALIKE = {
     "sensor noise × 2", "sensor noise ÷ 3", "odometry noise × 3", "nothing, another world", "the same in another world",
@@ -54,8 +57,8 @@ def linear_gaussian(claimed: float, seed: int = 0, steps: int = 300) -> Verdict:
     """Fixes of 1 m, and what the filter is told of them."""
     rng = np.random.default_rng(seed)
     truth = np.cumsum(rng.normal(size=(steps, 2)), axis=0)
-    filter_ = Filter(Walk(), Receiver(claimed), n=300, rng=rng)
-    reports = [filter_.step(fix) for fix in truth + rng.normal(size=(steps, 2))]
+    filter_, cov = Filter(WALK, Scripted(), n=300, rng=rng), claimed**2 * np.eye(2)[None]
+    reports = [filter_.step(seen(FIX, fix[None], cov)) for fix in truth + rng.normal(size=(steps, 2))]
     found = [motion_correction(report.mixture) for report in reports]
     own = innovation_statistics(
         np.array([report.nis for report in reports]),
@@ -64,7 +67,7 @@ def linear_gaussian(claimed: float, seed: int = 0, steps: int = 300) -> Verdict:
         np.array([correction.cov for correction in found]),
     )
     mean, cov = (np.array([getattr(r.estimate, name) for r in reports]) for name in ("mean", "cov"))
-    poses = pose_statistics(whitened_errors(Walk.space, mean, cov, truth))
+    poses = pose_statistics(whitened_errors(WALK.space, mean, cov, truth))
     return judge([*poses, *own], [statistic.name for statistic in poses])
 
 
@@ -156,8 +159,8 @@ def test_a_filter_of_fixes_is_told_its_noise(claimed):
     rng = np.random.default_rng(0)
     fixes = np.cumsum(rng.normal(size=(400, 2)), axis=0) + rng.normal(size=(400, 2))
     for _ in range(8):
-        filter_ = Filter(Walk(), Receiver(claimed), n=200, rng=np.random.default_rng(1))
-        reports = [filter_.step(fix) for fix in fixes]
+        filter_, cov = Filter(WALK, Scripted(), n=200, rng=np.random.default_rng(1)), claimed**2 * np.eye(2)[None]
+        reports = [filter_.step(seen(FIX, fix[None], cov)) for fix in fixes]
         nis = step_ratio(INNOVATIONS, *np.array([(r.nis, r.rows) for r in reports], dtype=float).T)
         advice = noise_advice(record("mono", search={"noise_px": claimed}), [nis])
         if not advice:

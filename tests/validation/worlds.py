@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
 
 from rbpf import gaussian
-from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
-from rbpf.lie import SE2, SE3, Array, Euclidean
+from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.readers import Frame, RobotLog, Truth
 from rbpf.sensors.readers.measurements import Kind, Measurements
@@ -197,40 +196,6 @@ def assert_same(
     for covs, others in ((found.cov_poses, expected.cov_poses), (cov_landmarks, expected.cov_landmarks)):
         for one, other in zip(covs, others, strict=True):
             np.testing.assert_allclose(one, other, rtol=cov, atol=cov * np.abs(other).max())
-
-
-# A walk in the plane and fixes of it: a linear-Gaussian model of one's own.
-
-
-class Walk(MotionModel):
-    """A random walk, by default of 1 m per step."""
-
-    space = Euclidean(2)
-
-    def __init__(self, variance=1.0):
-        self.variance = variance
-
-    def transition(self, state, control, dt):
-        return Transition(state, self.variance * np.eye(2)[None])
-
-
-class Position(ObservationModel):
-    """A position fix."""
-
-    dim, reads = 2, frozenset({Part.STATE})
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return state
-
-
-class Receiver(Sensor):
-    """Fixes with a claimed standard deviation."""
-
-    def __init__(self, std):
-        self.std = std
-
-    def observe(self, frame, belief):
-        return [Observations(frame[None], self.std**2 * np.eye(2)[None], Position())]
 
 
 def wander(length: int, seed: int) -> Trajectory:
