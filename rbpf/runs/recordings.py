@@ -198,8 +198,8 @@ def part_of_log(log: readers.RobotLog, part: readers.Part) -> readers.RobotLog:
     if part == WHOLE:
         return log
     stamps = np.array([frame.stamp_ns for frame in log.frames])
-    counted = np.array_equal(stamps, np.arange(len(stamps)))
-    rows = part.rows(stamps if counted else (stamps - stamps[0]) * 1e-9, f"{log.name}: no frame is left").tolist()
+    scale, unit = (1, "steps") if np.array_equal(stamps, np.arange(len(stamps))) else (1e-9, "s")
+    rows = part.rows((stamps - stamps[0]) * scale, f"{log.name}: no frame is left", unit).tolist()
     frames = [replace(log.frames[rows[0]], delta=None, cov_delta=None)]
     for before, row in pairwise(rows):
         moved = Odometry.at_rest(log.space)

@@ -69,7 +69,7 @@ class Run(Generic[SystemT]):
 
         Errors as `System.take`.
         """
-        # What the filter warns of stands among a run's messages instead.
+        # What the filter warns of stands among a run's messages instead, where the frame stands for its step.
         health = self.system.filter.health
         health.silent, known = True, len(health.findings)
         started = time.perf_counter()
@@ -77,7 +77,7 @@ class Run(Generic[SystemT]):
         seconds = time.perf_counter() - started
         self.frame = frame
         place = f"{self.system.frame_word} {len(self.log)}"
-        doubts = list(self.system.filter.health.findings.values())[known:]
+        doubts = [words.partition(": ")[2] for words in list(self.system.filter.health.findings.values())[known:]]
         self.messages += [f"{place}: {printable(words)}" for words in (*tracked.messages, *doubts)]
         self.log.append(tracked, seconds, waiting)
         return tracked

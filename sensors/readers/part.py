@@ -54,16 +54,16 @@ class Part:
         source = Chosen(sequence.source, rows, stamps[rows], (camera.height, camera.width))
         return replace(sequence, camera=camera, stamps_ns=stamps[rows], source=source)
 
-    def rows(self, after_s: np.ndarray, problem: str) -> np.ndarray:
-        """Numbers of the frames used, of all (T,) that come so long after the first, s.
+    def rows(self, after_s: np.ndarray, problem: str, unit: str = "s") -> np.ndarray:
+        """Numbers of the frames used, of all (T,) that come so long after the first, s or what the unit says.
 
         Raises InputError: none is left, with the problem as its beginning.
         """
         end_s = np.inf if self.end_s is None else self.end_s
         rows = np.flatnonzero((after_s >= self.start_s) & (after_s <= end_s))[:: self.every]
         if not rows.size:
-            long = f"the recording is {after_s[-1] if len(after_s) else 0.0:.3f} s long"
-            raise InputError(f"{problem} from {self.start_s:g} s on: {long}")
+            long = f"the recording is {round(after_s[-1], 3) if len(after_s) else 0} {unit} long"
+            raise InputError(f"{problem} from {self.start_s:g} {unit} on: {long}")
         return rows
 
 

@@ -8,6 +8,7 @@ import re
 import zlib
 from codecs import BOM_UTF8
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -22,6 +23,7 @@ from rbpf.lie import Array
 MOST_BYTES = 1 << 30  #: No table of a recording is larger.
 LARGEST = 1e12
 LATEST_S = 4e9
+SHORTEST_GAP_NS = 1e5  #: Nothing that is read here comes as often: times that do are in another unit.
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _PLAIN = dict.fromkeys(map(ord, "0123456789+-.eE \t,"))
@@ -89,8 +91,7 @@ def read_lines(path: Path, hint: str = "") -> list[str]:
     """Lines of a file whose last line is complete, without their ends."""
     lines = read_text(path, hint).split("\n")
     if lines[-1]:
-        problem = "the file ends inside this line; copy it again, or end the line if it is complete"
-        raise line_error(path, len(lines), problem)
+        raise line_error(path, len(lines), "the file ends inside this line; copy it again, or end it if it is complete")
     return [line.removesuffix("\r") for line in lines[:-1]]
 
 
@@ -188,10 +189,8 @@ def parse_table(
     # lines read one by one: characters beyond those of plain numbers (nan, 0x1p3, quotes) mean something to NumPy.
     values = None
     if not "".join(rows).translate(_PLAIN):
-        try:
+        with suppress(ValueError):
             values = np.loadtxt(rows, comments=None, delimiter=separator, ndmin=2)
-        except ValueError:
-            values = None
     if values is None or values.shape != (len(rows), len(columns)) or not (np.abs(values) <= LARGEST).all():
         values = np.empty((len(rows), len(columns)))
         for number, (line, row) in enumerate(filled):
@@ -280,4 +279,8 @@ def read_stamped(path: Path, hint: str, nanoseconds: bool = False) -> StampedLin
         raise InputError(f"{path}: expected lines that begin with a time, found none.")
     lines, texts = [line for line, _ in kept], [parts[0].strip() for _, parts in kept]
     rests = ["".join(parts[1:]).strip() for _, parts in kept]
-    return StampedLines(path, lines, _stamps_ns(path, lines, texts, parse), rests, separator)
+    stamps_ns = _stamps_ns(path, lines, texts, parse)
+    gap_ns = np.median(np.diff(stamps_ns)) if nanoseconds and len(stamps_ns) > 1 else 0.0
+    if 0.0 < gap_ns < SHORTEST_GAP_NS:
+        raise InputError(f"{path}: the times are {gap_ns:.0f} apart, too little for nanoseconds; write them in these.")
+    return StampedLines(path, lines, stamps_ns, rests, separator)
