@@ -32,19 +32,11 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, fails, seen
 from tests.core.worlds import Recipe, content, drive, planar_world, same
+from tests.exactness.models import Curved
 
 N = 6
 LINE = Euclidean(1)
-
-
-class Position(ObservationModel):
-    """The state itself."""
-
-    dim = 1
-    reads = frozenset({Part.STATE})
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return state.copy()
+STATE = Curved(np.copy)
 
 
 class Walk(MotionModel):
@@ -107,7 +99,7 @@ def test_time_running_backwards_and_a_failed_step_that_does_not_move_the_clock()
     filter_ = on_a_line()
     filter_.step([], None, 5_000)
     fails(filter_, "time runs backwards: step 1 has stamp 4999 ns after 5000 ns", [], None, 4_999)
-    fails(filter_, "is not finite", seen(Position(), [[np.nan]]), None, 9_000)
+    fails(filter_, "is not finite", seen(STATE, [[np.nan]]), None, 9_000)
     filter_.step([], None, 5_000)
     assert (filter_.steps, filter_.stamp_ns) == (2, 5_000)
 
@@ -117,19 +109,19 @@ class TestMeasurements:
     @pytest.mark.parametrize(
         ("z", "cov", "match"),
         [
-            ([[np.nan]], None, "a measurement of Position or its covariance is not finite"),
-            ([[1.0]], [[[np.inf]]], "a measurement of Position or its covariance is not finite"),
-            ([[1.0]], [[[-1.0]]], "the noise of Position has no covariance: .*negative eigenvalue"),
-            ([[1.0, 2.0]], None, r"Position measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)"),
+            ([[np.nan]], None, "a measurement of Curved or its covariance is not finite"),
+            ([[1.0]], [[[np.inf]]], "a measurement of Curved or its covariance is not finite"),
+            ([[1.0]], [[[-1.0]]], "the noise of Curved has no covariance: .*negative eigenvalue"),
+            ([[1.0, 2.0]], None, r"Curved measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)"),
             ([[1.0]], [[1.0]], r"got \(1, 1\) and \(1, 1\)"),
         ],
     )
     def test_numbers_that_are_no_measurement(self, proposal, z, cov, match):
-        fails(on_a_line(proposal=proposal), match, seen(Position(), z, cov))
+        fails(on_a_line(proposal=proposal), match, seen(STATE, z, cov))
 
     def test_no_particle_explains_them(self):
         # Far beyond the range of floating point is still a weight; what cannot be is none.
-        assert on_a_line().step(seen(Position(), [[1e3]], [[[1e-2]]])).log_evidence < -1e5
+        assert on_a_line().step(seen(STATE, [[1e3]], [[[1e-2]]])).log_evidence < -1e5
         clutter = {"ids": np.array([NULL]), "log_clutter": -np.inf}
         groups = seen(RangeBearing(SE2), [[5.0, 0.0]], **clutter)
         fails(in_the_plane(), "step 0: all particle weights are zero, no particle explains", groups)
@@ -144,7 +136,7 @@ class TestMeasurements:
         np.testing.assert_allclose(filter_.particles.weights, expected)
 
     def test_a_model_that_gives_nan(self):
-        poisoned = Position()
+        poisoned = Curved(np.copy)
         poisoned.predict = lambda state, *parts: state * np.nan
         fails(on_a_line(), "the weight of particle 0 is nan; check the models", seen(poisoned, [[1.0]]))
 
@@ -152,10 +144,10 @@ class TestMeasurements:
 class TestModels:
     @pytest.mark.usefixtures("unchecked_shapes")
     def test_observations_of_wrong_shape(self):
-        flat, slope = Position(), Position()
+        flat, slope = Curved(np.copy), Curved(np.copy)
         flat.predict = lambda *parts: np.zeros((1, 1))
         slope.jacobians = lambda state, *parts: Jacobians(np.ones((*state.shape[:-1], 2, 1)))
-        match = rf"Position.predict returned shape \(1, 1\), expected \({N}, 1, 1\)"
+        match = rf"Curved.predict returned shape \(1, 1\), expected \({N}, 1, 1\)"
         fails(on_a_line(), match, seen(flat, [[1.0]]))
         match = rf"jacobians returned a block of shape \({N}, 1, 2, 1\), expected \({N}, 1, 1"
         fails(on_a_line(), match, seen(slope, [[1.0]]))
@@ -261,7 +253,7 @@ def test_particles_of_weight_zero_do_no_harm():
     filter_ = on_a_line(resampler=EssTriggered(Systematic(), 0.0))
     filter_.particles.log_weights = np.log([0.5, 0.5, 1e-320, 1e-320, 1e-320, 1e-320])
     filter_.particles.log_weights[2] = -np.inf
-    report = filter_.step(seen(Position(), [[0.3]], [[[0.01]]]))
+    report = filter_.step(seen(STATE, [[0.3]], [[[0.01]]]))
     assert np.isfinite(report.log_evidence)
     assert np.isfinite(report.estimate.cov).all()
     assert filter_.particles.weights[2] == 0.0

@@ -8,13 +8,16 @@ import pytest
 
 from rbpf.core.diagnostics import Health, HealthWarning
 from rbpf.core.filter import Filter
-from rbpf.core.models import LikelihoodSensor, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
+from rbpf.core.models import LikelihoodSensor, MotionModel, Transition
 from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE2, Euclidean, Product
 from rbpf.maps.point import Point
+from tests.core.scripted import Scripted, seen
 from tests.core.worlds import Recipe, drive, planar_world
+from tests.exactness.models import Curved
 
 PERIOD, FIX_EVERY, STD_FIX = 0.1, 10, 0.5
+FIX = Curved(lambda state: state[..., 1:3], dim=2)
 
 
 class Wheeled(MotionModel):
@@ -30,31 +33,21 @@ class Wheeled(MotionModel):
         )
 
 
-class Fix(ObservationModel):
-    dim, reads = 2, frozenset({Part.STATE})
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return state[..., 1:3]
-
-
-class Receiver(Sensor):
-    def observe(self, frame, belief):
-        return [] if frame is None else [Observations(frame[None], STD_FIX**2 * np.eye(2)[None], Fix())]
-
-
 def driven(n: int, seconds: int, bias_std: float = 0.1) -> Filter:
     """Fixes at 1 Hz, wheels and a gyroscope ten times as often."""
     rng, pose, bias = np.random.default_rng(2), SE2.identity(), 0.15
     start = np.zeros((n, 4))
     start[:, 3] = bias_std * rng.standard_normal(n)
-    filter_ = Filter(Wheeled(), Receiver(), n=n, rng=np.random.default_rng(3), start=start)
+    filter_ = Filter(Wheeled(), Scripted(), n=n, rng=np.random.default_rng(3), start=start)
     for t in range(int(seconds / PERIOD)):
         rates = np.array([0.2 * np.sin(0.05 * t), 5.0])
         if t:
             moved = PERIOD * np.array([*rates, 0.0]) + np.array([0.002, 0.01, 0.001]) * rng.standard_normal(3)
             pose = SE2.retract(pose, moved)
-        fix = pose[1:] + STD_FIX * rng.standard_normal(2) if t % FIX_EVERY == 0 else None
-        filter_.step(fix, rates + np.array([bias, 0.0]), int(t * PERIOD * 1e9))
+        fixes = []
+        if t % FIX_EVERY == 0:
+            fixes = seen(FIX, [pose[1:] + STD_FIX * rng.standard_normal(2)], STD_FIX**2 * np.eye(2)[None])
+        filter_.step(fixes, rates + np.array([bias, 0.0]), int(t * PERIOD * 1e9))
     return filter_
 
 

@@ -15,7 +15,7 @@ from rbpf.core.smoothing import backward_simulation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Euclidean, Finite, Product
 from tests.core.scripted import Scripted, fails, says
-from tests.exactness.models import LinearObservation, assert_unbiased
+from tests.exactness.models import Curved, LinearObservation, assert_unbiased
 
 STAY = np.array([[0.9, 0.1], [0.2, 0.8]])
 DRIFT, NOISE = np.array([0.2, -1.0]), np.array([0.2, 0.6])
@@ -105,23 +105,14 @@ def sampled(motion, sensor, rng, proposal=None, n=4 * N):
 
 
 READ = LinearObservation(by_substate=np.eye(1))
-
-
-class First(LinearObservation):  # type: ignore[misc]
-    """Of the state, the number."""
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return state[..., :1]
-
-    def jacobians(self, state, landmark=None, const=None, substate=None):
-        return None
+NUMBER = Curved(lambda state: state[..., :1])
 
 
 def group(model, z):
     return [Observations(np.array([[z]]), np.array([[[STD**2]]]), model)]
 
 
-OF_SUBSTATE, OF_STATE = ([group(model, z) for z in Z] for model in (READ, First(np.eye(1))))
+OF_SUBSTATE, OF_STATE = ([group(model, z) for z in Z] for model in (READ, NUMBER))
 CASES = {
     "marginal": lambda rng: [marginal(rng), OF_SUBSTATE],
     "marginal, prior": lambda rng: [marginal(rng, PriorProposal()), OF_SUBSTATE],

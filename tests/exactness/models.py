@@ -70,6 +70,18 @@ class LinearObservation(ObservationModel):
         return Jacobians(state=self.matrices.get(Part.STATE), substate=self.matrices.get(Part.SUBSTATE))
 
 
+class Curved(ObservationModel):
+    """z = h(x) + v; its Jacobian is numeric."""
+
+    reads = frozenset({Part.STATE})
+
+    def __init__(self, h: Callable[[np.ndarray], np.ndarray], dim: int = 1):
+        self.h, self.dim = h, dim
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return self.h(state)
+
+
 class Relative(ObservationModel):
     """z = landmark − position + v, for a body of known orientation."""
 

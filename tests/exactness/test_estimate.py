@@ -5,14 +5,14 @@ import pytest
 
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.likelihoods import GaussianWithOutliers, TruncatedMahalanobis
-from rbpf.core.models import NEW, NULL, Observations, Part, Records
+from rbpf.core.models import NEW, NULL, Observations, Records
 from rbpf.core.particles import Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import MixturePoint, Point
-from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
+from tests.exactness.models import Curved, Frame, LinearMotion, LinearObservation, Relative, Scripted, single
 
 PLANE = Euclidean(2)
 TRUE = np.array([1.18, -0.68])
@@ -41,29 +41,16 @@ def test_what_enters_the_second_weight_alone_is_in_the_estimate(exact, resampler
     np.testing.assert_allclose(report.estimate.cov, sampled.cov, atol=1e-3)
 
 
-class Curved(LinearObservation):
-    """A fix whose slope is another one than where it is linearised, x + x²/5 of the first coordinate."""
-
-    reads = frozenset({Part.STATE})
-
-    def __init__(self):
-        super().__init__(by_state=[[1.0, 0.0]])
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return state[..., :1] + 0.2 * state[..., :1] ** 2
-
-    def jacobians(self, state, landmark=None, const=None, substate=None):
-        return None
-
-
 def test_the_nonlinear_part_is_in_the_estimate():
+    """Of a fix whose slope is another one than where it is linearised, x + x²/5 of the first coordinate."""
+    fix = Curved(lambda state: state[..., :1] + 0.2 * state[..., :1] ** 2)
     z, var = 2.5, 0.3
     grid = np.linspace(-6.0, 6.0, 20_001)
     density = np.exp(-0.5 * grid**2 - 0.5 * (z - grid - 0.2 * grid**2) ** 2 / var)
     exact = (grid * density).sum() / density.sum()
     std = np.sqrt(((grid - exact) ** 2 * density).sum() / density.sum())
     filter_ = Filter(LinearMotion(np.eye(2), np.eye(2)), Scripted(), n=50_000, rng=np.random.default_rng(4))
-    report = filter_.step(Frame([single(np.array([z]), var, Curved())]))
+    report = filter_.step(Frame([single(np.array([z]), var, fix)]))
     linearised = mixture_estimate(*report.mixture)
     assert abs(linearised.mean[0] - exact) > 0.1
     assert report.estimate.mean[0] == pytest.approx(exact, abs=0.1 * std)

@@ -26,6 +26,7 @@ from rbpf.lie import SE2, Euclidean
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from tests.exactness.models import (
     SEEDS,
+    Curved,
     Frame,
     Kalman,
     LinearMotion,
@@ -168,19 +169,6 @@ class Moving(MotionModel):
 
     def transition(self, state, control, dt):
         return Transition(self.f(state), np.full((1, 1, 1), self.std))
-
-
-class Curved(ObservationModel):
-    """z = h(x) + v."""
-
-    dim = 1
-    reads = frozenset({Part.STATE})
-
-    def __init__(self, h: Function):
-        self.h = h
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return self.h(state)
 
 
 @dataclass(frozen=True)
