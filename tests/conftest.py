@@ -52,6 +52,12 @@ def next_test() -> None:
 
 
 @pytest.fixture
+def rng() -> np.random.Generator:
+    """Begun anew in each test."""
+    return np.random.default_rng(2005)
+
+
+@pytest.fixture
 def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that hand over arrays of a wrong shape, and want to hear of it from the program."""
     monkeypatch.setattr(switch, "on", False)

@@ -13,11 +13,6 @@ DIMENSIONS = [1, 2, 3, 6, 8, 9, 12]
 every_dimension = pytest.mark.parametrize("n", DIMENSIONS)
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(20052)
-
-
 def covariances(rng: np.random.Generator, shape: tuple[int, ...], n: int, rank: int | None = None) -> np.ndarray:
     """Random covariances, of full rank unless told otherwise."""
     half = rng.normal(size=(*shape, n, n + 2 if rank is None else rank))

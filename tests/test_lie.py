@@ -15,11 +15,6 @@ every_angle = pytest.mark.parametrize("angle", ANGLES)
 every_batch = pytest.mark.parametrize("shape", BATCHES, ids=str)
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(20061)
-
-
 def rotations(group: LieGroup) -> int:
     """How many leading entries of a tangent turn something."""
     return {SE2: 1, SE3: 3}.get(group, 3 if isinstance(group, Product) else 0)

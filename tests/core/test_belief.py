@@ -19,11 +19,6 @@ N, K, DRAWS = 12, 3, 100_000
 STD = 0.01
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(11)
-
-
 def prior_of(space: LieGroup, rng: np.random.Generator, centred: bool, scale: float = STD) -> Prior:
     """Bases around the origin; the factor has one column too few: singular, as in a plane."""
     base = space.retract(space.identity((N,)), 0.02 * rng.normal(size=(N, space.dim)))

@@ -69,11 +69,6 @@ class Weights(LikelihoodSensor):
         return -0.5 * np.square((frame - state[:, 0]) / STD) - np.log(STD * np.sqrt(2 * np.pi))
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(4)
-
-
 def enumerated() -> float:
     """Log-evidence by all sequences of modes; given one, the measurements are Gaussian."""
     total, t = -np.inf, len(Z)

@@ -28,11 +28,6 @@ every_likelihood = pytest.mark.parametrize(
 )
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(64)
-
-
 def with_outliers(group: Observations) -> Observations:
     """The second measurement far off, the third at the edge of the gate."""
     return replace(group, z=group.z + np.array([0.0, 0.9, 0.25, 0.0, 0.0])[:, None])

@@ -19,11 +19,6 @@ TRUNCATED = TruncatedMahalanobis()
 PLANE = Euclidean(2)
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(2005)
-
-
 @pytest.mark.parametrize("p", [1, 2, 3])
 def test_truncated_mahalanobis_is_s05_equation_6(p, rng):
     """−½ min(T_l, νᵀS⁻¹ν) with T_l = 4.0, in no units."""

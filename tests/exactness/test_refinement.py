@@ -19,11 +19,6 @@ compiled_or_not = pytest.mark.parametrize("compiled", [True, False], ids=["compi
 every_rank = pytest.mark.parametrize("rank", [0, 1, 2, 3, 6])
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(2006)
-
-
 def rows_of(scene: Scene, groups: list[Observations], particle: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """ν, [H J] over (pose, all landmarks) and R of each measurement that a particle takes as known."""
     d, (_, k, dim) = scene.space.dim, scene.records.mean.shape

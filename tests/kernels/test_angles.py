@@ -3,7 +3,6 @@
 from itertools import product
 
 import numpy as np
-import pytest
 from numba import njit
 
 from rbpf.kernels.angles import arctan2, cos_sin
@@ -11,11 +10,6 @@ from rbpf.kernels.angles import arctan2, cos_sin
 HALF_ULP_OF_ONE = 2.0**-53
 ULP_OF_PI = np.spacing(np.pi)
 MANY = 20_000
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(0)
 
 
 @njit(error_model="numpy")
