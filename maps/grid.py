@@ -119,7 +119,8 @@ class GridMap(Conditional):
         few = beams[::_EVERY] * [1.0, 1.0, 1.0, 1.0, _EVERY]
         few = few[np.argsort(np.arange(len(few)) % _APART, kind="stable")]
         rest = np.ascontiguousarray(few[::-1, 4].cumsum()[::-1]) * float(self._stamps.max())
-        cells.search(place, (info, radius, spacing, self._steps, few, rest), (found, value, hessian))
+        lattice = info, radius, spacing, self._steps, few, rest
+        cells.search(len(self._fields), *place, *lattice, found, value, hessian)
         factor = np.broadcast_to(prior.factor, (n, *prior.factor.shape[1:]))
         # What falls off about the maximum, as information; in units in which the steps weigh the same.
         unit = self._steps
@@ -139,7 +140,8 @@ class GridMap(Conditional):
     def log_likelihood(self, state: np.ndarray, beams: np.ndarray) -> np.ndarray:
         """(N,) log p(z | x, m) up to a constant, of a scan (K, 5) at the states (N, 3)."""
         value = np.empty(state.shape[0])
-        cells.scores(self._place(state, beams), value)
+        place = self._place(state, beams)
+        cells.scores(len(self._fields), *place, value)
         return value
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -169,7 +171,7 @@ class GridMap(Conditional):
             self.pool[: len(held)] = held  # what is not used yet needs no memory
             self.users = np.concatenate([self.users, np.zeros(more, dtype=np.int64)])
         cells.own(touched, self.index, self.users, self.pool, np.flatnonzero(self.users == 0))
-        cells.insert(state, beams, side, self.origin, self.index, self.pool, self._change)
+        cells.insert(len(state), state, beams, side, self.origin, self.index, self.pool, self._change)
 
     def resample(self, ancestors: np.ndarray) -> None:
         self.index = np.ascontiguousarray(self.index[ancestors])

@@ -6,12 +6,11 @@ Cell (x, y) of the world is floor(position / side); `origin` is the tile of inde
 """
 
 import math
-from functools import partial
 
 import numpy as np
-from numba import boolean, float32, float64, int32, int64, njit, prange, types, void
+from numba import boolean, float32, float64, int32, njit, types, void
 
-from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR, part_of
+from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR, in_parts
 
 TILE = 32  #: Cells of a side of a tile.
 PLANES = 4  #: Of a tile: log-odds; how many beams ended in the cell, and their mean place in it, x and y in [0, 1).
@@ -115,13 +114,13 @@ def _tile_of(index, n, origin, x, y):
     return index[n, row, column]
 
 
-_INSERT = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, VECTOR
-_insert_at, _insert_part = part_of(*_INSERT)
+@in_parts(MATRIX, MATRIX, float64, INDICES, INDEX, POOL, VECTOR)
+def insert(n, arguments):
+    """Writes a scan into tiles that nobody shares, of (state, beams, side, origin, index, pool, change); parts are particles.
 
-
-@_insert_part
-def _insert_one(n, state, beams, side, origin, index, pool, change):
-    """Writes a scan into tiles that nobody shares; `change` is what the log-odds take: of an end, of a crossing, the bound."""
+    `change` is what the log-odds take: of an end, of a crossing, the bound.
+    """
+    state, beams, side, origin, index, pool, change = arguments
     hit, miss, bound = change[0], change[1], change[2]
     # What is crossed comes first, so that a wall which a grazing beam passes by is a wall again after this scan.
     for k in range(beams.shape[0]):
@@ -150,15 +149,6 @@ def _insert_one(n, state, beams, side, origin, index, pool, change):
             pool[tile, ENDS, row, column] = count
             pool[tile, MEAN_X, row, column] += (x1 / side - cx - pool[tile, MEAN_X, row, column]) / count
             pool[tile, MEAN_Y, row, column] += (y1 / side - cy - pool[tile, MEAN_Y, row, column]) / count
-
-
-@njit(void(int64, *_INSERT), parallel=True, cache=True, error_model="numpy")
-def _insert_all(one, state, beams, side, origin, index, pool, change):
-    for n in prange(state.shape[0]):
-        _insert_at(one)(int64(n), state, beams, side, origin, index, pool, change)
-
-
-insert = partial(_insert_all, _insert_one.address)
 
 
 @njit(cache=True, error_model="numpy")
@@ -297,18 +287,13 @@ def _second_order(field, window, border, side, base, at, beams, steps, state, gr
 
 #: Types of `place` = (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all
 #: zero.
-PLACE = types.Tuple((MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED))
-#: Of `lattice` = (info, radius, spacing, steps, few, rest) and of `found` = (increment, value, hessian).
-LATTICE = types.Tuple((MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR))
-FOUND = types.Tuple((MATRIX, VECTOR, CUBE))
-_scores_at, _scores_part = part_of(PLACE, VECTOR)
-_search_at, _search_part = part_of(PLACE, LATTICE, FOUND)
+PLACE = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED
 
 
-@_scores_part
-def _scores_of(thread, place, value):
-    """Σ of weight · field (N,) at the states."""
-    state, beams, side, origin, index, pool, stamps, fields, marks = place
+@in_parts(*PLACE, VECTOR)
+def scores(thread, arguments):
+    """Σ of weight · field, value (N,), at the states; parts are threads."""
+    state, beams, side, origin, index, pool, stamps, fields, marks, value = arguments
     border = stamps.shape[2] // 2
     threads = fields.shape[0]
     field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
@@ -318,15 +303,6 @@ def _scores_of(thread, place, value):
         cos, sin = math.cos(state[n, 0]), math.sin(state[n, 0])
         value[n] = _score(field, window, border, side, state[n, 1], state[n, 2], cos, sin, beams)
         _clear(field, marked, border)
-
-
-@njit(void(int64, PLACE, VECTOR), parallel=True, cache=True, error_model="numpy")
-def _scores_all(one, place, value):
-    for thread in prange(place[7].shape[0]):
-        _scores_at(one)(int64(thread), place, value)
-
-
-scores = partial(_scores_all, _scores_of.address)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -341,17 +317,17 @@ def _copy(values, out):
     out[0], out[1], out[2] = values[0], values[1], values[2]
 
 
-@_search_part
-def _search_of(thread, place, lattice, found):
+@in_parts(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, MATRIX, VECTOR, CUBE)
+def search(thread, arguments):
     """The increments (N, 3) at which score minus ½ εᵀ info ε is highest, within ±`radius` (3,) of the states.
 
-    First on a lattice of `spacing` (3,) from its middle outward, by the nearest cells' values for the beams `few`: those
-    from each on can add `rest` at most, so that most points are given up early. Then, from its best point, along the axes
-    with steps that are halved (G. Grisetti et al. 2007).
+    Arguments are a place, (info, radius, spacing, steps, few, rest) and what is found; parts are threads. First on a
+    lattice of `spacing` (3,) from its middle outward, by the nearest cells' values for the beams `few`: those from each on
+    can add `rest` at most, so that most points are given up early. Then, from its best point, along the axes with steps
+    that are halved (G. Grisetti et al. 2007).
     """
-    state, beams, side, origin, index, pool, stamps, fields, marks = place
-    info, radius, spacing, steps, few, rest = lattice
-    increment, value, hessian = found
+    state, beams, side, origin, index, pool, stamps, fields, marks = arguments[:9]
+    info, radius, spacing, steps, few, rest, increment, value, hessian = arguments[9:]
     border = stamps.shape[2] // 2
     threads = fields.shape[0]
     field, marked, window = fields[thread], marks[thread], np.zeros(2, dtype=np.int64)
@@ -414,12 +390,3 @@ def _search_of(thread, place, lattice, found):
         _copy(best, increment[n])
         value[n] = _second_order(field, window, border, side, base, best, beams, steps, there, gradient, hessian[n])
         _clear(field, marked, border)
-
-
-@njit(void(int64, PLACE, LATTICE, FOUND), parallel=True, cache=True, error_model="numpy")
-def _search_all(one, place, lattice, found):
-    for thread in prange(place[7].shape[0]):
-        _search_at(one)(int64(thread), place, lattice, found)
-
-
-search = partial(_search_all, _search_of.address)

@@ -31,8 +31,8 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import given_rows, linearise_group, refine, refine_alone, update, update_alone
-from rbpf.kernels.signature import run_driver
+from rbpf.kernels.landmarks import given_rows, linearise_group, refine, update
+from rbpf.kernels.signature import BLOCK, run_driver
 from rbpf.lie import Array, LieGroup
 from rbpf.maps.store import Layout, SharedStore
 
@@ -188,7 +188,8 @@ class RowEngine:
 
     def information(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
         """Information of all rows but those of mixtures, about a right perturbation of the states (N, E)."""
-        total = Information.zeros(state.shape[0], self.space.dim)
+        n = state.shape[0]
+        total = Information.zeros(n, self.space.dim)
         total.log_factor += plan.log_factor
         out = total.info, total.vector, total.quad, total.log_det, total.rows
         for batch in plan.batches:
@@ -199,8 +200,8 @@ class RowEngine:
             factor = np.ascontiguousarray(prior.factor)
             for taken in self._for_drivers(batch, group):
                 fused, measured = self._observed(taken, group, state, EVERYTHING)
-                access, pairs = tuple(self.store.access(taken.ids)), state.shape[0] * taken.ids.size
-                run_driver(refine, pairs, fused, access, measured, factor, taken.sizes, out, alone=refine_alone)
+                access, pairs = self.store.access(taken.ids), n * taken.ids.size
+                run_driver(refine, pairs, -(-n // BLOCK), *fused, *access, *measured, factor, taken.sizes, *out)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
@@ -219,7 +220,7 @@ class RowEngine:
         return total
 
     def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        log_density = plan.log_factor.copy()
+        log_density, n = plan.log_factor.copy(), state.shape[0]
         for batch in plan.batches:
             group = groups[batch.group]
             if not self._is_compiled(group):
@@ -229,11 +230,11 @@ class RowEngine:
             for taken in self._for_drivers(batch, group):
                 fused, measured = self._observed(taken, group, state, MAP)
                 access, targets = self.store.rewrite(taken.ids)
-                what = fused, tuple(access), targets, measured, taken.sizes, log_density
-                run_driver(update, state.shape[0] * taken.ids.size, *what, alone=update_alone)
+                what = *fused, *access, *measured, targets, taken.sizes, log_density
+                run_driver(update, n * taken.ids.size, -(-n // BLOCK), *what)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
-        after_sampling = np.zeros(state.shape[0])
+        after_sampling = np.zeros(n)
         for row in plan.mixtures:
             after_sampling += self._correct_mixture(row, groups[row.group], state)
         return LogDensities(log_density + after_sampling, after_sampling)

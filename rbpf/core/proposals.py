@@ -16,8 +16,8 @@ import numpy as np
 from rbpf.arrays import numbers
 from rbpf.core.models import LineariseAt, Proposal
 from rbpf.core.particles import Information, Prior, Proposed
-from rbpf.kernels.dense import refine, refine_alone
-from rbpf.kernels.signature import run_driver
+from rbpf.kernels.dense import refine
+from rbpf.kernels.signature import BLOCK, run_driver
 from rbpf.ranges import Count, NotNegative, Ranged
 
 
@@ -75,7 +75,7 @@ def refined(prior: Prior, information: Information) -> Proposed:
     mean, root, squared, log_det = np.empty((n, rank)), np.empty((n, rank, rank)), np.empty(n), np.empty(n)
     # With M = C Cᵀ the covariance of u is C⁻ᵀC⁻¹, and its mean C⁻ᵀ of C⁻¹Lᵀη. What a model spoils makes the weight NaN.
     given = (numbers(each, "information") for each in (information.info, information.vector, prior.factor))
-    run_driver(refine, n * rank, *given, mean, root, squared, log_det, alone=refine_alone)
+    run_driver(refine, n * rank, -(-n // BLOCK), *given, mean, root, squared, log_det)
     nis = information.quad - squared
     log_w1 = information.log_factor - 0.5 * (nis + information.log_det + log_det)
     for other in information.otherwise:

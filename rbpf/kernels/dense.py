@@ -1,12 +1,11 @@
 """Linear algebra: Cholesky's factor of a small matrix, what is solved by it, products, and what stays symmetric."""
 
 import math
-from functools import partial
 
 import numpy as np
-from numba import float64, int64, njit, prange, void
+from numba import float64, int64, njit, void
 
-from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR, part_of
+from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR, in_parts
 
 
 @njit(cache=True, error_model="numpy")
@@ -133,17 +132,14 @@ def comb(weights, offset, ancestors):
     ancestors[tooth:] = last
 
 
-_REFINE = CUBE, MATRIX, CUBE, MATRIX, CUBE, VECTOR, VECTOR
-_refine_at, _refine_part = part_of(*_REFINE)
-
-
-@_refine_part
-def _refine_block(block, info, vector, root_prior, mean, root, squared, log_det):
+@in_parts(CUBE, MATRIX, CUBE, MATRIX, CUBE, VECTOR, VECTOR)
+def refine(block, arguments):
     """Fills mean (N, r) and root (N, r, r) of u, |C⁻¹Lᵀη|² and log |M| (N,), see `rbpf.core.proposals`.
 
     Of N particles with Λ (N, d, d) and η (N, d), and L (N or 1, d, r). Where M is not definite, all of these are NaN.
-    The innermost loops run along a block of particles.
+    Parts are blocks of particles, along which the innermost loops run.
     """
+    info, vector, root_prior, mean, root, squared, log_det = arguments
     dim, rank = root_prior.shape[1], root_prior.shape[2]
     spread, half = np.empty((dim, rank, BLOCK)), np.empty((rank, BLOCK))
     chol, inverse = np.empty((rank, rank, BLOCK)), np.empty((rank, rank, BLOCK))
@@ -212,22 +208,6 @@ def _refine_block(block, info, vector, root_prior, mean, root, squared, log_det)
             log_det[start + i] += 2.0 * math.log(chol[r, r, i])
             for c in range(rank):
                 root[start + i, r, c] = inverse[r, c, i]
-
-
-@njit(void(int64, *_REFINE), parallel=True, cache=True, error_model="numpy")
-def _refine_blocks(one, info, vector, root_prior, mean, root, squared, log_det):
-    for block in prange((len(info) + BLOCK - 1) // BLOCK):
-        _refine_at(one)(int64(block), info, vector, root_prior, mean, root, squared, log_det)
-
-
-@njit(void(int64, *_REFINE), cache=True, error_model="numpy")
-def _refine_in_turn(one, info, vector, root_prior, mean, root, squared, log_det):
-    for block in range((len(info) + BLOCK - 1) // BLOCK):
-        _refine_at(one)(block, info, vector, root_prior, mean, root, squared, log_det)
-
-
-refine = partial(_refine_blocks, _refine_block.address)
-refine_alone = partial(_refine_in_turn, _refine_block.address)
 
 
 @njit(void(CUBE, MATRIX, CUBE, MATRIX, VECTOR), cache=True, error_model="numpy")

@@ -5,10 +5,9 @@ compiled once for all models.
 """
 
 import math
-from functools import partial
 
 import numpy as np
-from numba import int64, njit, prange, types, void
+from numba import int64, njit, types, void
 
 from rbpf.kernels import block as lanes
 from rbpf.kernels.block import packed
@@ -24,40 +23,36 @@ from rbpf.kernels.signature import (
     MASK,
     MATRIX,
     VECTOR,
+    in_parts,
     kernel_at,
     observation_kernel,
-    part_of,
 )
 
 #: Types of `fused` = (address, params, state), `records` = (pool, slabs, which, maps), and
 #: `observed` = (z, noise, mask, kernel_id, kernel_params), see `refine`.
-FUSED = types.Tuple((int64, VECTOR, MATRIX))
-RECORDS = types.Tuple((CUBE, INDICES, INDICES, INDEX_MATRIX))
-OBSERVED = types.Tuple((MATRIX, CUBE, MASK, int64, VECTOR))
-_REFINE = FUSED, RECORDS, OBSERVED, CUBE, INDICES, types.Tuple((CUBE, MATRIX, VECTOR, VECTOR, VECTOR))
-_UPDATE = FUSED, RECORDS, INDICES, OBSERVED, INDICES, VECTOR
+FUSED = int64, VECTOR, MATRIX
+RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
+OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
 #: Types of (address, params, state, mean, columns, clones, origins), see `linearise_group`.
 _GROUP = int64, VECTOR, MATRIX, MATRIX, INDEX_MATRIX, INDEX_MATRIX, MATRIX
-_PROJECT = void(FUSED, RECORDS, int64, VECTOR, CUBE, INDICES, MATRIX, CUBE)
-
-_refine_at, _refine_part = part_of(*_REFINE)
+_PROJECT = void(types.Tuple(FUSED), types.Tuple(RECORDS), int64, VECTOR, CUBE, INDICES, MATRIX, CUBE)
 
 
-@_refine_part
-def _refine_block(block, fused, records, observed, factor, sizes, sums):
+@in_parts(*FUSED, *RECORDS, *OBSERVED, CUBE, INDICES, CUBE, MATRIX, VECTOR, VECTOR, VECTOR)
+def refine(block, arguments):
     """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
 
-    The last of `sums`, `rows` (N,), counts the scalar measurements that entered.
+    Parts are blocks of particles. `rows` (N,) counts the scalar measurements that entered.
 
     `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
     `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
     saw it; `kernel_id` and `kernel_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
     `sizes` = (d, D, A).
     """
-    address, params, state = fused
-    pool, slabs, which, maps = records
-    z, noise, mask, kernel_id, kernel_params = observed
-    info, vector, quad, log_det, rows = sums
+    address, params, state = arguments[:3]
+    pool, slabs, which, maps = arguments[3:7]
+    z, noise, mask, kernel_id, kernel_params = arguments[7:12]
+    factor, sizes, info, vector, quad, log_det, rows = arguments[12:]
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
@@ -111,22 +106,6 @@ def _refine_block(block, fused, records, observed, factor, sizes, sums):
                 info[start + i, a, b] -= sum_info[packed(a, b), i]
 
 
-@njit(void(int64, *_REFINE), parallel=True, cache=True, error_model="numpy")
-def _refine_blocks(one, fused, records, observed, factor, sizes, sums):
-    for block in prange((fused[2].shape[0] + BLOCK - 1) // BLOCK):
-        _refine_at(one)(int64(block), fused, records, observed, factor, sizes, sums)
-
-
-@njit(void(int64, *_REFINE), cache=True, error_model="numpy")
-def _refine_in_turn(one, fused, records, observed, factor, sizes, sums):
-    for block in range((fused[2].shape[0] + BLOCK - 1) // BLOCK):
-        _refine_at(one)(block, fused, records, observed, factor, sizes, sums)
-
-
-refine = partial(_refine_blocks, _refine_block.address)
-refine_alone = partial(_refine_in_turn, _refine_block.address)
-
-
 @njit(cache=True, error_model="numpy")
 def _store_record(pool, slab, source, rows, start, count, mean, cov):
     """Writes a record; the fields behind mean and covariance follow their particle."""
@@ -143,20 +122,18 @@ def _store_record(pool, slab, source, rows, start, count, mean, cov):
                 pool[slab, f, start + i] = pool[source, f, rows[start + i]]
 
 
-_update_at, _update_part = part_of(*_UPDATE)
-
-
-@_update_part
-def _update_block(block, fused, records, targets, observed, sizes, log_density):
+@in_parts(*FUSED, *RECORDS, *OBSERVED, INDICES, INDICES, VECTOR)
+def update(block, arguments):
     """Adds Σ log p(z | x) to `log_density` (N,) and writes the updated landmarks to the slabs `targets`.
 
     Given the sampled pose, each landmark is an independent EKF: with S = J P Jᵀ + R = L Lᵀ, A = L⁻¹ J P and
     y = L⁻¹ν the update is m += Aᵀy, P −= AᵀA. Arguments as in `refine`; particle i reads row `maps[...][i]` of the
     slab it inherits and writes row i of the target, so that descendants of one parent never share what they write.
     """
-    address, params, state = fused
-    pool, slabs, which, maps = records
-    z, noise, mask, kernel_id, kernel_params = observed
+    address, params, state = arguments[:3]
+    pool, slabs, which, maps = arguments[3:7]
+    z, noise, mask, kernel_id, kernel_params = arguments[7:12]
+    targets, sizes, log_density = arguments[12:]
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
@@ -215,22 +192,6 @@ def _update_block(block, fused, records, targets, observed, sizes, log_density):
         if kernel_id == 0:
             sum_log[i] -= 0.5 * (squared[i] + used[i] * p * math.log(2.0 * math.pi))
         log_density[start + i] += sum_log[i]
-
-
-@njit(void(int64, *_UPDATE), parallel=True, cache=True, error_model="numpy")
-def _update_blocks(one, fused, records, targets, observed, sizes, log_density):
-    for block in prange((fused[2].shape[0] + BLOCK - 1) // BLOCK):
-        _update_at(one)(int64(block), fused, records, targets, observed, sizes, log_density)
-
-
-@njit(void(int64, *_UPDATE), cache=True, error_model="numpy")
-def _update_in_turn(one, fused, records, targets, observed, sizes, log_density):
-    for block in range((fused[2].shape[0] + BLOCK - 1) // BLOCK):
-        _update_at(one)(block, fused, records, targets, observed, sizes, log_density)
-
-
-update = partial(_update_blocks, _update_block.address)
-update_alone = partial(_update_in_turn, _update_block.address)
 
 
 @observation_kernel

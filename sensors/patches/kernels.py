@@ -6,13 +6,12 @@ not the template's: the noise of both then comes out smaller than with gradients
 """
 
 import math
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numba import float32, float64, int64, njit, prange, types, uint8, void
+from numba import float32, float64, njit, types, uint8, void
 
-from rbpf.kernels.signature import MATRIX, READ_ONLY, discard_stale, part_of
+from rbpf.kernels.signature import MATRIX, READ_ONLY, discard_stale, in_parts
 
 discard_stale(Path(__file__).parent)
 
@@ -424,17 +423,15 @@ def second(scores, row, column):
     return v, u
 
 
-#: Types of (image, templates, centres, covs, limits, places), see `_search_one`.
-_SEARCH = IMAGE, _TEMPLATES, READ_ONLY, _READ_ONLY_CUBE, types.UniTuple(float64, 3), MATRIX
-_search_at, _search_part = part_of(*_SEARCH)
-
-
-@_search_part
-def _search_one(k, image, templates, centres, covs, limits, places):
+@in_parts(IMAGE, _TEMPLATES, READ_ONLY, _READ_ONLY_CUBE, float64, float64, float64, MATRIX)
+def search_all(k, arguments):
     """Fills places (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv, of one template in one ellipse each.
 
-    limits = (sigmas, most_px, least_std). What was not found keeps what the caller put there.
+    Arguments are (image, templates, centres, covs, sigmas, most_px, least_std, places); parts are templates. What was not
+    found keeps what the caller put there.
     """
+    image, templates, centres, covs, sigmas, most, least_std, places = arguments
+    limits = sigmas, most, least_std
     template, centre, cov, found = templates[k], centres[k], covs[k], places[k]
     unit = normalised(template, limits[2])
     if unit.shape[0] == 0:
@@ -460,12 +457,3 @@ def _search_one(k, image, templates, centres, covs, limits, places):
             other[3] = found[2]
             for i in range(found.shape[0]):
                 found[i] = other[i]
-
-
-@njit(void(int64, *_SEARCH), cache=True, error_model="numpy", parallel=True)
-def _search_all(one, image, templates, centres, covs, limits, places):
-    for k in prange(templates.shape[0]):
-        _search_at(one)(int64(k), image, templates, centres, covs, limits, places)
-
-
-search_all = partial(_search_all, _search_one.address)

@@ -132,7 +132,7 @@ def search(
     sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])
     products = float(sides.prod(axis=1).sum()) * templates.shape[1] ** 2
     pairs = int(products * PAIRS_PER_PRODUCT + count * PAIRS_PER_TEMPLATE)
-    run_driver(search_all, pairs, image, templates, centres, covs, limits, found)
+    run_driver(search_all, pairs, count, image, templates, centres, covs, *limits, found)
     return PatchMatches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
 
 

@@ -84,7 +84,7 @@ def test_a_refined_gaussian_is_numpys(rank, shared, rng):
     """One that a model has spoilt is NaN, the others are as they are."""
     info, vector, root = covariances(rng, 4, 6), rng.normal(size=(4, 6)), rng.normal(size=(shared, 6, rank))
     mean, half, squared, log_det = np.empty((4, rank)), np.empty((4, rank, rank)), np.empty(4), np.empty(4)
-    dense.refine(info, vector, root, mean, half, squared, log_det)
+    dense.refine(1, info, vector, root, mean, half, squared, log_det)
     turned = np.swapaxes(root, 1, 2)
     inside, ahead = np.eye(rank) + turned @ info @ root, turned @ vector[..., None]
     np.testing.assert_allclose(mean, np.linalg.solve(inside, ahead)[..., 0], rtol=1e-9, atol=1e-12)
@@ -94,7 +94,7 @@ def test_a_refined_gaussian_is_numpys(rank, shared, rng):
     np.testing.assert_allclose(log_det, np.linalg.slogdet(inside)[1], rtol=1e-9, atol=1e-12)
     if rank:
         info[1] = np.nan
-        dense.refine(info, vector, root, mean, half, squared, log_det)
+        dense.refine(1, info, vector, root, mean, half, squared, log_det)
         np.testing.assert_array_equal(np.isnan(log_det), [False, True, False, False])
 
 
