@@ -111,6 +111,10 @@ def test_innovations_alone_never_say_cautious():
     assert told.trust == "trust" and "noise is stated too large: innovations: " in told.reason
     far = variance_ratio("landmarks", 6.0, 3.0, 2.0)  # it may be far off
     assert judge([good, far], ["poses", "landmarks"]).trust == "cannot tell"
+    # The batch has the run's calibration: only innovations that are not too large vouch for that.
+    for more, trust in (([], "cannot tell"), ([0.8], "trust"), ([1.5], "cannot tell")):
+        own = [variance_ratio(INNOVATIONS, value, 5.0, 1.1) for value in more]
+        assert judge([good, *own], ["poses"]).trust == trust
     large = variance_ratio("innovations", 4.0, 5000.0, 1.1)
     assert judge([large, good], ["poses"], truth=["poses"]).leaning == "over-confident"
 

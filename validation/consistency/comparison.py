@@ -126,16 +126,10 @@ def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     """One sentence where a robot's odometry errs alike in all steps, and the run has not learnt what its wheels get wrong."""
     biased = any(s.name == BIAS_OF_MOTION and s.outcome == "contradicts" for s in statistics)
     more = {"off": "odometry", "sensor": "online"}.get(str(record.config.get("calibrate")))
-    if (
-        not biased
-        or more is None
-        or record.config.get("association") != "known"
-        or record.summary.get("map") != "joint"
-    ):
+    able = record.config.get("association") == "known" and record.summary.get("map") == "joint"
+    if not biased or more is None or not able:
         return ""
-    return (
-        f"The odometry errs alike in all steps: in the plane --set calibrate={more} learns what the wheels get wrong."
-    )
+    return f"The odometry errs alike in all steps: in the plane --set calibrate={more} learns what wheels get wrong."
 
 
 Trust = Literal["trust", "do not trust", "cannot tell"]
@@ -238,10 +232,18 @@ def judge(
         reason = f"{described(worst)}{more}; the noise is not the stated one, and to which side the poses err "
         return Verdict(path, "do not trust", f"{reason}innovations do not tell")
     doubtful = [s for s in judging if s.kind == "ratio" and s.samples >= 1.0 and not s.zone[0] <= s.value <= s.zone[1]]
-    if support and not doubtful:
+    # The batch posterior has the run's noise and calibration: without the truth no innovation may look larger than these say.
+    noise = [s for s in statistics if s.name in (INNOVATIONS, RESIDUALS)]
+    doubtful += [s for s in noise if not told and s.samples >= 1.0 and s.value > s.zone[1]]
+    if support and not doubtful and (told or noise):
         but = f"; but noise is stated too large: {described(max(against, key=_distance))}" if against else ""
         return Verdict(path, "trust", described((told or support)[0]) + but)
-    if judging:
+    if support and not doubtful:
+        reason = (
+            f"{described(support[0])}, but the batch optimum has the run's own calibration and noise, and no innovation "
+            "tells whether these are right; compare it with the truth"
+        )
+    elif judging:
         first = (doubtful or judging)[0]
         zone = first.zone if first.kind != "ratio" else tuple(map(_root, first.zone))
         reason = (
