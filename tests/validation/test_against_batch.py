@@ -70,8 +70,11 @@ def test_a_posterior_that_is_not_gaussian_is_no_witness(folder, monkeypatch):
     assert found.figures["posterior_draws_ess"] > 0.99 * DRAWS and "no witness" not in found.accuracy
     monkeypatch.setattr(against_batch, "LEAST_COUNT", 1.1)
     found, _ = compare_with_batch(RunFolder.open(folder))
-    assert not {POSES, LANDMARKS} & {statistic.name for statistic in found.statistics}
+    assert [statistic.name for statistic in found.statistics] == ["residuals of the batch optimum"]
     assert "so that it is no witness of the uncertainty." in found.accuracy
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("likelihood:\n  kind: null", "likelihood:\n  kind: outliers"))
+    assert compare_with_batch(RunFolder.open(folder))[0].statistics == []  # nor the sum of all squares of its noise
 
 
 def test_a_folder_tells_the_same_as_the_run(linear_run, folder):

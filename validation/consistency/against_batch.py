@@ -159,15 +159,17 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
     if not isinstance(problem, FeatureLog):
         residuals = problem.z.size - found.optimum.estimate.landmarks.mean.size
         figures["batch_error_right"] = 0.5 * residuals
-        if residuals > 0:
+        # Squares of what the run takes for outliers say nothing about the noise of the rest.
+        likelihood = record.config.get("likelihood")
+        if residuals > 0 and not (isinstance(likelihood, dict) and likelihood.get("kind") == "outliers"):
             value = 2.0 * found.optimum.error / residuals
             statistics.insert(0, variance_ratio(RESIDUALS, value, residuals, NOISE_FACTOR))
         batch = found.optimum.estimate
         start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
         draws = draw_posterior(problem, start, np.random.default_rng(0), DRAWS)
         names = "log_evidence_batch", "log_evidence_batch_error", "posterior_draws_ess"
-        weighed = zip(names, (draws.log_evidence, draws.error, draws.ess), strict=True)
-        figures |= {name: value for name, value in weighed if np.isfinite(value)}
+        values = draws.log_evidence, draws.error, draws.ess
+        figures |= {name: value for name, value in zip(names, values, strict=True) if np.isfinite(value)}
         if not draws.ess >= LEAST_COUNT * DRAWS:
             statistics = [s for s in statistics if s.name not in (POSES, LANDMARKS)]
             said = (
