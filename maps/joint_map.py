@@ -56,6 +56,7 @@ from rbpf.maps.joint.rows import (
     plus_gram,
     spread_of,
     turned,
+    with_tails,
 )
 from rbpf.maps.joint.solution import Constants, Given, SubMap, exchanged, moved
 from rbpf.maps.joint.submaps import SubMaps
@@ -82,8 +83,8 @@ class JointMap(Map):
     It takes points, what is anchored at a pose, and any `Landmark` that overrides `seen_from`.
     The motion, and what is observed of landmarks, must not change when the whole world is moved, as it is with odometry and
     sensors on the robot. An observation of the state alone, as a position fix, is of its pose in the world. Landmarks are
-    associated alike in all particles, all observations update state and landmarks, and what a likelihood other than the
-    Gaussian takes for an outlier is one in all particles: it updates nothing, and weighs each by its own innovation.
+    associated alike in all particles, all observations update state and landmarks, and what a likelihood takes for an outlier
+    is one in all particles: it updates nothing, and weighs each by its own innovation.
 
     Args:
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
@@ -223,11 +224,12 @@ class JointMap(Map):
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
     def decided(self, groups: Sequence[Observations], belief: Belief) -> Sequence[Observations]:
-        """Which observations are outliers: the most probable choice, given all particles, Mathematics (joint-outliers)."""
+        """How noisy observations with heavy tails are, Mathematics (joint-tails), and which are outliers (joint-outliers)."""
+        if any(group.likelihood is not None and np.isfinite(group.likelihood.dof) for group in groups):
+            groups = with_tails(groups, *self._foreseen(groups, belief))
         if all(group.likelihood is None or group.likelihood.kernel_id == 0 for group in groups):
             return groups
-        nu, cov, parts = self._foreseen(groups, belief)
-        chosen = iter(log_odds_of(nu, cov, parts))
+        chosen = iter(log_odds_of(*self._foreseen(groups, belief)))
         decided = []
         for group in groups:
             log_odds = np.full(len(group.z), np.inf)

@@ -4,10 +4,12 @@ Observations of one Gaussian are judged together, once for all particles, Mathem
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrsm
+from scipy.special import digamma, gammaln
 
 from rbpf import gaussian
 from rbpf.arrays import numbers
@@ -29,6 +31,8 @@ WIDE = 3.0
 LINEARISATIONS = 3
 SETTLED = 0.1
 """Of what is learnt alone, at most so often and until its mean moves by less than this many standard deviations."""
+ROUNDS, SAME = 10, 0.01
+"""In which the noise of each measurement is learnt, at most and until none changes by more than this fraction."""
 IN_WORLD = frozenset({Part.STATE})
 """What a model reads that measures the pose in the world."""
 
@@ -151,6 +155,7 @@ class Reading:
         read, noises, first = list[np.ndarray](), list[np.ndarray](), 0
         for group in groups:
             ids, kind, reads = checked_ids(group), None, group.model.reads
+            self._log_factor += group.log_factor
             seen = np.arange(len(group.z)) if ids is None else np.flatnonzero(ids >= 0)
             at = [np.zeros((seen.size, 0), dtype=np.int64)]
             if ids is not None:
@@ -334,6 +339,65 @@ def log_det(diagonal: np.ndarray) -> float:
 def diagonal_blocks(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The blocks (K, p, p) on the diagonal that belong to rows and columns (K, p)."""
     return matrix[rows[:, :, None], rows[:, None, :]]
+
+
+def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: list[Group]) -> list[Observations]:
+    """The groups, measurements with the noise R / λ in place of R where that is Student's t, Mathematics (joint-tails).
+
+    Of λ ~ Γ(ν/2, ν/2) it is the mean, given all such measurements (variational Bayes: R. Piché, S. Särkkä and J. Hartikainen
+    2012), and `log_factor` makes of their log-density a bound of what it is under the distribution of λ.
+
+    Args:
+        groups: of a step.
+        nu: (R,) mean of the innovations under all particles.
+        cov: (R, R) their covariance.
+        parts: whose rows they are.
+    """
+    heavy = [
+        at for at, group in enumerate(groups) if group.likelihood is not None and np.isfinite(group.likelihood.dof)
+    ]
+    of_heavy = np.concatenate([parts[at].rows.ravel() for at in heavy])
+    place = np.zeros(len(nu), dtype=np.int64)
+    place[of_heavy] = np.arange(of_heavy.size)
+    nu, cov = nu[of_heavy], cov[np.ix_(of_heavy, of_heavy)]
+    taken = {
+        at: np.ones(len(group.z), bool) if group.ids is None else group.ids >= 0 for at, group in enumerate(groups)
+    }
+    scales = {at: np.ones(len(parts[at].rows)) for at in heavy}
+    for _ in range(ROUNDS):
+        inverse, settled = np.linalg.inv(cov), True
+        solved = inverse @ nu
+        for at in heavy:
+            # Of the noise given all measurements, mean R S⁻¹ν and covariance R − R (S⁻¹) R; then by how much it is stated.
+            own, stated, dof = place[parts[at].rows], groups[at].cov[taken[at]], parts[at].likelihood.dof
+            now, p = stated / scales[at][:, None, None], own.shape[1]
+            mean = (now @ solved[own][..., None])[..., 0]
+            second = mean[:, :, None] * mean[:, None] + now - now @ diagonal_blocks(inverse, own) @ now
+            scale = (dof + p) / (dof + np.einsum("kab,kba->k", np.linalg.inv(stated), second))
+            cov[own[:, :, None], own[:, None]] += stated / scale[:, None, None] - now
+            settled &= bool((np.abs(scale - scales[at]) <= SAME * scale).all())
+            scales[at] = scale
+        if settled:
+            break
+    found = list(groups)
+    for at, scale in scales.items():
+        noise = groups[at].cov.copy()
+        noise[taken[at]] /= scale[:, None, None]
+        bound = groups[at].log_factor + _bound_of(scale, parts[at].likelihood.dof, noise.shape[-1])
+        found[at] = replace(groups[at], cov=noise, likelihood=None, log_factor=bound)
+    return found
+
+
+def _bound_of(scale: np.ndarray, dof: float, p: int) -> float:
+    """What the bound has beside the log-density of K measurements of p numbers with means λ (K,), at most 0.
+
+    E log λ in place of log E λ, half of it for each number, and how far what is known of λ is from its prior.
+    """
+    prior, shape = 0.5 * dof, 0.5 * (dof + p)
+    rate = shape / scale
+    apart = (shape - prior) * digamma(shape) - gammaln(shape) + gammaln(prior)
+    apart += prior * np.log(rate / prior) + shape * (prior / rate - 1.0)
+    return float((0.5 * p * (digamma(shape) - np.log(shape)) - apart).sum())
 
 
 def log_odds_of(nu: np.ndarray, cov: np.ndarray, groups: list[Group]) -> list[np.ndarray]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
+from scipy.special import gammaln
 
 from rbpf import gaussian
 from rbpf.core.models import NEW, NULL, Likelihood
@@ -114,6 +115,29 @@ class GaussianWithOutliers(Likelihood):
 
     def log_outlier(self) -> float:
         return float(self.params[1])
+
+
+@final
+class StudentT(Likelihood):
+    """Multivariate t with the scale matrix S: a Gaussian whose covariance is uncertain, so that what is far off says less.
+
+    In a joint map it is the measurement's noise that is so, and each observation updates by what is learnt of its own,
+    Mathematics (joint-tails). In maps of the particles' own it weighs, and the update is Kalman's with S.
+
+    Args:
+        dof: degrees of freedom; infinitely many are a Gaussian.
+    """
+
+    def __init__(self, dof: float = 4.0) -> None:
+        if not 0.0 < dof < np.inf:
+            raise InputError(f"Student's t needs degrees of freedom above 0 and finite, got {dof}")
+        self.dof = dof
+
+    def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+        chol, half = gaussian.cholesky(cov), 0.5 * (self.dof + nu.shape[-1])
+        squared = np.square(gaussian.solve_lower(chol, nu)).sum(axis=-1)
+        scale = gaussian.log_det(chol) + nu.shape[-1] * np.log(self.dof * np.pi)
+        return gammaln(half) - gammaln(0.5 * self.dof) - 0.5 * scale - half * np.log1p(squared / self.dof)
 
 
 def squared_mahalanobis(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:

@@ -131,6 +131,7 @@ class Observations:
     #: log-odds (K,) that each is an inlier, where what is marginalised decides so once for all particles
     #: (`Conditional.decided`); None leaves it to the likelihood in every particle.
     log_odds: Float[np.ndarray, " K"] | None = None
+    log_factor: float = 0.0  #: added to their log-density, for what has been decided about them.
     #: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share a
     #: measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     updates: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
@@ -363,6 +364,8 @@ class Likelihood(ABC):
     normalised: bool = True
     #: Whether some observations are taken for outliers, as of another thing than they are said to be of.
     rejects: bool = False
+    #: Degrees of freedom of measurement noise that is Student's t: a joint map learns the noise of each observation.
+    dof: float = np.inf
     kernel_id: int = -1  #: Number of the compiled twin in `rbpf.kernels.gate`, called with `params`; −1 has none.
     params: np.ndarray = np.zeros(1)
 

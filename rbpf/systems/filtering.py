@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, StudentT, TruncatedMahalanobis
 from rbpf.core.models import Likelihood, Proposal, Resampler
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
@@ -16,21 +16,22 @@ from rbpf.ranges import Count, Fraction, Positive, Probability, Range, Ranged, S
 class LikelihoodConfig(Ranged):
     """Likelihood of an innovation."""
 
-    #: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers; by default the system's.
-    kind: Literal["gaussian", "truncated", "outliers"] | None = None
+    #: Gaussian, truncated Mahalanobis (S05 (6)), Gaussian with outliers, or Student's t; by default the system's.
+    kind: Literal["gaussian", "truncated", "outliers", "student"] | None = None
     truncation: Positive = 4.0  #: T_l of the truncated form, which bounds the weight.
     #: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated either; 16.3 holds
     #: 99.9 % of a Gaussian in three dimensions.
     update_limit: Positive = 16.3
     outlier_rate: Probability = 0.02  #: ε.
     outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0  #: V, of the measurement space, in its units.
+    dof: Positive = 4.0  #: of Student's t: the fewer degrees of freedom, the more often a measurement is far off.
 
     def build(self) -> Likelihood:
         if self.kind == "truncated":
             return TruncatedMahalanobis(self.truncation, max(self.update_limit, self.truncation))
         if self.kind == "outliers":
             return GaussianWithOutliers(self.outlier_rate, self.outlier_volume)
-        return Gaussian()
+        return StudentT(self.dof) if self.kind == "student" else Gaussian()
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 
 from rbpf import gaussian
 from rbpf.conformance import Example, check_model
-from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis, squared_mahalanobis
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, StudentT, TruncatedMahalanobis, squared_mahalanobis
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import (
     FusedKernel,
@@ -36,7 +36,7 @@ from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from tests.core.scripted import Polar, says
 from tests.core.worlds import Recipe, drive, planar_world
-from tests.exactness.models import Frame, Scripted, StudentT
+from tests.exactness.models import Frame, Scripted
 from tests.sensors.camera_scenes import CAMERAS
 
 RING = 24

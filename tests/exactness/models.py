@@ -2,16 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from math import lgamma
 from typing import Any, TypeVar
 
 import numpy as np
 
 from rbpf.core.filter import Filter
-from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import (
     Jacobians,
-    Likelihood,
     MotionModel,
     NewLandmarks,
     ObservationModel,
@@ -92,15 +89,6 @@ class Relative(ObservationModel):
 
     def invert(self, state, z):
         return state + z
-
-
-class StudentT(Likelihood):
-    """Two degrees of freedom: heavier tails than any Gaussian, no outliers, and no compiled twin."""
-
-    def log_density(self, nu, cov):
-        p = nu.shape[-1]
-        constant = lgamma(1.0 + 0.5 * p) - 0.5 * (np.linalg.slogdet(cov)[1] + p * np.log(2.0 * np.pi))
-        return constant - (1.0 + 0.5 * p) * np.log1p(0.5 * squared_mahalanobis(nu, cov))
 
 
 @dataclass(frozen=True)

@@ -8,22 +8,24 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from scipy.special import logsumexp
+from scipy.stats import gamma, norm
 
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
-from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, StudentT, TruncatedMahalanobis
 from rbpf.core.models import Belief, Likelihood, NewLandmarks, Observations, Part, Records
 from rbpf.core.particles import Particles, Prior, balanced, uniform_log_weights
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.maps.joint.rows import Group, with_tails
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
-from tests.exactness.models import Frame, Kalman, LinearObservation, Relative, Scripted, StudentT
+from tests.exactness.models import Frame, Kalman, LinearObservation, Relative, Scripted
 from tests.exactness.slam import ALONG, DRIFTING, NOISE, TURNED, LinearSlam, Walk, turned, velocity, walked
 
 EVERY_STEP = (Consolidation(window=1), Consolidation(window=9, threshold=1.0))
@@ -362,6 +364,10 @@ def summed(joint: JointMap, state: np.ndarray, group: Observations) -> np.ndarra
     return logsumexp(terms, axis=0)
 
 
+OWN = Gaussian()
+OWN.kernel_id = -1  # as a user's, which has no compiled twin
+
+
 def corrected(group: Observations) -> tuple[np.ndarray, np.ndarray, JointMap]:
     """Log-odds, log p(z | x) and the map after the update."""
     joint, state = six_held()
@@ -377,17 +383,49 @@ def test_every_particle_is_weighed_by_the_sum_over_all_choices():
     np.testing.assert_allclose(density, summed(*six_held(), SOME), atol=1e-3)
 
 
-def test_the_order_of_the_rows_and_groups_does_not_matter():
-    log_odds, density, joint = corrected(SOME)
+@pytest.mark.parametrize("likelihood", [OUTLIERS, StudentT()], ids=["outliers", "tails"])
+def test_the_order_of_the_rows_and_groups_does_not_matter(likelihood):
+    group = replace(SOME, likelihood=likelihood)
+    log_odds, density, joint = corrected(group)
     order = np.array([5, 3, 0, 4, 2, 1])
-    other = corrected(replace(SOME, z=SOME.z[order], ids=SOME.ids[order]))
-    np.testing.assert_allclose(other[0], log_odds[order], rtol=1e-9)
+    other = corrected(replace(group, z=SOME.z[order], ids=SOME.ids[order]))
+    if log_odds is not None:
+        np.testing.assert_allclose(other[0], log_odds[order], rtol=1e-9)
     np.testing.assert_allclose(other[1], density, rtol=1e-9)
     np.testing.assert_allclose(other[2].mean, joint.mean, atol=1e-12)
-    parts = [replace(SOME, z=SOME.z[rows], cov=SOME.cov[rows], ids=SOME.ids[rows]) for rows in ([3, 1], [0, 2, 4, 5])]
+    parts = [replace(group, z=SOME.z[rows], cov=SOME.cov[rows], ids=SOME.ids[rows]) for rows in ([3, 1], [0, 2, 4, 5])]
     held_, state = six_held()
     decided = held_.decided(parts, belief(held_, state))
     np.testing.assert_allclose(held_.correct(state, np.zeros_like(state), decided).all, density, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("dof", "within"), [(1.5, 0.07), (4.0, 0.04), (20.0, 0.025)])
+@pytest.mark.parametrize(("known", "error"), [(0.1, 0.0), (0.1, 2.0), (0.1, 6.0), (1.0, 0.3)])
+def test_heavy_tails_are_a_noise_of_each_measurement(dof, within, known, error):
+    """Beside the integral over λ: its mean, and a bound of the density, for one reading of a landmark known to `known`."""
+    group = Observations(np.zeros((1, 1)), np.ones((1, 1, 1)), LinearObservation([[1.0]]), StudentT(dof))
+    part = Group(group.likelihood, np.array([[0]]), np.array([np.inf]), None)
+    [found] = with_tails([group], np.array([error]), np.array([[known + 1.0]]), [part])
+    log_scale, step = np.linspace(-12.0, 5.0, 20_001, retstep=True)
+    scale = np.exp(log_scale)
+    density = (
+        norm.pdf(error, 0.0, np.sqrt(known + 1.0 / scale)) * gamma.pdf(scale, dof / 2.0, scale=2.0 / dof) * scale * step
+    )
+    assert 1.0 / found.cov[0, 0, 0] == pytest.approx((density * scale).sum() / density.sum(), rel=within)
+    bound = norm.logpdf(error, 0.0, np.sqrt(known + found.cov[0, 0, 0])) + found.log_factor
+    assert 0.0 < np.log(density.sum()) - bound < within
+
+
+def test_without_tails_they_are_a_gaussian_beside_which_there_may_be_outliers():
+    rows = [0, 2, 4], [3, 1, 5]
+    first, second = [replace(SOME, z=SOME.z[at], cov=SOME.cov[at], ids=SOME.ids[at]) for at in rows]
+    found = []
+    for likelihood in (StudentT(1e9), None):
+        joint, state = six_held()
+        decided = joint.decided([second, replace(first, likelihood=likelihood)], belief(joint, state))
+        found.append((decided[0].log_odds, joint.correct(state, np.zeros_like(state), decided).all, joint.mean))
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-6)
 
 
 @pytest.mark.parametrize("n", [1, 6])
@@ -407,7 +445,7 @@ def test_nothing_but_outliers_updates_nothing(n):
 
 
 @pytest.mark.parametrize(
-    "likelihood", [Gaussian(), OUTLIERS, TruncatedMahalanobis(), TruncatedMahalanobis(4.0, 16.0), StudentT()]
+    "likelihood", [Gaussian(), OUTLIERS, TruncatedMahalanobis(), TruncatedMahalanobis(4.0, 16.0), OWN]
 )
 def test_landmarks_that_are_independent_weigh_as_in_a_map_of_the_particles_own(likelihood):
     joint, state = six_held(correlated=False)

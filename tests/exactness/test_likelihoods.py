@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 
 from rbpf.core.filter import Filter
-from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, StudentT, TruncatedMahalanobis
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import ObservationModel, Observations, Records
 from rbpf.core.proposals import EkfProposal, PriorProposal, refined
@@ -30,6 +31,14 @@ def test_truncated_mahalanobis_is_s05_equation_6(p, rng):
     np.testing.assert_array_equal(TRUNCATED.inlier(nu, cov), squared < 4.0)
     assert TRUNCATED.log_outlier() == -2.0
     np.testing.assert_allclose(TRUNCATED.log_density(1000.0 * nu, 1e6 * cov), expected, rtol=1e-9)
+
+
+def test_students_t_is_the_usual_one(rng):
+    nu, cov = rng.normal(scale=2.0, size=(5, 3)), random_covs(rng, (), 3, 1.0)
+    expected = multivariate_t(shape=cov, df=2.5).logpdf(nu)
+    np.testing.assert_allclose(StudentT(2.5).log_density(nu, np.tile(cov, (5, 1, 1))), expected, rtol=1e-12)
+    with pytest.raises(InputError, match="degrees of freedom above 0 and finite, got inf"):
+        StudentT(np.inf)
 
 
 def test_what_is_clipped_may_update_all_the_same(rng):

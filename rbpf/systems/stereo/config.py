@@ -155,12 +155,8 @@ class StereoConfig(RunConfig):
 
     @classmethod
     def joint(cls) -> Self:
-        """The defaults that go with a joint map: a likelihood that is a density, and fifty particles."""
-        return cls(
-            particles=50,
-            map=MapConfig(kind="joint"),
-            likelihood=LikelihoodConfig("outliers", outlier_volume=OUTLIER_VOLUME_PX3),
-        )
+        """The defaults that go with a joint map: noise that is far off now and then, and fifty particles."""
+        return cls(particles=50, map=MapConfig(kind="joint"), likelihood=LikelihoodConfig("student"))
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Self:
