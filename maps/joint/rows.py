@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrsm
+from scipy.linalg.lapack import dpotri
 from scipy.special import digamma, gammaln
 
 from rbpf import gaussian
@@ -364,8 +365,10 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
         at: np.ones(len(group.z), bool) if group.ids is None else group.ids >= 0 for at, group in enumerate(groups)
     }
     scales = {at: np.ones(len(parts[at].rows)) for at in heavy}
+    weights = {at: np.linalg.inv(groups[at].cov[taken[at]]) for at in heavy}
     for _ in range(ROUNDS):
-        inverse, settled = np.linalg.inv(cov), True
+        lower, settled = dpotri(np.asfortranarray(gaussian.cholesky(cov)), lower=1)[0], True
+        inverse = lower + np.tril(lower, -1).T
         solved = inverse @ nu
         for at in heavy:
             # Of the noise given all measurements, mean R S⁻¹ν and covariance R − R (S⁻¹) R; then by how much it is stated.
@@ -373,7 +376,7 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
             now, p = stated / scales[at][:, None, None], own.shape[1]
             mean = (now @ solved[own][..., None])[..., 0]
             second = mean[:, :, None] * mean[:, None] + now - now @ diagonal_blocks(inverse, own) @ now
-            scale = (dof + p) / (dof + np.einsum("kab,kba->k", np.linalg.inv(stated), second))
+            scale = (dof + p) / (dof + np.einsum("kab,kba->k", weights[at], second))
             cov[own[:, :, None], own[:, None]] += stated / scale[:, None, None] - now
             settled &= bool((np.abs(scale - scales[at]) <= SAME * scale).all())
             scales[at] = scale
