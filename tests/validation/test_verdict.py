@@ -143,6 +143,8 @@ def test_where_no_setting_holds_it_the_factor_is_told_and_nothing_where_nothing_
     assert noise_advice(record("mono"), innovations(1.0)) == ""
     assert noise_advice(record("mono"), [variance_ratio("poses", 9.0, 500.0, 2.0)]) == ""
     assert noise_advice(record("mono"), []) == ""
+    for kind, value, told in ((None, 36.0, True), (None, 9.0, False), ("outliers", 36.0, False)):
+        assert ("kind=outliers" in noise_advice(record("mono", likelihood={"kind": kind}), innovations(value))) == told
 
 
 def test_odometry_that_errs_alike_in_all_steps_should_be_learnt():

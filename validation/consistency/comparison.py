@@ -96,6 +96,10 @@ def compare_with_itself(record: RunFolder) -> Comparison:
     return Comparison("itself", "", figures, statistics)
 
 
+#: Times that noise is larger than somebody states it, at most; what is farther off is something else.
+MISSTATED = 5.0
+
+
 def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     """One sentence where innovations contradict the stated noise, with the noise that would make them right; else empty.
 
@@ -116,9 +120,14 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     value = settings.get(name) if isinstance(settings, dict) else None
     if isinstance(value, (int, float)) and value > 0:
         how = f"--set {section}.{name}={factor * value:.2g} in place of {value:g}"
+    likelihood, false = record.config.get("likelihood"), ""
+    if factor > MISSTATED and isinstance(likelihood, dict) and likelihood.get("kind") in (None, "gaussian"):
+        false = (
+            " So much is seldom noise: if some measurements are false, --set likelihood.kind=outliers leaves them out."
+        )
     return (
         f"Innovations would be about as large as expected with {how}; judge such a run beside the truth or a batch "
-        "optimum, because errors that repeat from step to step do not show in innovations."
+        f"optimum, because errors that repeat from step to step do not show in innovations.{false}"
     )
 
 
