@@ -6,6 +6,7 @@ from .core.filter import Filter as Filter
 from .core.filter import StepReport as StepReport
 from .core.likelihoods import Gaussian as Gaussian
 from .core.likelihoods import GaussianWithOutliers as GaussianWithOutliers
+from .core.likelihoods import StudentT as StudentT
 from .core.likelihoods import TruncatedMahalanobis as TruncatedMahalanobis
 from .core.marginals import KalmanSubstate as KalmanSubstate
 from .core.models import NEW as NEW
