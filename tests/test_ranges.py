@@ -128,7 +128,7 @@ def test_settings_say_a_thing_once_run_nothing_and_unfold_into_nothing(tmp_path,
         ("submap=few", "settings: submap must be a whole number or nothing, got a word"),
         (
             "likelihood.kind=x",
-            "settings: likelihood.kind must be gaussian or truncated or outliers or nothing, got 'x'",
+            "settings: likelihood.kind must be gaussian or truncated or outliers or student or nothing, got 'x'",
         ),
         ("proposal=ekf", "proposal is a group of settings, of which each is set by itself: proposal.kind, .*"),
     ],
@@ -163,8 +163,8 @@ def test_nothing_given_is_the_default_a_joint_map_of_two_cameras_brings_its_own_
     for kind in (MonoConfig, StereoConfig):
         assert asdict(load_settings(kind, "any", None, [], {})) == asdict(kind())
     joint = load_settings(StereoConfig, "stereo", None, ["map.kind=joint"], {"particles": 20})
-    assert joint == replace(StereoConfig.joint(), particles=20)
-    assert joint.likelihood.outlier_volume == StereoConfig().likelihood.outlier_volume  # for who asks for outliers
+    assert joint == replace(StereoConfig.joint(), particles=20) and joint.likelihood.build().normalised
+    assert joint.likelihood.outlier_volume == StereoConfig().likelihood.outlier_volume
     assert not load_settings(StereoConfig, "stereo", None, ["map.window=3"], {}).likelihood.build().normalised
 
 

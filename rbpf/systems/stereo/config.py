@@ -156,7 +156,11 @@ class StereoConfig(RunConfig):
     @classmethod
     def joint(cls) -> Self:
         """The defaults that go with a joint map: noise that is far off now and then, and fifty particles."""
-        return cls(particles=50, map=MapConfig(kind="joint"), likelihood=LikelihoodConfig("student"))
+        return cls(
+            particles=50,
+            map=MapConfig(kind="joint"),
+            likelihood=LikelihoodConfig("student", outlier_volume=OUTLIER_VOLUME_PX3),
+        )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Self:
