@@ -366,7 +366,7 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
     }
     scales = {at: np.ones(len(parts[at].rows)) for at in heavy}
     weights = {at: np.linalg.inv(groups[at].cov[taken[at]]) for at in heavy}
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if of_heavy.size else 0):
         lower, settled = dpotri(np.asfortranarray(gaussian.cholesky(cov)), lower=1)[0], True
         inverse = lower + np.tril(lower, -1).T
         solved = inverse @ nu
