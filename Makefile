@@ -20,7 +20,7 @@ $(STAMP): pyproject.toml requirements.lock
 	  { echo "$(PYTHON) is older than Python 3.11; name a newer one: make PYTHON=python3.12 setup" >&2; exit 2; }
 	@echo "setting up .venv, which is done once. 1 of 2: download and install the packages; pip says nothing for some minutes …"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	@$(BIN)/python -m pip install --quiet --no-compile --requirement requirements.lock  # what is imported gets bytecode then
 	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@echo "2 of 2: compile the kernels, and try what is installed …"
 	@$(BIN)/rbpf doctor
@@ -30,13 +30,13 @@ demo: $(STAMP) ## simulate, filter and report into demo/
 	$(BIN)/rbpf demo --out demo
 
 test: $(STAMP) ## all tests
-	$(PYTEST)
+	$(PYTEST) $(COVER)
 
 slow: $(STAMP) ## the tests that `make check` leaves out
-	$(PYTEST) $(COVER) -m "slow or real_data"
+	$(PYTEST) -m "slow or real_data"
 
 fast: $(STAMP) ## the tests that take less than a second or so each
-	$(PYTEST) $(COVER) -m "not slow and not real_data"
+	$(PYTEST) -m "not slow and not real_data"
 
 lint: $(STAMP) ## format, lint, spelling, types and import rules
 	$(BIN)/ruff format --check .
@@ -66,8 +66,9 @@ dist: $(STAMP) ## wheel and source distribution into dist/: of one commit always
 	  tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner -cf - $$name | gzip -n9 > $$name.tar.gz && \
 	  $(abspath $(BIN))/python -m build --no-isolation --wheel --outdir . $$name && rm -r $$name; done
 
+# By one process: two take more than twice the processor time.
 docs: $(STAMP) ## build the documentation into docs/_build
-	$(BIN)/sphinx-build -W -j 2 -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
 clean: ## remove everything that make made, .venv included
 	rm -rf .venv .venv-lowest demo build dist coverage .coverage *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
