@@ -317,7 +317,7 @@ class JointMap(Map):
             return False
         self._returning = np.union1d(self._returning, ids[~self.holds(ids)])
         self.leaving = np.setdiff1d(self.leaving, ids)
-        near = np.isin(self._returning, self.old.near)
+        near = np.isin(self._returning, self.old.about.ids)
         return bool(near.any()) or np.isin(self._returning[~near], self.old.ids).sum() >= FEWEST
 
     def _exchange(self) -> None:
@@ -326,11 +326,11 @@ class JointMap(Map):
         returning = np.intersect1d(self._returning[~self.holds(self._returning)], self.old.ids)
         observed = np.isin(leaving, self._observed)
         self._returning, self.leaving, leaving = leaving[:0], leaving[observed], leaving[~observed]
-        far = int((~np.isin(returning, self.old.near)).sum()) >= FEWEST
+        far = int((~np.isin(returning, self.old.about.ids)).sum()) >= FEWEST
         present = self._lasting()
         if leaving.size or far:
             present.pass_on(self.old, leaving, returning if far else None)
-        present.bring_in(self.old, returning[np.isin(returning, self.old.near)])
+        present.bring_in(self.old, returning[np.isin(returning, self.old.about.ids)])
         self._take(present)
 
     def finished(self) -> SubMap:
@@ -343,7 +343,7 @@ class JointMap(Map):
 
     def _lasting(self) -> Present:
         """The present sub-map, of which something is to go over into the next one."""
-        if self.old.constants.size:
+        if self.old.about.constants.size:
             raise InputError(
                 "sub-maps that share constants exchange no landmarks: leave out is_constant, or put none away"
             )
@@ -703,5 +703,5 @@ class JointMap(Map):
             self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
             if not self.passed_on:
                 self._reach = float(checkpoint.read_one(arrays, "joint/reach", checkpoint.numbers(1))[0])
-            if not np.isin(self._given_ids, self.old.near).all():
+            if not np.isin(self._given_ids, self.old.about.ids).all():
                 raise InputError("the array joint/given names a landmark that is not about the start of the sub-map")

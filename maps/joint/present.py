@@ -30,7 +30,7 @@ class Present:
         """As it would be if it ended here."""
         points = self.held.table.ids[self.held.table.kind == 0]
         columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
-        d, k = self.held.space.dim, old.constants.size
+        d, k = self.held.space.dim, old.about.constants.size
         used = np.concatenate([np.arange(d), columns.ravel(), np.arange(d, d + k)])
         return SubMap(
             self.origin,

@@ -77,16 +77,33 @@ class SubMap(NamedTuple):
     constants: np.ndarray = NOTHING.mean
     known: Constants = NOTHING  #: what was known of these before it.
 
+    @property
+    def mean(self) -> np.ndarray:
+        """Of what `cov` is about."""
+        pose = len(self.cov) - self.points.size - self.constants.size
+        return np.concatenate([np.zeros(pose), self.points.ravel(), self.constants])
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """Of its landmarks (K,)."""
+        row_of = {landmark: row for row, landmark in enumerate(self.ids.tolist())}
+        return np.array([row_of[landmark] for landmark in ids.tolist()], dtype=np.int64)
+
+    def columns(self, rows: np.ndarray) -> np.ndarray:
+        """Of `cov` those (d + KD + k,) of the end, of landmarks by row (K,), and of the constants."""
+        size, dim, last = len(self.cov), self.points.shape[1], len(self.cov) - self.constants.size
+        d = last - self.points.size
+        points = (d + dim * rows[:, None] + np.arange(dim)).ravel()
+        return np.concatenate([np.arange(d), points, np.arange(last, size)])
+
+    def of(self, rows: np.ndarray) -> "SubMap":
+        """Without its other landmarks."""
+        columns = self.columns(rows)
+        return self._replace(ids=self.ids[rows], points=self.points[rows], cov=self.cov[np.ix_(columns, columns)])
+
     def seeing(self, seen: Given) -> "SubMap":
         """With landmarks that are seen from its end besides."""
         cov = block_diag(self.cov, seen.cov)
         return self._replace(ids=np.append(self.ids, seen.ids), points=np.append(self.points, seen.points, 0), cov=cov)
-
-
-def columns_of(d: int, dim: int, rows: np.ndarray, cov: np.ndarray, constants: int) -> np.ndarray:
-    """Columns (d + KD + k,) of a Gaussian's pose, of points by row (K,), and of the constants at its end."""
-    last = np.arange(len(cov) - constants, len(cov))
-    return np.concatenate([np.arange(d), (d + dim * rows[:, None] + np.arange(dim)).ravel(), last])
 
 
 def inverse_of(cov: np.ndarray) -> np.ndarray:
@@ -164,7 +181,7 @@ def solve(
     common, parts = np.arange(size - k, size), []
     for number, each in enumerate(maps):
         rows = np.array([row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64)
-        own = columns_of(d, dim, rows, each.cov, k)
+        own = each.columns(rows)
         at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
         columns = np.append(columns, common)
@@ -258,11 +275,7 @@ def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, betw
     They are solved for with the new one's end and how the old one lies. Where the old one began is left out.
     """
     ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
-    row_of = {landmark: row for row, landmark in enumerate(ids.tolist())}
-    rows = np.array([row_of[landmark] for landmark in old.ids.tolist()])
-    points = np.empty((ids.size, new.points.shape[1]))
-    points[rows] = space.transform(between, old.points)
-    points[: new.ids.size] = new.points
+    points = np.concatenate([new.points, space.transform(between, old.points[old.rows(ids[new.ids.size :])])])
     starts = np.array([space.identity(), new.end, space.compose(new.end, between)])
     both = [new, old._replace(tied=False, given=None)]
     solution = solve(space, both, ids, starts, space.transform(new.end, points), new.constants)

@@ -30,7 +30,6 @@ from rbpf.maps.joint.solution import (
     Given,
     Solution,
     SubMap,
-    columns_of,
     exchanged,
     fused,
     inverse_of,
@@ -91,10 +90,8 @@ class SubMaps:
         beside: the old landmarks there, where they are kept.
         maps: the finished ones.
         starts: the world's origin, and world_from_end (E,) of each; the last one is where the present one starts.
-        near: (K,) landmarks about the last start.
-        points: (K, D) where they are, as seen from it.
-        constants: (k,) what all sub-maps together say of them.
-        cov: (d + KD + k, d + KD + k) of the last start, in its right chart, of `points` and of the constants.
+        about: what they say of the last start, of landmarks about it, and of the constants: as one that begins at the
+            world's origin and ends there.
     """
 
     def __init__(
@@ -110,9 +107,10 @@ class SubMaps:
         self.beside: Beside | None = None
         self.maps: list[SubMap] = []
         self.starts = [space.identity()]
-        self.near, self.points = np.zeros(0, dtype=np.int64), np.zeros((0, dim))
-        self.constants = constants.mean
-        self.cov = block_diag(np.zeros((space.dim, space.dim)), constants.cov)
+        cov = block_diag(np.zeros((space.dim, space.dim)), constants.cov)
+        self.about = SubMap(
+            self.start, np.zeros(0, dtype=np.int64), np.zeros((0, dim)), cov, constants=constants.mean, known=constants
+        )
         self._places: tuple[np.ndarray, np.ndarray] | None = None
         self._factor_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
         self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
@@ -125,34 +123,30 @@ class SubMaps:
     @property
     def known(self) -> Constants:
         """The constants, by all that is finished."""
-        own = slice(len(self.cov) - self.constants.size, None)
-        return Constants(self.constants, self.cov[own, own])
+        own = slice(len(self.about.cov) - self.about.constants.size, None)
+        return Constants(self.about.constants, self.about.cov[own, own])
 
     def presume(self, prior: Constants) -> None:
         """All that is finished, had the constants had this prior before the first one."""
-        d, k = self.space.dim, self.constants.size
+        d, k = self.space.dim, prior.mean.size
 
-        def anew(end: Array, points: Array, constants: Array, cov: Array, before: Constants) -> tuple[Array, ...]:
-            mean = np.concatenate([np.zeros(d), points.ravel(), constants])
-            mean, cov = exchanged(mean, cov, slice(len(cov) - k, len(cov)), before, prior)
-            end, cov = moved(self.space, end, mean[:d], cov)
-            return end, mean[d : len(mean) - k].reshape(points.shape), mean[len(mean) - k :], cov
+        def anew(each: SubMap, before: Constants) -> SubMap:
+            size = len(each.cov) - k
+            mean, cov = exchanged(each.mean, each.cov, slice(size, size + k), before, prior)
+            end, cov = moved(self.space, each.end, mean[:d], cov)
+            points = mean[d:size].reshape(each.points.shape)
+            return SubMap(end, each.ids, points, cov, each.tied, each.given, mean[size:], prior)
 
-        before = self.maps[0].known if self.maps else self.known
-        about = anew(self.start, self.points, self.constants, self.cov, before)
-        self.starts[-1], self.points, self.constants, self.cov = about
-        maps = self.maps
-        self.maps = []
-        for each in maps:
-            end, points, constants, cov = anew(each.end, each.points, each.constants, each.cov, each.known)
-            self.maps.append(each._replace(end=end, points=points, constants=constants, cov=cov, known=prior))
-        if maps:
+        self.about = anew(self.about, self.maps[0].known if self.maps else self.known)
+        self.starts[-1] = self.about.end
+        self.maps = [anew(each, each.known) for each in self.maps]
+        if self.maps:
             self.solve()
 
     def returned(self, ids: np.ndarray) -> np.ndarray:
         """Which landmarks (K,) are of old sub-maps, and not among those about the start."""
         old = np.array([landmark in self._last for landmark in ids.tolist()], dtype=bool)
-        return old & ~np.isin(ids, self.near)
+        return old & ~np.isin(ids, self.about.ids)
 
     def take(self, present: SubMap, is_large: bool) -> bool:
         """Joins the present sub-map if it is time: it is large, or the robot is back among old landmarks."""
@@ -174,8 +168,8 @@ class SubMaps:
             return
         # The old landmarks about the end of the present sub-map, by all that is known.
         x, cov, half, mine = tied = self._tied(present)
-        own = slice(self.space.dim * 2 + self.dim * self.near.size, len(x))
-        others = np.setdiff1d(np.arange(self.near.size), mine)
+        own = slice(self.space.dim * 2 + self.dim * self.about.ids.size, len(x))
+        others = np.setdiff1d(np.arange(self.about.ids.size), mine)
         seen, of_others = self._seen_from_end(tied, present, others)
         # Rows of the joint covariance, then what of it goes with the present landmarks.
         rows, halves = of_others(cov), of_others(half.T)
@@ -184,7 +178,7 @@ class SubMaps:
         spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(own.stop - own.start)
         slope = cross @ inverse_of(gaussian.symmetrise(spread)) if present.ids.size else cross
         rest = gaussian.symmetrise(within - slope @ cross.T)
-        self.beside = Beside(self.near[others], seen, present.ids, present.points, slope, rest)
+        self.beside = Beside(self.about.ids[others], seen, present.ids, present.points, slope, rest)
 
     def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
         """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
@@ -217,7 +211,7 @@ class SubMaps:
         for each in maps:
             given = None if each.given is None else each.given._replace(ids=renamed(each.given.ids))
             self._hold(each._replace(ids=renamed(each.ids), given=given))
-        self.near = renamed(self.near)
+        self.about = self.about._replace(ids=renamed(self.about.ids))
         if self.beside is not None:
             self.beside = self.beside._replace(ids=renamed(self.beside.ids))
 
@@ -225,10 +219,8 @@ class SubMaps:
         """What is known of landmarks (K,) about the start, by all that is finished."""
         if not ids.size:
             return None
-        row_of = {landmark: row for row, landmark in enumerate(self.near.tolist())}
-        rows = np.array([row_of[landmark] for landmark in ids.tolist()])
-        columns = (self.space.dim + self.dim * rows[:, None] + np.arange(self.dim)).ravel()
-        return Given(ids, self.points[rows], self.cov[np.ix_(columns, columns)])
+        own, points = self.about.of(self.about.rows(ids)), slice(self.space.dim, self.space.dim + self.dim * ids.size)
+        return Given(ids, own.points, own.cov[points, points])
 
     def join(self, finished: SubMap, recall: bool = False, wanted: np.ndarray | None = None) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end.
@@ -246,32 +238,24 @@ class SubMaps:
     def end(self, present: SubMap) -> Estimate:
         """World_from_end of the present sub-map, by it and what is known about its start."""
         space, d = self.space, self.space.dim
-        if present.given is not None and np.isin(present.ids, self.near).sum() == present.given.ids.size:
+        if present.given is not None and np.isin(present.ids, self.about.ids).sum() == present.given.ids.size:
             # All that both know was passed on: no more than the start has to follow.
             moved, by_new, rest = self._followed(present, np.arange(d))
             x, cross = np.append(moved, np.zeros(d)), by_new @ present.cov
             spread = rest + cross @ by_new.T
             own = np.block([[spread, cross[:, :d]], [cross[:, :d].T, present.cov[:d, :d]]])
         else:
-            about, present = self._of_both(present)
-            x, cov, half, _ = about._tied(present)
-            ends = np.append(np.arange(d), len(about.cov) + np.arange(d))
+            # Landmarks that one of the two alone has do not move ends.
+            both = copy(self)
+            both.about = self.about.of(np.flatnonzero(np.isin(self.about.ids, present.ids)))
+            x, cov, half, _ = both._tied(present.of(np.flatnonzero(np.isin(present.ids, self.about.ids))))
+            ends = np.append(np.arange(d), len(both.about.cov) + np.arange(d))
             x, own = x[ends], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
         end = space.retract(present.end, x[d:])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
         turn = np.concatenate([by_start, space.right_jacobian(x[d:])], axis=1)
         mean = space.compose(space.retract(self.start, x[:d]), end)
         return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
-
-    def _of_both(self, present: SubMap) -> tuple["SubMaps", SubMap]:
-        """The start and the present sub-map, without the landmarks that one of them alone has: these do not move ends."""
-        d, dim, about = self.space.dim, self.dim, copy(self)
-        mine, its = (np.flatnonzero(np.isin(*pair)) for pair in ((self.near, present.ids), (present.ids, self.near)))
-        columns = columns_of(d, dim, mine, self.cov, self.constants.size)
-        theirs = columns_of(d, dim, its, present.cov, self.constants.size)
-        about.near, about.points, about.cov = self.near[mine], self.points[mine], self.cov[np.ix_(columns, columns)]
-        cov = present.cov[np.ix_(theirs, theirs)]
-        return about, present._replace(ids=present.ids[its], points=present.points[its], cov=cov)
 
     def relative(self, number: int, present: SubMap) -> Estimate:
         """Where the end of the present sub-map is as seen from that of an older one, by all that is known."""
@@ -290,28 +274,28 @@ class SubMaps:
         (passed-on). Returns how far the rows move (R,), by what slope with the new sub-map (R, d + MD), and what is left
         of their covariance given it.
         """
-        space, d, dim, k = self.space, self.space.dim, self.dim, self.constants.size
+        space, d, dim, k = self.space, self.space.dim, self.dim, self.about.constants.size
         by_new = np.zeros((rows.size, len(new.cov)))
         if new.given is None and not k:
-            return np.zeros(rows.size), by_new, self.cov[np.ix_(rows, rows)]
-        names = self.near[:0] if new.given is None else new.given.ids
-        _, mine, its = np.intersect1d(self.near, names, assume_unique=True, return_indices=True)
-        columns = columns_of(d, dim, mine, self.cov, k)[d:]
+            return np.zeros(rows.size), by_new, self.about.cov[np.ix_(rows, rows)]
+        names = self.about.ids[:0] if new.given is None else new.given.ids
+        _, mine, its = np.intersect1d(self.about.ids, names, assume_unique=True, return_indices=True)
+        columns = self.about.columns(mine)[d:]
         held = self._factor_of_given
-        if held is None or held[0] is not self.cov or not np.array_equal(held[1], columns):
-            own = self.cov[np.ix_(columns, columns)] + np.diag(np.where(columns < len(self.cov) - k, ROUNDING, 0.0))
-            self._factor_of_given = held = self.cov, columns, gaussian.cholesky(own)
-        cross = self.cov[np.ix_(columns, rows)]
+        if held is None or held[0] is not self.about.cov or not np.array_equal(held[1], columns):
+            noise = np.diag(np.append(np.full(columns.size - k, ROUNDING), np.zeros(k)))
+            own = self.about.cov[np.ix_(columns, columns)] + noise
+            self._factor_of_given = held = self.about.cov, columns, gaussian.cholesky(own)
+        cross = self.about.cov[np.ix_(columns, rows)]
         gain = cho_solve((held[2], True), cross, check_finite=False).T
-        row_of = {landmark: row for row, landmark in enumerate(new.ids.tolist())}
-        theirs = np.array([row_of[landmark] for landmark in names[its].tolist()], dtype=np.int64)
+        theirs = new.rows(names[its])
         seen, of_points, last = new.points[theirs], gain[:, : mine.size * dim], gain[:, mine.size * dim :]
         by_points = (of_points.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)).reshape(rows.size, -1)
-        by_new[:, columns_of(d, dim, theirs, new.cov, k)[d:]] = np.concatenate([by_points, last], axis=1)
+        by_new[:, new.columns(theirs)[d:]] = np.concatenate([by_points, last], axis=1)
         by_new[:, :d] = by_points @ space.transform_jacobian(seen).reshape(-1, d)
-        off = space.transform(new.end, seen) - self.points[mine]
-        moved = gain @ np.append(off, new.constants - self.constants)
-        return moved, by_new, self.cov[np.ix_(rows, rows)] - gain @ cross
+        off = space.transform(new.end, seen) - self.about.points[mine]
+        moved = gain @ np.append(off, new.constants - self.about.constants)
+        return moved, by_new, self.about.cov[np.ix_(rows, rows)] - gain @ cross
 
     def brought_back(self, ids: np.ndarray, present: SubMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Landmarks (K,) about the start, as seen from the end of the present sub-map (K, D).
@@ -319,10 +303,9 @@ class SubMaps:
         And by what slope (KD, d + MD) they move with its end and points, and the covariance that is left given these.
         """
         space, d, dim = self.space, self.space.dim, self.dim
-        row_of = {landmark: row for row, landmark in enumerate(self.near.tolist())}
-        at = np.array([row_of[landmark] for landmark in ids.tolist()])
+        at = self.about.rows(ids)
         moved, by_new, rest = self._followed(present, (d + dim * at[:, None] + np.arange(dim)).ravel())
-        seen = space.inverse_transform(present.end, self.points[at] + moved.reshape(-1, dim))
+        seen = space.inverse_transform(present.end, self.about.points[at] + moved.reshape(-1, dim))
         turn = np.kron(np.eye(at.size), space.rotation(present.end).T)
         slope = turn @ by_new
         slope[:, :d] -= space.transform_jacobian(seen).reshape(-1, d)
@@ -336,7 +319,7 @@ class SubMaps:
         And what turns rows of the Gaussian that is tied, (n, …), into theirs (KD, …).
         """
         space, d, dim = self.space, self.space.dim, self.dim
-        turned = slice(len(self.cov), len(self.cov) + d)
+        turned = slice(len(self.about.cov), len(self.about.cov) + d)
         end, theirs = space.retract(new.end, tied.mean[turned]), d + dim * others[:, None] + np.arange(dim)
         seen = space.inverse_transform(end, tied.mean[theirs])
         by_end = -space.transform_jacobian(seen) @ space.right_jacobian(tied.mean[turned])
@@ -351,7 +334,7 @@ class SubMaps:
         """Whether an old landmark that is not among those about the start may be within reach of a pose."""
         origin = np.zeros((1, self.dim))
         off = self.space.transform(end.mean, origin) - self.space.transform(self.start, origin)
-        ids = np.setdiff1d(self.ids, self.near)
+        ids = np.setdiff1d(self.ids, self.about.ids)
         if np.linalg.norm(off) < 0.5 * reach or not ids.size:
             return False
         at = self.space.dim - self.dim
@@ -411,16 +394,14 @@ class SubMaps:
     def _tied(self, new: SubMap) -> _Tied:
         """One Kalman update by what is shared, without noise, of the Gaussians about the last start and the new end."""
         space, d, dim = self.space, self.space.dim, self.dim
-        _, mine, its = np.intersect1d(self.near, new.ids, assume_unique=True, return_indices=True)
-        first = len(self.cov)
+        _, mine, its = np.intersect1d(self.about.ids, new.ids, assume_unique=True, return_indices=True)
+        first = len(self.about.cov)
         size = first + len(new.cov)
-        cov = block_diag(self.cov, new.cov)
-        prior = np.concatenate(
-            [np.zeros(d), self.points.ravel(), self.constants, np.zeros(d), new.points.ravel(), new.constants]
-        )
+        cov = block_diag(self.about.cov, new.cov)
+        prior = np.append(self.about.mean, new.mean)
         of_mine = d + dim * mine[:, None] + np.arange(dim)
         of_its = first + d + dim * its[:, None] + np.arange(dim)
-        if new.given is not None or self.constants.size:
+        if new.given is not None or self.about.constants.size:
             moved, by_new, rest = self._followed(new, np.arange(first))
             prior[:first] += moved
             cov[:first, first:] = cross = by_new @ new.cov
@@ -453,27 +434,31 @@ class SubMaps:
         """About its end: it, its landmarks, and the old ones that it has not, as far as there is room."""
         space, d, dim = self.space, self.space.dim, self.dim
         x, cov, half, mine = tied = self._tied(new)
-        first, k = len(self.cov), self.constants.size
+        first, k = len(self.about.cov), self.about.constants.size
         turned, points = slice(first, first + d), slice(first + d, len(x) - k)
         start, end = space.retract(self.start, x[:d]), space.retract(new.end, x[turned])
         by_start, by_end = (
             space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d]),
             space.right_jacobian(x[turned]),
         )
-        others = np.setdiff1d(np.arange(self.near.size), mine)
+        others = np.setdiff1d(np.arange(self.about.ids.size), mine)
         far = np.linalg.norm(self._seen_from_end(tied, new, others)[0], axis=1)
         kept = np.sort(np.argsort(far, kind="stable")[: max(self.most - new.ids.size, 0)])
-        others = others[kept[self.near[others[kept]] >= 0]]
+        others = others[kept[self.about.ids[others[kept]] >= 0]]
         seen, of_others = self._seen_from_end(tied, new, others)
 
         def of_all(rows: np.ndarray) -> np.ndarray:
             ends = by_start @ rows[:d] + by_end @ rows[turned]
             return np.concatenate([ends, rows[points], of_others(rows), rows[len(x) - k :]])
 
-        self.near = np.append(new.ids, self.near[others])
-        self.points, self.constants = np.concatenate([x[points].reshape(-1, dim), seen]), x[len(x) - k :]
-        self.cov = gaussian.symmetrise(of_all(of_all(cov - half.T @ half).T))
         self.starts[-1:] = [start, space.compose(start, end)]
+        self.about = self.about._replace(
+            end=self.start,
+            ids=np.append(new.ids, self.about.ids[others]),
+            points=np.concatenate([x[points].reshape(-1, dim), seen]),
+            cov=gaussian.symmetrise(of_all(of_all(cov - half.T @ half).T)),
+            constants=x[len(x) - k :],
+        )
         self._places = None
         self._hold(new)
 
@@ -541,9 +526,9 @@ class SubMaps:
 
     def surely_near(self, ratio: float) -> np.ndarray:
         """Names (K,) of landmarks about the start that are known, as seen from it, to this fraction of their distance."""
-        columns = self.space.dim + self.dim * np.arange(self.near.size)[:, None] + np.arange(self.dim)
-        variance = np.diagonal(self.cov)[columns].max(axis=1, initial=0.0)
-        return self.near[np.sqrt(variance) <= ratio * np.linalg.norm(self.points, axis=1)]
+        columns = self.space.dim + self.dim * np.arange(self.about.ids.size)[:, None] + np.arange(self.dim)
+        variance = np.diagonal(self.about.cov)[columns].max(axis=1, initial=0.0)
+        return self.about.ids[np.sqrt(variance) <= ratio * np.linalg.norm(self.about.points, axis=1)]
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """Names (M,) of all landmarks, and where in the world (M, D) the last sub-map that holds each has it."""
@@ -552,7 +537,7 @@ class SubMaps:
         return self._places
 
     def _solve(self, ids: np.ndarray) -> Solution:
-        return solve(self.space, self.maps, ids, np.array(self.starts), self._guess(ids), self.constants)
+        return solve(self.space, self.maps, ids, np.array(self.starts), self._guess(ids), self.about.constants)
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
@@ -570,34 +555,20 @@ class SubMaps:
         order = np.lexsort((far, -self._beside(ids, asked), ~last))
         kept = order[: max(self.most, int(last.sum()))]
         kept = kept[last[kept] | (ids[kept] >= 0)]
-        self.near = ids[kept]
-        self.points, self.cov = solution.seen_from(self.space, len(self.maps), kept)
-        self.constants = solution.constants
+        points, cov = solution.seen_from(self.space, len(self.maps), kept)
+        self.about = self.about._replace(
+            end=self.start, ids=ids[kept], points=points, cov=cov, constants=solution.constants
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All of it, for a checkpoint."""
-        none = Given(np.zeros(0, dtype=np.int64), np.zeros((0, self.dim)), np.zeros((0, 0)))
-        given = [each.given or none for each in self.maps]
-        named = {
-            "counts": np.array([each.ids.size for each in self.maps], dtype=np.int64),
-            "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(each.ids for each in self.maps)]),
-            "points": np.concatenate([np.zeros((0, self.dim)), *(each.points for each in self.maps)]),
-            "covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in self.maps)]),
-            "ends": np.array([each.end for each in self.maps]).reshape(-1, self.space.size),
-            "tied": np.array([each.tied for each in self.maps], dtype=np.int64),
-            "given": np.array([each.ids.size for each in given], dtype=np.int64),
-            "given_ids": np.concatenate([none.ids, *(each.ids for each in given)]),
-            "given_points": np.concatenate([none.points, *(each.points for each in given)]),
-            "given_covs": np.concatenate([np.zeros(0), *(each.cov.ravel() for each in given)]),
-            "starts": np.array(self.starts), "near": self.near, "near_points": self.points, "near_cov": self.cov,
-        }  # fmt: skip
-        if k := self.constants.size:
-            named |= {
-                "constants": np.array([self.constants, *(each.constants for each in self.maps)]),
-                "known": np.array([each.known.mean for each in self.maps]).reshape(-1, k),
-                "known_covs": np.array([each.known.cov for each in self.maps]).reshape(-1, k, k),
-            }
-        named = {f"submaps/{name}": array for name, array in named.items()}
+        named, none = {"submaps/starts": np.array(self.starts)}, np.zeros(0, dtype=np.int64)
+        for number, each in enumerate([self.about, *self.maps]):
+            own, given = each._asdict(), each.given or Given(none, each.points[none], np.zeros((0, 0)))
+            own |= {"tied": np.array(each.tied)} | {f"given_{name}": array for name, array in given._asdict().items()}
+            del own["given"]
+            own |= {f"known_{name}": array for name, array in own.pop("known")._asdict().items()}
+            named |= {f"submaps/{number}/{name}": array for name, array in own.items()}
         if self.frame is not None:
             named |= {"joint/frame": self.frame.mean, "joint/frame_cov": self.frame.cov}
         if self.beside is not None:
@@ -606,46 +577,32 @@ class SubMaps:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Takes up what `arrays` gave. Raises InputError: it is damaged."""
-        schema = {
-            "counts": checkpoint.integers("maps", least=0), "ids": checkpoint.integers("landmarks"),
-            "given": checkpoint.integers("maps", least=0), "given_ids": checkpoint.integers("given landmarks"),
-            "given_points": checkpoint.numbers("given landmarks", self.dim),
-            "given_covs": checkpoint.numbers("given entries"),
-            "points": checkpoint.numbers("landmarks", self.dim), "covs": checkpoint.numbers("entries"),
-            "ends": checkpoint.elements(self.space, "maps"), "starts": checkpoint.elements(self.space, "starts"),
-            "tied": checkpoint.integers("maps", least=0, below=2),
-            "near": checkpoint.integers("near"), "near_points": checkpoint.numbers("near", self.dim),
-            "near_cov": checkpoint.numbers("size", "size"),
-        }  # fmt: skip
-        if k := self.constants.size:
-            schema |= {
-                "constants": checkpoint.numbers("starts", k), "known": checkpoint.numbers("maps", k),
-                "known_covs": checkpoint.covariances("maps", k, k),
+        d, dim, k = self.space.dim, self.dim, self.known.mean.size
+        self.starts = list(checkpoint.read_one(arrays, "submaps/starts", checkpoint.elements(self.space, "starts")))
+        maps = list[SubMap]()
+        if not self.starts or f"submaps/{len(self.starts)}/end" in arrays:
+            raise InputError("the array submaps/starts does not have one more than there are sub-maps")
+        for number in range(len(self.starts)):
+            schema = {
+                "end": checkpoint.elements(self.space), "ids": checkpoint.integers("landmarks", distinct=True),
+                "points": checkpoint.numbers("landmarks", dim), "cov": checkpoint.numbers("size", "size"),
+                "tied": checkpoint.truths(), "constants": checkpoint.numbers(k),
+                "given_ids": checkpoint.integers("given", refers=f"submaps/{number}/ids"),
+                "given_points": checkpoint.numbers("given", dim), "given_cov": checkpoint.numbers("entries", "entries"),
+                "known_mean": checkpoint.numbers(k), "known_cov": checkpoint.covariances(k, k),
             }  # fmt: skip
-        found = checkpoint.read(arrays, schema, "submaps/")
-        d, dim, counts, known = self.space.dim, self.dim, found["counts"], found["given"]
-        rows = {
-            "ids": counts, "points": counts, "covs": (d + dim * counts + k) ** 2,
-            "given_ids": known, "given_points": known, "given_covs": (dim * known) ** 2,
-        }  # fmt: skip
-        parts = [checkpoint.split(found[name], each.tolist(), f"submaps/{name}") for name, each in rows.items()]
-        if len(found["starts"]) != len(counts) + 1 or len(found["near_cov"]) != d + found["near_points"].size + k:
-            raise InputError("the arrays submaps/starts and submaps/near_cov do not fit the sub-maps")
-        self.maps, self._last = [], {}
-        every = zip(found["ends"], found["tied"].tolist(), *parts, strict=True)
-        for end, tied, names, places, cov, others, before, prior in every:
-            if np.unique(names).size < names.size or not np.isin(others, names).all():
-                raise InputError("the arrays submaps/ids and submaps/given_ids name a landmark twice in a sub-map")
-            own = Given(others, before, prior.reshape(before.size, before.size)) if others.size else None
-            self._hold(SubMap(end, names, places, cov.reshape(d + places.size + k, -1), bool(tied), own))
-        if k:
-            self.constants, *means = found["constants"]
-            every = zip(self.maps, means, map(Constants, found["known"], found["known_covs"]), strict=True)
-            self.maps = [each._replace(constants=mean, known=known) for each, mean, known in every]
-        if not np.isin(found["near"], found["ids"]).all() or np.unique(found["near"]).size < found["near"].size:
-            raise InputError("the array submaps/near names a landmark twice, or one that no sub-map holds")
-        self.starts, self.near = list(found["starts"]), found["near"]
-        self.points, self.cov = found["near_points"], found["near_cov"]
+            end, ids, points, cov, tied, constants, *given, mean, known = checkpoint.read(
+                arrays, schema, f"submaps/{number}/"
+            ).values()
+            if len(cov) != d + points.size + k or len(given[2]) != given[1].size:
+                raise InputError(f"the arrays submaps/{number}/cov and given_cov do not fit the landmarks")
+            own = Given(*given) if given[0].size else None
+            maps.append(SubMap(end, ids, points, cov, bool(tied), own, constants, Constants(mean, known)))
+        self.about, self.maps, self._last = maps[0], [], {}
+        for each in maps[1:]:
+            self._hold(each)
+        if not np.isin(self.about.ids, list(self._last)).all():
+            raise InputError("the array submaps/0/ids names a landmark that no sub-map holds")
         if not self.maps:
             return
         schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}

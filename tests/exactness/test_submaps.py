@@ -152,14 +152,14 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
     maps = SubMaps(space, 2 if space is SE2 else 3, RING)
     for each in finished[:6]:
         maps.join(each)
-    assert maps.near.size < RING  # nothing has returned: no solution of all was needed
-    start, near, points, cov = maps.start, maps.near, maps.points, maps.cov
+    assert maps.about.ids.size < RING  # nothing has returned: no solution of all was needed
+    start, near, points, cov = maps.start, maps.about.ids, maps.about.points, maps.about.cov
     maps.solve()
     np.testing.assert_allclose(space.local(start, maps.start), 0.0, atol=1e-7)
-    mine, its = (np.argsort(ids) for ids in (near, maps.near[np.isin(maps.near, near)]))
-    np.testing.assert_allclose(points[mine], maps.points[np.isin(maps.near, near)][its], atol=1e-7)
+    mine, its = (np.argsort(ids) for ids in (near, maps.about.ids[np.isin(maps.about.ids, near)]))
+    np.testing.assert_allclose(points[mine], maps.about.points[np.isin(maps.about.ids, near)][its], atol=1e-7)
     d = space.dim
-    np.testing.assert_allclose(cov[:d, :d], maps.cov[:d, :d], rtol=1e-3, atol=1e-4 * cov.max())
+    np.testing.assert_allclose(cov[:d, :d], maps.about.cov[:d, :d], rtol=1e-3, atol=1e-4 * cov.max())
     # What is told of every landmark: that of all in one system of equations, whose inverse is dense.
     ids, _, covs = maps.landmarks()
     at = d * len(maps.maps) + maps.dim * np.arange(ids.size)[:, None] + np.arange(maps.dim)
@@ -179,7 +179,7 @@ def test_with_a_landmark_come_back_those_that_were_seen_with_it():
         maps.join(each)
     asked = np.setdiff1d(finished[0].ids, finished[1].ids)[:1]
     maps.solve(asked)
-    back = np.setdiff1d(maps.near, finished[5].ids)
+    back = np.setdiff1d(maps.about.ids, finished[5].ids)
     assert back.size == 4 and asked[0] in back and np.isin(back, finished[0].ids).all()
 
 
@@ -210,10 +210,10 @@ def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most, by):
             maps.join(turning(space, each, maps.known, wrong))
         assert closed and len(maps.maps) <= 14
         error, d = space.local(maps.start, ends[-1]), space.dim
-        pose.append(error @ np.linalg.solve(maps.cov[:d, :d], error) / d)
-        error = (maps.points - space.inverse_transform(ends[-1], landmarks[maps.near])).ravel()
+        pose.append(error @ np.linalg.solve(maps.about.cov[:d, :d], error) / d)
+        error = (maps.about.points - space.inverse_transform(ends[-1], landmarks[maps.about.ids])).ravel()
         error = np.append(error, maps.known.mean - wrong)
-        near.append(error @ np.linalg.solve(maps.cov[d:, d:], error) / error.size)
+        near.append(error @ np.linalg.solve(maps.about.cov[d:, d:], error) / error.size)
     for found in (pose, near):
         assert abs(np.mean(found) - 1.0) < 3.0 * np.std(found) / np.sqrt(len(found)) + 0.05
 
@@ -297,10 +297,10 @@ def test_what_is_removed_is_in_no_sub_map():
     for name, found in after.items():
         for one, other in zip(found, before[name], strict=True):
             np.testing.assert_allclose(one, other, atol=1e-9)
-    assert not maps.returned(gone).any() and maps.arrays()["submaps/ids"].min() < 0
+    assert not maps.returned(gone).any() and min(each.ids.min() for each in maps.maps) < 0
     maps.join(finished[6]._replace(ids=np.append(gone, finished[6].ids[2:])))
     maps.forget(gone)
-    assert np.unique(maps.arrays()["submaps/ids"]).size == len(maps.landmarks()[0]) + 2 * gone.size
+    assert np.unique(np.concatenate([each.ids for each in maps.maps])).size == len(maps.landmarks()[0]) + 2 * gone.size
 
 
 def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
@@ -313,9 +313,9 @@ def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
     for mine, theirs in zip((*again.known, *again.landmarks()), (*maps.known, *maps.landmarks()), strict=True):
         np.testing.assert_array_equal(mine, theirs)
     for name, wrong in {
-        "counts": lambda a: a + 1, "ends": lambda a: a[1:], "starts": lambda a: a[1:], "near": lambda a: a + 1000,
-        "ids": lambda a: np.zeros_like(a), "near_cov": lambda a: a[1:, 1:], "covs": lambda a: a[1:], "tied": lambda a: a + 2,
-        "constants": lambda a: a[1:], "known": lambda a: a[:, :0], "known_covs": lambda a: a[1:],
+        "5/end": lambda a: a[1:], "starts": lambda a: a[1:], "0/ids": lambda a: a + 1000, "5/ids": lambda a: np.zeros_like(a),
+        "5/cov": lambda a: a[1:, 1:], "0/cov": lambda a: a[1:], "5/tied": lambda a: a + 2, "5/known_cov": lambda a: -a,
+        "5/given_ids": lambda a: np.append(a, -7), "5/constants": lambda a: a[1:], "5/known_mean": lambda a: a[:0],
     }.items():  # fmt: skip
         damaged = {key: wrong(array) if key.endswith("/" + name) else array for key, array in maps.arrays().items()}
         with pytest.raises(InputError, match="submaps/"):
@@ -328,11 +328,11 @@ def test_what_was_given_and_cannot_be_taken_off_stays():
     maps = SubMaps(SE2, 2, RING)
     for each in finished[:5]:
         maps.join(each)
-    start, cov = maps.start, maps.cov
-    maps.maps[3] = maps.maps[3]._replace(given=Given(maps.near[:3], maps.points[:3], 1e-8 * np.eye(6)))
+    start, cov = maps.start, maps.about.cov
+    maps.maps[3] = maps.maps[3]._replace(given=Given(maps.about.ids[:3], maps.about.points[:3], 1e-8 * np.eye(6)))
     maps.solve()
-    np.testing.assert_equal((maps.start, maps.cov), (start, cov))
+    np.testing.assert_equal((maps.start, maps.about.cov), (start, cov))
     assert np.linalg.eigvalsh(maps.landmarks()[2]).min() > 0.0
     maps.maps[2] = maps.maps[2]._replace(cov=-maps.maps[2].cov)
     maps.solve()
-    np.testing.assert_equal((maps.start, maps.cov), (start, cov))
+    np.testing.assert_equal((maps.start, maps.about.cov), (start, cov))

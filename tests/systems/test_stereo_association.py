@@ -130,9 +130,7 @@ def test_what_was_put_away_is_held_again_when_it_is_seen():
                 assert gone.size > 30 and not slam.joint.holds(gone).any()
                 if far:
                     old = slam.joint.old
-                    rows = np.flatnonzero(slam.joint.holds(old.near))
-                    used = np.append(np.arange(6), 6 + 3 * rows[:, None] + np.arange(3))
-                    old.near, old.points, old.cov = old.near[rows], old.points[rows], old.cov[np.ix_(used, used)]
+                    old.about = old.about.of(np.flatnonzero(slam.joint.holds(old.about.ids)))
             told = slam.take(frame)
             held.append(slam.joint.holds(gone).mean() if t >= COUNT else 1.0)
         assert held[-1] > 0.5 and np.isin(gone, slam.map().ids).all()

@@ -457,7 +457,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         near = self.gate.pairs(features, expected)
         found = match_pairs(features.descriptors, held.descriptors[at], near, self.config.limits)
         taken = held.names[at[found.second]]
-        far = np.flatnonzero(~np.isin(taken, joint.old.near))
+        far = np.flatnonzero(~np.isin(taken, joint.old.about.ids))
         agreed = np.ones(len(found), dtype=bool)
         agreed[far] = self._agreed(expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng)
         out[rows[found.first[agreed]]] = taken[agreed]
