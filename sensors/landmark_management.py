@@ -6,13 +6,14 @@ candidate. Here candidates are 60 at most, and new ones are spread over the imag
 whole numbers that are never used again.
 """
 
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Annotated, final
+from typing import Annotated, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, read
+from rbpf.core.checkpoint import Kept, integers, numbers
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, Formerly, NotNegative, Range, Ranged
@@ -20,11 +21,6 @@ from rbpf.sensors.descriptors import MatchLimits, distances, match_all, two_best
 
 #: Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer.
 DISTINCT = {36: 0.12, 128: 0.3}
-_DESCRIPTORS = {
-    "ids": integers("landmarks", least=0, ascending=True),
-    "descriptors": numbers("landmarks", "length", dtype=np.float32),
-}
-_COUNTED = {"table": integers("landmarks", 3, least=0), "counters": integers(2, least=0)}
 
 
 @dataclass(frozen=True)
@@ -45,7 +41,7 @@ class NewLandmarkConfig(Ranged):
 
 
 @final
-class LandmarkManager:
+class LandmarkManager(Kept):
     """Holds landmarks and candidates by their descriptors, and counts observations of them, frame by frame.
 
     Call `observe`, then `select`, then `add`.
@@ -55,6 +51,14 @@ class LandmarkManager:
         size: of the images, (width, height) [px].
         length: of a descriptor.
     """
+
+    kept: ClassVar = {
+        "descriptors": numbers("landmarks", "length", dtype=np.float32),
+        "_table": integers("landmarks", 3, least=0),
+        "frame": integers(least=0),
+        "next_name": integers(least=0),
+    }
+    prefix = "key_manager/"
 
     def __init__(self, config: NewLandmarkConfig, size: tuple[int, int], length: int) -> None:
         self.config = config
@@ -182,19 +186,11 @@ class LandmarkManager:
         self.descriptors = np.concatenate([self.descriptors, descriptors], dtype=np.float32)
         return names
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
-        described = {"descriptors/ids": self.names.copy(), "descriptors/descriptors": self.descriptors}
-        counters = np.array([self.frame, self.next_name])
-        return described | {"key_manager/table": self._table.copy(), "key_manager/counters": counters}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        ids, self.descriptors = read(arrays, _DESCRIPTORS, "descriptors/", length=self.length).values()
-        self._table, counters = read(arrays, _COUNTED, "key_manager/").values()
-        self.frame, self.next_name = counters.tolist()
-        if not np.array_equal(ids, self.names) or ids.max(initial=-1) >= self.next_name:
-            raise InputError("the landmarks that have descriptors are not those that are counted, below the next one")
+        super().restore(arrays, length=self.length)
+        if (np.diff(self.names, append=self.next_name) <= 0).any():
+            raise InputError("the landmarks' names do not ascend, or not below the next one")
 
     def _cell(self, px: np.ndarray) -> np.ndarray:
         column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T

@@ -1,11 +1,12 @@
 """A robot that calibrates itself: where its sensor is, and what its wheels get wrong, as constants of the joint map."""
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, read_one
+from rbpf.core.checkpoint import Kept, integers, numbers, truths
 from rbpf.core.diagnostics import Correction
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
@@ -24,13 +25,21 @@ AS_GOOD_AS_KNOWN = 1e-4
 
 
 @final
-class RobotCalibration:
+class RobotCalibration(Kept):
     """Constants (m,) of a joint map: coordinates of the sensor's place, then `wheel_errors`, whichever are uncertain.
 
     By default (`calibrate=auto`) they are as good as known until a score test, Mathematics (wheel-score), says otherwise.
     `is_possible` is whether the map is a joint one of landmarks with names. Raises InputError: what is asked for by name is
     not possible, or leaves nothing to estimate.
     """
+
+    kept: ClassVar = {
+        "learnt": integers("learnt"),
+        "score": numbers(3, "learnt"),
+        "_before": numbers("dim", "learnt"),
+        "is_estimated": truths(),
+    }
+    prefix = "calibration/"
 
     def __init__(
         self, config: RangeBearingConfig, space: SE2Group | SE3Group, model: RigidPointModel, is_possible: bool
@@ -145,20 +154,11 @@ class RobotCalibration:
         """Mean (m,) and covariance (m, m), as they are known by now."""
         return self._joint(filter_).moments(filter_.particles, Part.SUBSTATE)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint: which are uncertain, and what is known of whether they should be."""
-        known = np.array([int(self.is_estimated)])
-        named = {"learnt": self.learnt, "score": self.score, "before": self._before, "is_estimated": known}
-        return named if self.learnt.size else {}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Raises InputError: the checkpoint is of another calibration."""
-        if not self.learnt.size:
-            return
-        if not np.array_equal(read_one(arrays, "learnt", integers("learnt")), self.learnt):
+    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
+        """The inverse of `arrays`. Raises InputError: the checkpoint is of another calibration."""
+        own = self.learnt
+        super().restore(arrays, dim=self.space.dim)
+        if not np.array_equal(self.learnt, own):
             raise InputError(
                 "the checkpoint is of a robot that estimates other things of itself: set calibrate as it was"
             )
-        self.score = read_one(arrays, "score", numbers(3, self.learnt.size))
-        self._before = read_one(arrays, "before", numbers(*self._before.shape))
-        self.is_estimated = bool(read_one(arrays, "is_estimated", integers(1, least=0))[0])

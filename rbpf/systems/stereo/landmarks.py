@@ -20,9 +20,10 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.arrays import RowByRow
-from rbpf.core.checkpoint import Kept, integers, read
+from rbpf.core.checkpoint import Kept, integers
 from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Particles, Prior
+from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
@@ -505,8 +506,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return self.manager.arrays() | self.places.arrays() | learnt
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        read(arrays, {"descriptors/ids": integers("landmarks", refers=MAP_IDS)})
         self.manager.restore(arrays)
+        if not np.isin(self.manager.names, arrays[MAP_IDS]).all():
+            raise InputError("a landmark that is managed is not in the map")
         self.places.restore(arrays, landmarks=len(self.manager))
         if self.noise is not None:
             self.noise.restore(arrays)

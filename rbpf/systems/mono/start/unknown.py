@@ -9,11 +9,11 @@ S. Sénécal, 2006).
 """
 
 from collections.abc import Callable, Sequence
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, read_one
+from rbpf.core.checkpoint import Kept, integers, truths
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.lie import SE3
@@ -34,12 +34,15 @@ TINY = np.finfo(float).tiny
 
 
 @final
-class UnknownStart:
+class UnknownStart(Kept):
     """Adjusts the first frames when it is time, and resamples the particles.
 
     `new_filter` makes a filter without a past, with `features` as its sensor; `needed` is whether the run starts without known
     points and without a map.
     """
+
+    kept: ClassVar = {"over": truths(), "_next": integers(least=0)}
+    prefix = "start/"
 
     def __init__(
         self,
@@ -92,15 +95,6 @@ class UnknownStart:
         first.path = list(poses)
         seen_first = first.seen_first(paths[:, filter_.belief().mode])
         return Adjusted(filter_, Revision(stamps, poses, covs), seen_first), None
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
-        return {"start/progress": np.array([self.over, self._next])}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        over, self._next = read_one(arrays, "start/progress", integers(2, least=0)).tolist()
-        self.over = bool(over)
 
     def _along(self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
