@@ -115,18 +115,14 @@ class Rows(NamedTuple):
                 count = int((log_odds >= 0.0).sum())
                 log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
                 is_density[own] = likelihood.normalised
-        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, len(chol) - self._uninformative()
-        return Information(info, vector, quad, *np.full((n, 3), of_all).T)
-
-    def _uninformative(self) -> float:
-        """How many of the rows say nothing, of those that are set apart."""
-        total = 0.0
+        nothing = 0.0  # is said by so many of the rows that are set apart
         for group in self.groups:
             if group.along is not None:
                 taken = group.log_odds >= 0.0
                 along, spread = group.along[taken], diagonal_blocks(self.cov, group.rows[taken])
-                total += float((along * np.linalg.solve(spread, along[..., None])[..., 0]).sum())
-        return total
+                nothing += float((along * np.linalg.solve(spread, along[..., None])[..., 0]).sum())
+        of_all = log_det(chol.diagonal()[is_density[inside]]), log_factor, len(chol) - nothing
+        return Information(info, vector, quad, *np.full((n, 3), of_all).T)
 
     def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One gain for all particles: log p(z | x) (N,), by what the means move (N, n), and the covariance (n, n) after."""

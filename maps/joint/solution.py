@@ -112,13 +112,6 @@ def inverse_of(cov: np.ndarray) -> np.ndarray:
     return np.asarray(half.T @ half)
 
 
-def information_of(cov: np.ndarray, d: int) -> np.ndarray:
-    """The inverse; the first d of what it is of may be known exactly."""
-    if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
-        cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
-    return inverse_of(cov)
-
-
 class Factor(NamedTuple):
     """What a sub-map says of starts and landmarks in `columns` (c,): a residual (r,), its information and slope (r, c).
 
@@ -190,7 +183,9 @@ def solve(
             # A short one may know what drives the motion exactly from its start.
             cov = cov + EXACT**2 * np.eye(len(cov))
         if each.tied:
-            info = information_of(cov, d)
+            if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
+                cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
+            info = inverse_of(cov)
         else:
             info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
             info[d:, d:] = inverse_of(cov[d:, d:])

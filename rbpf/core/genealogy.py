@@ -163,17 +163,7 @@ class Lineage:
         self._nodes[:] = np.column_stack([found[name] for name in _COLUMNS])
         self._leaves, self._free = found["leaves"], found["free"]
         self.generation, self._n_free = now, n_free
-        self._require_forest()
-        self._pending.clear()
-        self._is_planted = True
-        self._retained.clear()
-        self._cache.clear()
-        self._alive.clear()
-        self._members.clear()
-        self._settled.clear()
-
-    def _require_forest(self) -> None:
-        """Refuses what is no forest: parents are older than their children, and what is free is nobody's ancestor."""
+        # Refused is what is no forest: parents are older than their children, and what is free is nobody's ancestor.
         size = len(self._nodes)
         alive, children = np.zeros(size, dtype=bool), np.zeros(size, dtype=np.int64)
         parent, its_children, generation, _ = self._nodes.T
@@ -195,6 +185,13 @@ class Lineage:
         sound = sound and np.unique(free).size == size - int(alive.sum()) == free.size
         if not (sound and not alive[free].any() and np.array_equal(children[alive], its_children[alive])):
             raise InputError("the particles' ancestry is no forest")
+        self._pending.clear()
+        self._is_planted = True
+        self._retained.clear()
+        self._cache.clear()
+        self._alive.clear()
+        self._members.clear()
+        self._settled.clear()
 
     def _allocate(self, size: int) -> None:
         self._nodes = np.tile(_NO_NODE, (size, 1))

@@ -117,7 +117,11 @@ class SE2Group(LieGroup):
 
     def rotation(self, a: States) -> Float[np.ndarray, "*batch 2 2"]:
         """Rotation matrix, (..., 3) -> (..., 2, 2)."""
-        return _matrix(_phasor(_contiguous(a)[..., 0]))
+        z = _phasor(_contiguous(a)[..., 0])
+        out = np.empty((*np.shape(z), 2, 2))
+        out[..., 0, 0] = out[..., 1, 1] = z.real
+        out[..., 1, 0], out[..., 0, 1] = z.imag, -z.imag
+        return out
 
     def matrix(self, a: States) -> Float[np.ndarray, "*batch 3 3"]:
         """Homogeneous matrix, (..., 3) -> (..., 3, 3)."""
@@ -168,12 +172,4 @@ def _pack(angle: Array, z: Complex) -> Array:
     out = np.empty((*np.shape(z), 3))
     out[..., 0] = angle
     _planar(out)[...] = z
-    return out
-
-
-def _matrix(z: Complex) -> Array:
-    out = np.empty((*np.shape(z), 2, 2))
-    out[..., 0, 0] = out[..., 1, 1] = z.real
-    out[..., 1, 0] = z.imag
-    out[..., 0, 1] = -z.imag
     return out

@@ -53,17 +53,12 @@ def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: M
     head = {"rbpf": __version__, "system": system, **sources}
     if digest is not None:
         head["input_sha256"] = digest
-    text = yaml.safe_dump({**head, "versions": library_versions(), **settings}, sort_keys=False)
-    write_text(out / CONFIG, text)
-
-
-def library_versions() -> dict[str, str]:
-    """Python, the libraries that compute, and the processor's instructions that they choose among."""
-    found = {"python": platform.python_version(), "instructions": instruction_set()}
+    # Python, the libraries that compute, and the processor's instructions that they choose among.
+    versions = {"python": platform.python_version(), "instructions": instruction_set()}
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            versions[name] = version(name)
+    write_text(out / CONFIG, yaml.safe_dump({**head, "versions": versions, **settings}, sort_keys=False))
 
 
 def instruction_set() -> str:

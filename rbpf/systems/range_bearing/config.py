@@ -58,15 +58,6 @@ class CalibrationConfig(Ranged):
     turn: NotNegative = 0.05  #: fraction by which its turns are wrong, those to the left and those to the right.
     distance: NotNegative = 0.05  #: fraction by which its distances are wrong; right with calibrate=online.
 
-    def of_sensor(self, space: SE2Group | SE3Group) -> np.ndarray:
-        """(d,) in the right chart of the sensor's pose."""
-        yaw, shift = np.deg2rad(self.yaw_deg), (self.x_m, self.y_m, self.z_m)
-        return np.array([yaw, *shift[:2]] if isinstance(space, SE2Group) else [0.0, 0.0, yaw, *shift])
-
-    def of_wheels(self) -> np.ndarray:
-        """(4,) of `wheel_errors`."""
-        return np.array([np.deg2rad(self.heading_deg_per_m), self.turn, self.turn, self.distance])
-
 
 @dataclass(frozen=True)
 class RangeBearingConfig(RunConfig):
@@ -107,11 +98,14 @@ class RangeBearingConfig(RunConfig):
         return cls(window=1) if given.get("calibrate") in ("sensor", "online") else cls()
 
     def uncertain(self, space: SE2Group | SE3Group) -> np.ndarray:
-        """Standard deviations (d + 4,) of what a robot may estimate of itself: its sensor's place, then its wheels."""
-        sensor, wheels = self.self_calibration.of_sensor(space), self.self_calibration.of_wheels()
+        """Standard deviations (d + 4,) of what a robot may estimate of itself: its sensor's pose, then `wheel_errors`."""
+        of, is_planar = self.self_calibration, isinstance(space, SE2Group)
+        yaw, shift = np.deg2rad(of.yaw_deg), (of.x_m, of.y_m, of.z_m)
+        sensor = np.array([yaw, *shift[:2]] if is_planar else [0.0, 0.0, yaw, *shift])
+        wheels = np.array([np.deg2rad(of.heading_deg_per_m), of.turn, of.turn, of.distance])
         if self.calibrate not in ("sensor", "online"):
             sensor[:] = 0.0
-        if self.calibrate in ("off", "sensor") or not isinstance(space, SE2Group):
+        if self.calibrate in ("off", "sensor") or not is_planar:
             wheels[:] = 0.0
         if self.calibrate == "online":  # who turns one way cannot tell it from a sensor that stands to the side
             wheels[-1] = 0.0
