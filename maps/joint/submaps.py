@@ -339,7 +339,7 @@ class SubMaps:
             return False
         at = self.space.dim - self.dim
         reach += 3.0 * float(np.sqrt(np.linalg.eigvalsh(end.cov[at:, at:])[-1]))
-        far = np.linalg.norm(self.space.inverse_transform(end.mean, self._guess(ids)), axis=1)
+        far = np.linalg.norm(self.space.inverse_transform(end.mean, self.guess(ids)), axis=1)
         return bool((far < reach).any())
 
     def __deepcopy__(self, memo: dict[int, object]) -> "SubMaps":
@@ -499,7 +499,7 @@ class SubMaps:
         wanted, last = times > 1, self.maps[-1].ids
         if asked is not None:
             wanted |= np.isin(ids, last) | np.isin(ids, asked)
-            far = np.linalg.norm(self.space.inverse_transform(self.start, self._guess(ids)), axis=1)
+            far = np.linalg.norm(self.space.inverse_transform(self.start, self.guess(ids)), axis=1)
             order = np.lexsort((far, -self._beside(ids, asked)))
             wanted[order[: max(self.most - last.size, 0)]] = True
         return ids[wanted]
@@ -511,7 +511,7 @@ class SubMaps:
             most = np.maximum(most, np.isin(ids, each.ids) * np.isin(asked, each.ids).sum())
         return most
 
-    def _guess(self, ids: np.ndarray) -> np.ndarray:
+    def guess(self, ids: np.ndarray) -> np.ndarray:
         """Where landmarks (K,) are in the world (K, D), by the last sub-map that holds each."""
         held = np.array([self._last[landmark] for landmark in ids.tolist()], dtype=np.int64).reshape(-1, 2)
         ends = np.array([self.starts[number + 1] for number in held[:, 0]]).reshape(-1, self.space.size)
@@ -533,11 +533,11 @@ class SubMaps:
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """Names (M,) of all landmarks, and where in the world (M, D) the last sub-map that holds each has it."""
         if self._places is None:
-            self._places = self.ids, self._guess(self.ids)
+            self._places = self.ids, self.guess(self.ids)
         return self._places
 
     def _solve(self, ids: np.ndarray) -> Solution:
-        return solve(self.space, self.maps, ids, np.array(self.starts), self._guess(ids), self.about.constants)
+        return solve(self.space, self.maps, ids, np.array(self.starts), self.guess(ids), self.about.constants)
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
         """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""

@@ -202,7 +202,7 @@ class FeatureSensor(Sensor):
         self._reach_px = np.inf
         self.noise: LearntNoise | None = None
         self.point = CameraPoint(camera)
-        self._take_group(group)
+        self.group = group
 
     def become_joint(self, unknown_depth: UnknownDepth, reach_px: float, noise: LearntNoise | None = None) -> None:
         """From now on the map is a joint one, which holds the known points one by one.
@@ -210,8 +210,7 @@ class FeatureSensor(Sensor):
         What is expected with a greater standard deviation than `reach_px` cannot be looked for. Without `noise`, what is
         measured is as exact as it says.
         """
-        self.unknown_depth, self._reach_px, self.noise = unknown_depth, reach_px, noise
-        self._take_group(None)
+        self.unknown_depth, self._reach_px, self.noise, self.group = unknown_depth, reach_px, noise, None
 
     def tune(self, camera: Pinhole, about: np.ndarray) -> None:
         """The camera of a joint map that it is estimated in, at the substate `about` (m,)."""
@@ -222,12 +221,6 @@ class FeatureSensor(Sensor):
     def noise_factor(self) -> float:
         """Of the variance that what is measured says."""
         return 1.0 if self.noise is None else self.noise.mean
-
-    def _take_group(self, group: KnownPoints | None) -> None:
-        self.group = group
-        names = np.zeros(0, dtype=np.int64) if group is None else group.names
-        self._order = np.argsort(names)
-        self._member_names = names[self._order]
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
         """Groups of observations for known points, points, and features of unknown depth."""
@@ -298,10 +291,8 @@ class FeatureSensor(Sensor):
         assert isinstance(joint, JointMap)
         if not self.is_unsure(joint):
             return amiss
-        ids, places = joint.old.places()
-        away = np.flatnonzero(np.isin(frame.landmarks, ids) & ~joint.holds(frame.landmarks))
-        row_of = {name: row for row, name in enumerate(ids.tolist())}
-        points = places[[row_of[name] for name in frame.landmarks[away].tolist()]]
+        away = np.flatnonzero(np.isin(frame.landmarks, joint.old.ids) & ~joint.holds(frame.landmarks))
+        points = joint.old.guess(frame.landmarks[away])
         seen = self.camera.project(SE3.inverse_transform(self.pose(belief), points))
         amiss[away] = ~(np.linalg.norm(seen - frame.z[away], axis=1) <= LINEAR * self._reach_px)
         return amiss
@@ -416,10 +407,10 @@ class FeatureSensor(Sensor):
 
     def members(self, names: np.ndarray) -> np.ndarray:
         """Number of features (K,) among the points of the constellation, −1 of others."""
-        if not self._order.size:
+        if self.group is None or not self.group.names.size:
             return np.full(names.size, -1)
-        rows = np.minimum(self._member_names.searchsorted(names), self._order.size - 1)
-        return np.where(self._member_names[rows] == names, self._order[rows], -1)
+        same = names[:, None] == self.group.names
+        return np.where(same.any(axis=1), same.argmax(axis=1), -1)
 
     def _ids(self, belief: Belief, names: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Landmarks (K,) of features (K,), −1 where the map has none of their own; `members` are theirs."""

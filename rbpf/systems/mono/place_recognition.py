@@ -18,7 +18,7 @@ from rbpf import gaussian
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Estimate, Particles, uniform_log_weights
 from rbpf.lie import SE3
-from rbpf.maps.joint.solution import Given
+from rbpf.maps.joint.solution import Given, SubMap
 from rbpf.maps.joint_map import JointMap
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
@@ -43,12 +43,10 @@ DEPTH_RATIO = 10.0
 
 
 class Place(NamedTuple):
-    """A sub-map: its landmarks (K,) at points (K, 3) as seen from its end, with covariances (K, 3, 3)."""
+    """A sub-map of landmarks alone, and where its end is."""
 
     world_from_place: np.ndarray
-    rows: np.ndarray
-    points: np.ndarray
-    cov: np.ndarray
+    held: SubMap
 
     @classmethod
     def of(cls, joint: JointMap, number: int | None = None) -> "Place":
@@ -57,15 +55,13 @@ class Place(NamedTuple):
             held, pose = joint.finished(), joint.world(SE3.identity((1,)), slice(1))[0]
         else:
             held, pose = joint.old.maps[number], joint.old.starts[number + 1]
-        own = np.flatnonzero(held.ids >= 0)
-        columns = SE3.dim + 3 * own[:, None] + np.arange(3)
-        return cls(pose, held.ids[own], held.points[own], held.cov[columns[:, :, None], columns[:, None]])
+        return cls(pose, held.of(np.flatnonzero(held.ids >= 0)))
 
-    def at(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points and covariances of landmarks (M,) in their order."""
-        order = np.argsort(self.rows)
-        which = order[np.searchsorted(self.rows, rows, sorter=order)]
-        return self.points[which], self.cov[which]
+    def at(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (M, 3), as seen from the end, and covariances (M, 3, 3) of landmarks (M,)."""
+        rows = self.held.rows(names)
+        columns = SE3.dim + 3 * rows[:, None] + np.arange(3)
+        return self.held.points[rows], self.held.cov[columns[:, :, None], columns[:, None]]
 
 
 def log_likelihood(
@@ -214,7 +210,7 @@ class PlaceRecognition:
         """Features that carry names say where they are seen from: the old sub-map that has most of them."""
         number = int(np.argmax([np.isin(seen.landmarks, held.ids).sum() for held in joint.old.maps]))
         place = Place.of(joint, number)
-        rows = np.flatnonzero(np.isin(seen.landmarks, place.rows))
+        rows = np.flatnonzero(np.isin(seen.landmarks, place.held.ids))
         names, px = seen.landmarks[rows], seen.z[rows]
         if rows.size < MIN_FITTED + 1:
             return number, None
@@ -230,7 +226,7 @@ class PlaceRecognition:
     def _look(self, filter_: Filter, joint: JointMap, image: np.ndarray, number: int) -> Sighting | None:
         """Where the image was taken if it shows an old sub-map, seen from where that ended."""
         place = Place.of(joint, number)
-        among = place.rows, SE3.transform(place.world_from_place, place.points)
+        among = place.held.ids, SE3.transform(place.world_from_place, place.held.points)
         return self.relocaliser.find(filter_.belief(), image, place.world_from_place, None, among).sighting
 
     def _ask(self, joint: JointMap, image: np.ndarray) -> np.ndarray:
@@ -256,10 +252,10 @@ class PlaceRecognition:
 
     def _odds(self, joint: JointMap, place: Place, sighting: Sighting, prior: Estimate) -> tuple[float, np.ndarray]:
         """`log_odds` of a place where the image was sighted, and the pose (7,) in it."""
-        held = np.isin(sighting.matches[0], place.rows)
+        held = np.isin(sighting.matches[0], place.held.ids)
         names, px = (each[held] for each in sighting.matches)
         pose = SE3.between(place.world_from_place, sighting.world_from_camera)
-        every = np.concatenate([joint.old.places()[1], SE3.transform(place.world_from_place, place.points)])
+        every = np.concatenate([joint.old.places()[1], SE3.transform(place.world_from_place, place.held.points)])
         return log_odds(self.features.camera, pose, *place.at(names), px, prior, np.ptp(every, axis=0))
 
     def _judged(
