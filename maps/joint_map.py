@@ -286,9 +286,7 @@ class JointMap(Map):
     @property
     def is_full(self) -> bool:
         """Whether more landmarks are held than a sub-map should have, without those that leave."""
-        if self.submap is None or self.ids.size <= self.submap:
-            return False
-        return np.setdiff1d(self.ids, self.leaving).size > self.submap
+        return self.submap is not None and np.setdiff1d(self.ids, self.leaving).size > self.submap
 
     def make_room(self, order: np.ndarray) -> np.ndarray:
         """Lets go of the first of these landmarks (K,) until half of a sub-map is left, if they are worth one.
