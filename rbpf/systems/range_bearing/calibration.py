@@ -1,12 +1,11 @@
 """A robot that calibrates itself: where its sensor is, and what its wheels get wrong, as constants of the joint map."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import Kept, integers, numbers, truths
+from rbpf.core.checkpoint import Kept, numbers, truths
 from rbpf.core.diagnostics import Correction
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
@@ -33,12 +32,7 @@ class RobotCalibration(Kept):
     not possible, or leaves nothing to estimate.
     """
 
-    kept: ClassVar = {
-        "learnt": integers("learnt"),
-        "score": numbers(3, "learnt"),
-        "_before": numbers("dim", "learnt"),
-        "is_estimated": truths(),
-    }
+    kept: ClassVar = {"score": numbers(3, "learnt"), "_before": numbers("dim", "learnt"), "is_estimated": truths()}
     prefix = "calibration/"
 
     def __init__(
@@ -153,12 +147,3 @@ class RobotCalibration(Kept):
     def _moments(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
         """Mean (m,) and covariance (m, m), as they are known by now."""
         return self._joint(filter_).moments(filter_.particles, Part.SUBSTATE)
-
-    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
-        """The inverse of `arrays`. Raises InputError: the checkpoint is of another calibration."""
-        own = self.learnt
-        super().restore(arrays, dim=self.space.dim)
-        if not np.array_equal(self.learnt, own):
-            raise InputError(
-                "the checkpoint is of a robot that estimates other things of itself: set calibrate as it was"
-            )

@@ -257,6 +257,6 @@ class RangeBearingSlam(System):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self.sensor.observed_once = set(read_one(arrays, "observed_once", integers("once")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
-        self.calibration.restore(arrays)
+        self.calibration.restore(arrays, dim=self.space.dim, learnt=self.calibration.learnt.size)
         if self.hypotheses is not None:
             self.hypotheses.restore(arrays)
