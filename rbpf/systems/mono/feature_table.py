@@ -127,10 +127,7 @@ class FeatureTable:
 
     def restore(self, arrays: dict[str, np.ndarray], members: int) -> None:
         """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.checkpoint.read`."""
-        count = np.size(arrays.get("features/alive", ()))  # before planes were learnt nothing was known of them
-        nothing = {"plane_information": np.zeros((count, 2, 3)), "squared_parallax": np.zeros((count, 2))}
-        given = {f"features/{name}": values for name, values in nothing.items()} | arrays
-        self._room = read(given, _COLUMNS, "features/", members=members)
+        self._room = read(arrays, _COLUMNS, "features/", members=members)
         if (np.linalg.eigvalsh(self._room["plane_information"][:, :, :2]) < -0.1).any():
             raise InputError("features/plane_information: expected information that is not less than none")
         self._use(len(self._room["alive"]))
