@@ -1,5 +1,7 @@
 """The range-bearing system on recorded logs, against the figures of independent reference filters."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,10 +40,10 @@ PATH, ATE, LANDMARKS, ALIGNED = range(4)
         ("mrpt_kf_slam_6d", 1, "map=auto", {PATH: 0.0125, LANDMARKS: 0.0050}),
         ("mrclam6_robot1", 1, "window=5", {ATE: 0.13, ALIGNED: 0.08}),
         ("mrclam6_robot1", 1, "calibrate=sensor", {ATE: 0.14, ALIGNED: 0.02}),
-        ("mrclam6_robot1", 2, "calibrate=odometry", {ATE: 0.11, ALIGNED: 0.09}),
-        ("mrpt_kf_slam_6d", 3, "map=particles", {PATH: 0.030, LANDMARKS: 0.030}),
-        ("mrclam6_robot1", 2, "map=particles", {ATE: 0.16}),
-        ("mrclam6_robot1", 2, "association=ml", {ATE: 0.19}),
+        ("mrclam6_robot1", 1, "calibrate=odometry", {ATE: 0.11, ALIGNED: 0.09}),
+        ("mrpt_kf_slam_6d", 1, "map=particles", {PATH: 0.030, LANDMARKS: 0.030}),
+        ("mrclam6_robot1", 1, "map=particles", {ATE: 0.16}),
+        ("mrclam6_robot1", 1, "association=ml", {ATE: 0.19}),
     ],
 )
 def test_errors(data_dir, name, seeds, setting, most):
@@ -58,7 +60,9 @@ def test_the_refined_proposal_beats_the_bootstrap_one(data_dir):
 
 def test_sub_maps_close_the_loops_of_victoria_park(data_dir):
     """Whose odometry turns by many times what it states: one Gaussian of all is surprised at every return."""
-    run = filter_opened(open_robot_log(open_log(data_dir / "victoria_park"), RangeBearingConfig(seed=0)))
-    assert run.system.map().ids.size == 151 and len(run.system.joint.old.maps) > 5
-    assert np.nansum(run.log["nis"]) < np.nansum(run.log["nis_dof"])
+    log = open_log(data_dir / "victoria_park")
+    first = replace(log, frames=log.frames[:1500])  # the first loop; one Gaussian's NIS is 0.8 of its number
+    run = filter_opened(open_robot_log(first, RangeBearingConfig(seed=0)))
+    assert run.system.map().ids.size == 74 and len(run.system.joint.old.maps) >= 5
+    assert np.nansum(run.log["nis"]) < 0.5 * np.nansum(run.log["nis_dof"])
     assert np.isnan(run.log["log_evidence"][-1]) and run.log["log_evidence"][0] == 0.0
