@@ -9,7 +9,9 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
+from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.gtsam.robot import CHUNK, solve, solve_online
+from rbpf.validation.gtsam.stated import DOUBTFUL, measured_calibration
 from tests.validation.worlds import assert_same, seen, solve_by_scipy, world
 
 WORLDS = [
@@ -68,6 +70,23 @@ def test_any_start_near_by_leads_to_the_same_optimum():
     for found in (solve(m, initial=InitialEstimate(moved, points)), solve(m, incremental=True)):
         assert found.error == pytest.approx(expected.error, rel=1e-9)
         assert np.abs(SE2.local(expected.world_from_body, found.world_from_body)).max() < 1e-6
+
+
+@pytest.mark.parametrize(("dim", "kind", "singular"), WORLDS[1:4])
+def test_a_sensor_that_stands_or_measures_otherwise_than_stated_is_found(dim, kind, singular):
+    """And none that is where it is said to be; who always turns alike cannot tell, and noise does not make it so."""
+    for winding, turn, away, longer in ((False, 0.0, 0.0, 1.0), (True, 0.0, 0.0, 1.0), (True, 0.04, 0.1, 1.03)):
+        m = world(dim, kind, singular, steps=30, noise=0.1, winding=winding)
+        z, place = m.z.copy(), m.robot_from_sensor.copy()
+        z[:, : 1 if kind == "range_bearing" else None] *= longer
+        place[-dim:] += away
+        off = m.space.exp(np.concatenate([np.zeros(m.space.dim - dim - 1), [turn], np.zeros(dim)]))
+        stated = replace(m, z=z, robot_from_sensor=m.space.compose(place, off))
+        found = measured_calibration(solve_problem(stated, initial_estimate(stated).world_from_body))
+        assert (max((one.apart for one in found), default=0.0) > 2.0 * DOUBTFUL) == bool(away)
+        if winding:
+            right = [found[-dim - 2].stated - np.rad2deg(turn), *m.space.translation(m.robot_from_sensor), longer]
+            assert max(o._replace(stated=r).apart for o, r in zip(found[-dim - 2 :], right, strict=True)) < 4.0
 
 
 def first_steps(m, count):

@@ -15,6 +15,7 @@ from rbpf.validation.gtsam.batch_problem import Optimum, connected_frames, solve
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.gtsam.self_calibration import refine_calibration
+from rbpf.validation.gtsam.stated import DOUBTFUL, measured_calibration
 from tests.exactness.models import known
 
 pytestmark = pytest.mark.slow
@@ -91,6 +92,11 @@ def test_a_wrong_focal_length_and_distortion_are_mended():
     wrong = replace(camera, fx=0.96 * camera.fx, fy=0.96 * camera.fy, distortion=(-0.02, 0.0, 0.0, 0.0, 0.0))
     spoilt = replace(log, camera=wrong)
     start = solve_problem(spoilt, known(log.truth).poses, HUBER, marginals=False)
+    right = solve_problem(log, known(log.truth).poses, HUBER, marginals=False)
+    assert max(one.apart for one in measured_calibration(right)) < DOUBTFUL
+    focal, k1 = measured_calibration(start)
+    assert focal.apart > DOUBTFUL and focal._replace(stated=camera.fx).apart < 4.0
+    assert k1._replace(stated=0.0).apart < 4.0
     refined = refine_calibration(spoilt, start, lambda done, most: rounds.append(done))
     assert refined.batch.error < start.error
     off = np.array([refined.camera.fx / camera.fx - 1.0, refined.camera.distortion[0]])

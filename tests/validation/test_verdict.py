@@ -15,6 +15,7 @@ from rbpf.validation.consistency.against_groundtruth import pose_statistics
 from rbpf.validation.consistency.comparison import (
     INNOVATIONS,
     Verdict,
+    calibration_advice,
     compare_with_itself,
     grade_path,
     innovation_statistics,
@@ -23,7 +24,7 @@ from rbpf.validation.consistency.comparison import (
     noise_advice,
     verdict_of,
 )
-from rbpf.validation.consistency.statistic import coverage, step_ratio, variance_ratio, whitened_errors
+from rbpf.validation.consistency.statistic import Statistic, coverage, step_ratio, variance_ratio, whitened_errors
 from tests.core.scripted import Scripted, seen
 from tests.exactness.models import LinearMotion, LinearObservation
 
@@ -117,6 +118,19 @@ def test_innovations_alone_never_say_cautious():
         assert judge([good, *own], ["poses"]).trust == trust
     large = variance_ratio("innovations", 4.0, 5000.0, 1.1)
     assert judge([large, good], ["poses"], truth=["poses"]).leaning == "over-confident"
+
+
+def test_a_stated_calibration_that_the_measurements_contradict_is_not_trusted():
+    """The batch optimum has it, too, and vouches for any; a truth that supports the run says that it is good enough."""
+    good, own = variance_ratio("poses", 1.0, 400.0, 2.0), variance_ratio(INNOVATIONS, 1.0, 5000.0, 1.1)
+    for apart, trust in ((5.0, "cannot tell"), (7.0, "do not trust")):
+        wrong = Statistic("ranges: 1 is stated", apart, apart - 3.0, apart + 3.0, (-np.inf, 3.0), 99, "calibration")
+        found, names = [good, own, wrong], ["poses", wrong.name]
+        verdict = judge(found, names)
+        assert verdict.trust == trust and f"ranges: 1 is stated, {apart:.0f} standard deviations" in verdict.reason
+        assert judge(found, names, truth=["poses"]).trust == "trust"
+    for system, advice in (("range-bearing", "calibrate=odometry"), ("mono", "calibrate=online")):
+        assert advice in calibration_advice(record(system), [wrong])
 
 
 def test_the_path_has_a_light_of_its_own():

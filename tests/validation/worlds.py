@@ -24,15 +24,21 @@ MOUNT = {2: np.array([2.4, 0.3, -0.2]), 3: SE3.exp(np.array([0.2, 0.5, 2.4, 0.3,
 
 
 def world(
-    dim: int, kind: Kind, singular: bool = False, steps: int = 7, noise: float = 1.0, seed: int = 0
+    dim: int,
+    kind: Kind,
+    singular: bool = False,
+    steps: int = 7,
+    noise: float = 1.0,
+    seed: int = 0,
+    winding: bool = False,
 ) -> Measurements:
     """A drive of half a metre per step among six landmarks, seen by a sensor that looks back and down.
 
     Bearings cross ±π. With `singular` one direction of motion, not along an axis, is without noise; `noise`
-    multiplies all standard deviations.
+    multiplies all standard deviations. It turns alike all the way unless it is `winding`.
     """
     rng = np.random.default_rng(seed)
-    m, path = _drive(dim, kind, singular, steps, noise, rng)
+    m, path = _drive(dim, kind, singular, steps, noise, rng, winding)
     points = m.space.translation(path).mean(0) + rng.normal(scale=3.0, size=(len(NAMES), dim))
     at, which = (x.ravel() for x in np.indices((steps, len(NAMES))))
     kept = np.sort(rng.permutation(len(at))[: 4 * len(at) // 5])
@@ -43,7 +49,7 @@ def world(
 
 
 def _drive(
-    dim: int, kind: Kind, singular: bool, steps: int, noise: float, rng: np.random.Generator
+    dim: int, kind: Kind, singular: bool, steps: int, noise: float, rng: np.random.Generator, winding: bool
 ) -> tuple[Measurements, Array]:
     space, d = (SE2, 3) if dim == 2 else (SE3, 6)
     std = np.full(d, 0.03 * noise)
@@ -51,7 +57,7 @@ def _drive(
     turned = space.adjoint(space.exp(0.5 * MOTION[dim]))
     path, deltas = [space.exp(np.linspace(-0.4, 0.9, d))], []
     for slip in rng.normal(size=(steps - 1, d)) * std @ turned.T:
-        deltas.append(space.exp(MOTION[dim] * rng.uniform(0.6, 1.4)))
+        deltas.append(space.exp(MOTION[dim] * rng.uniform(0.6, 1.4, d if winding else 1)))
         path.append(space.retract(space.compose(path[-1], deltas[-1]), slip))
     cov = gaussian.symmetrise(turned @ np.diag(std**2) @ turned.T)
     m = Measurements(

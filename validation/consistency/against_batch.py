@@ -32,6 +32,7 @@ from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, poste
 from rbpf.validation.gtsam.batch_problem import OnIteration, Optimum, Problem, fit_of, floats_in_scale, solve_problem
 from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.gtsam.path_sampling import draw_posterior
+from rbpf.validation.gtsam.stated import DOUBTFUL, measured_calibration
 from rbpf.validation.metrics import gaussian_differences as gaussians
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
@@ -177,6 +178,13 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
                 "no witness of the uncertainty"
             )
     accuracy = f"The path is {distance(found.path.rmse)} (rms) from the batch optimum of the same measurements"
+    calibration = [one for one in measured_calibration(found.optimum) if np.isfinite(one.std)]
+    figures |= {f"{one.name}, measured": one.found for one in calibration}
+    figures |= {f"{one.name}, standard deviation": one.std for one in calibration}
+    for one in calibration:
+        if one.apart > DOUBTFUL:
+            ends, zone = (one.apart - DOUBTFUL, one.apart + DOUBTFUL), (-np.inf, DOUBTFUL)
+            statistics.append(Statistic(one.said, one.apart, *ends, zone, 1.0, "calibration"))
     # Single numbers of the Gaussians for the page; the rows behind them are `AgainstBatch.as_dict`'s.
     for name, rows in (("landmarks", found.landmarks), ("poses", found.poses)):
         figures |= {f"{name}_{key}": value for key, value in rows.as_dict().items() if not isinstance(value, list)}

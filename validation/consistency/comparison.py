@@ -141,6 +141,22 @@ def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     return f"The odometry errs alike in all steps: in the plane --set calibrate={more} learns what wheels get wrong."
 
 
+def calibration_advice(record: RunFolder, statistics: list[Statistic]) -> str:
+    """One sentence where a calibration contradicts the measurements: what finds a better one; else empty."""
+    wrong = [s.name for s in statistics if s.kind == "calibration" and s.outcome == "contradicts"]
+    if not wrong:
+        return ""
+    if record.system == "mono":
+        return (
+            "--set calibrate=online finds focal lengths and distortion while it runs, rbpf recalibrate RUN afterwards."
+        )
+    if wrong[0].startswith("ranges"):
+        return "Either the ranges are wrong, or the distances of the odometry are, --set calibrate=odometry."
+    return (
+        "--set calibrate=sensor finds the sensor's place on the robot, its yaw where self_calibration.yaw_deg is not 0."
+    )
+
+
 Trust = Literal["trust", "do not trust", "cannot tell"]
 Leaning = Literal["over-confident", "cautious", ""]
 Grade = Literal["good", "fair", "poor", "not known"]
@@ -225,16 +241,19 @@ def judge(
     among them that compare with the truth, which does not have the run's noise as the batch posterior has.
     """
     path = path or PathGrade()
-    against = [s for s in statistics if s.outcome == "contradicts"]
-    judging = [s for s in statistics if s.name in independent]
+    judging = [s for s in statistics if s.name in independent and s.kind != "calibration"]
     support = [s for s in judging if s.outcome == "supports"]
     told = [s for s in support if s.name in truth and s.kind == "ratio"]
+    # A calibration with which a run is as far from the truth as it says is good enough.
+    calibration = [s for s in statistics if s.kind == "calibration" and not told]
+    against = [s for s in statistics if s.outcome == "contradicts" and (s.kind != "calibration" or s in calibration)]
     # Those that say that it errs more than it claims; else those that may say that it errs less.
     daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
     witnesses = [s for s in against if s.name in independent]
     if against and (daring or witnesses or not told):
         more = f" ({len(against) - 1} more of {len(statistics)} statistics contradict it)" if len(against) > 1 else ""
-        worst = max(daring or witnesses or against, key=_distance)
+        alone = all(s.kind == "calibration" for s in against)
+        worst = against[0] if alone else max(daring or witnesses or against, key=_distance)
         if daring or witnesses:
             leaning: Leaning = "over-confident" if daring else "cautious"
             return Verdict(path, "do not trust", described(worst) + more, leaning)
@@ -244,6 +263,7 @@ def judge(
     # The batch posterior has the run's noise and calibration: without the truth no innovation may look larger than these say.
     noise = [s for s in statistics if s.name in (INNOVATIONS, RESIDUALS)]
     doubtful += [s for s in noise if not told and s.samples >= 1.0 and s.value > s.zone[1]]
+    doubtful += calibration
     if support and not doubtful and (told or noise):
         but = f"; but noise is stated too large: {described(max(against, key=_distance))}" if against else ""
         return Verdict(path, "trust", described((told or support)[0]) + but)
@@ -252,6 +272,8 @@ def judge(
             f"{described(support[0])}, but the batch optimum has the run's own calibration and noise, and no innovation "
             "tells whether these are right; compare it with the truth"
         )
+    elif doubtful and doubtful[0].kind == "calibration":
+        reason = f"{described(doubtful[0])}: more than chance allows for, and less than would be beyond doubt"
     elif judging:
         first = (doubtful or judging)[0]
         zone = first.zone if first.kind != "ratio" else tuple(map(_root, first.zone))
@@ -291,7 +313,7 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
     independent = [s.name for c in comparisons if c.accuracy for s in c.statistics if s.name != RESIDUALS]
     truth = [s.name for c in comparisons if c.against == "groundtruth" for s in c.statistics]
     verdict = judge(statistics, independent, path, truth)
-    advice = motion_advice(record, statistics), noise_advice(record, statistics)
+    advice = [advise(record, statistics) for advise in (calibration_advice, motion_advice, noise_advice)]
     return replace(verdict, advice=" ".join(filter(None, advice)))
 
 
@@ -303,6 +325,8 @@ def described(statistic: Statistic) -> str:
             f"the {statistic.name} is {value:.2g} of its standard deviations in every step "
             f"({low:.2g} to {high:.2g}; up to {statistic.zone[1]:g} is harmless)"
         )
+    if statistic.kind == "calibration":
+        return f"{statistic.name}, {value:.2g} standard deviations from it"
     if statistic.kind == "share":
         return f"{statistic.name}: {100 * value:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     times, least, most = (_number(_root(ratio)) for ratio in (value, low, high))

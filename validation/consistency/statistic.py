@@ -52,8 +52,9 @@ class Statistic:
     high: float
     zone: tuple[float, float]  #: where it may lie.
     samples: float  #: effective degrees of freedom or number of independent samples behind it.
-    #: a ratio of variances, a bias in standard deviations, or a fraction of cases.
-    kind: Literal["ratio", "bias", "share"] = "ratio"
+    #: a ratio of variances, a bias in standard deviations, a fraction of cases, or how many standard deviations a stated
+    #: calibration is from what is measured.
+    kind: Literal["ratio", "bias", "share", "calibration"] = "ratio"
 
     @property
     def outcome(self) -> Literal["supports", "contradicts", "leaves open"]:

@@ -17,7 +17,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME, camera_text
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam.batch_problem import Optimum, softened, solve_problem
-from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, adjust, begin
+from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, CameraState, adjust, begin
 from rbpf.validation.gtsam.observations import HUBER, Residuals, known_by_name, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals, together
 
@@ -44,30 +44,10 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None 
     `on_round` is called with the iterations done, and the most that there can be. Errors as of `solve_problem`.
     """
     assert isinstance(batch.problem, FeatureLog) and isinstance(batch.problem.camera, Pinhole)
-    camera, full, path = batch.problem.camera, observation_table(batch.problem), batch.estimate.world_from_body
-    known = known_by_name(softened(batch.problem.known), full.names)
-    given = CameraProblem(log.name, len(path), full.determined(known), known, HUBER)
-    found = adjust(given, begin(given, InitialEstimate(path, batch.estimate.landmarks.named())))
-    problem, key = found.problem, int(gtsam.symbol("c", 0))
-
-    def changed(change: np.ndarray) -> Pinhole:
-        k1, *others = camera.distortion
-        focal = 1.0 + float(change[0])
-        lens = (k1 + float(change[1]), *others)
-        return replace(camera, fx=camera.fx * focal, fy=camera.fy * focal, distortion=lens)
-
-    def evaluate(values: Any) -> Residuals:
-        state, change = problem.state(values), values.atVector(key)
-
-        def at(change: np.ndarray) -> Residuals:
-            return reprojection(replace(problem.table, camera=changed(change)), state.path, state.points)
-
-        residuals, slopes = at(change)
-        moved = [at(change + step)[0] - at(change - step)[0] for step in _STEP * np.eye(2)]
-        return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
-
-    factor = together(evaluate)
-    factors = problem.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point, key], model))
+    camera, key = batch.problem.camera, int(gtsam.symbol("c", 0))
+    found = adjust(*camera_problem(batch.problem, batch))
+    problem, path = found.problem, batch.estimate.world_from_body
+    factors = with_camera(problem, camera, key)
     graph = problem.graph(found.state, found.loose, path, SCALE, factors)
     values = problem.values(found.state)
     values.insert(key, np.zeros(2))
@@ -78,10 +58,43 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None 
         std = np.sqrt(np.diagonal(marginals(graph, values, [key])[0]))
     except RuntimeError:
         pass
-    better = adjust_near(replace(log, camera=changed(values.atVector(key))), batch)
+    better = adjust_near(replace(log, camera=changed(camera, values.atVector(key))), batch)
     best = min(batch, better, key=lambda one: one.error)
     assert isinstance(best.problem, FeatureLog) and isinstance(best.problem.camera, Pinhole)
     return Calibrated(best.problem.camera, best, std)
+
+
+def camera_problem(log: FeatureLog, batch: Optimum) -> tuple[CameraProblem, CameraState]:
+    """The problem of a log that is the batch's or nearly so, and the optimum there."""
+    full, path = observation_table(log), batch.estimate.world_from_body
+    known = known_by_name(softened(log.known), full.names)
+    problem = CameraProblem(log.name, len(path), full.determined(known), known, HUBER)
+    return problem, begin(problem, InitialEstimate(path, batch.estimate.landmarks.named()))
+
+
+def with_camera(problem: CameraProblem, camera: Pinhole, key: int) -> list[Any]:
+    """Factors of the observations that hang on the variable of a key, too: a change (2,) of the camera, see `changed`."""
+
+    def evaluate(values: Any) -> Residuals:
+        state, change = problem.state(values), values.atVector(key)
+
+        def at(change: np.ndarray) -> Residuals:
+            return reprojection(replace(problem.table, camera=changed(camera, change)), state.path, state.points)
+
+        residuals, slopes = at(change)
+        moved = [at(change + step)[0] - at(change - step)[0] for step in _STEP * np.eye(2)]
+        return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
+
+    factor = together(evaluate)
+    return problem.factors_by_row(lambda row, model, pose, point: factor(row, [pose, point, key], model))
+
+
+def changed(camera: Pinhole, change: np.ndarray) -> Pinhole:
+    """A camera whose focal lengths are longer by a fraction, and whose k1 is larger."""
+    k1, *others = camera.distortion
+    focal = 1.0 + float(change[0])
+    lens = (k1 + float(change[1]), *others)
+    return replace(camera, fx=camera.fx * focal, fy=camera.fy * focal, distortion=lens)
 
 
 def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
