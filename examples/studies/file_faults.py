@@ -16,10 +16,13 @@ from pathlib import Path
 import numpy as np
 
 LIMITED = (
-    "import resource, sys; from rbpf.cli import main; "
+    "import resource, sys; from rbpf.cli import main; sys.dont_write_bytecode = True; "
     "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2); sys.exit(main(sys.argv[2:]))"
 )
-"""A program whose files cannot grow beyond so many bytes: what writes more gets an error, as on a full disk."""
+"""A program whose files cannot grow beyond so many bytes: what writes more gets an error, as on a full disk.
+
+It writes no bytecode, which would be cut off unnoticed.
+"""
 
 Damage = Callable[[Path], None]
 
