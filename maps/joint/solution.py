@@ -12,6 +12,8 @@ from rbpf.maps.joint.elimination import Elimination, cliques_of
 
 ENOUGH, ITERATIONS = 0.1, 20
 """Length of the last step to a solution, in standard deviations of all of it together, and how many there are at most."""
+LESS = 0.9
+"""Of what sub-maps were given, the fraction that is taken off where all of it is more than they say."""
 EXACT = 1e-5
 """Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
 
@@ -134,7 +136,7 @@ class Solution(NamedTuple):
     constants: np.ndarray
     factors: list[Factor]
     eliminated: Elimination
-    is_whole: bool  #: is a minimum of all that is known, and nothing counts twice.
+    is_whole: bool  #: is a minimum of all that is known, and next to nothing counts twice.
 
     def seen_from(
         self, space: SE2Group | SE3Group | Euclidean, number: int, rows: np.ndarray
@@ -158,13 +160,14 @@ def solve(
     starts: np.ndarray,
     world: np.ndarray,
     constants: np.ndarray,
-    is_whole: bool = True,
+    off: float = 1.0,
 ) -> Solution:
     """Gauss-Newton over all starts and some landmarks (M,); the others of a sub-map are left out of its factor.
 
     It begins at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
-    `constants` (k,). What sub-maps were given is taken off, and what all but the first knew of constants before. Where that
-    leaves no minimum, as when a filter has diverged, it is not.
+    `constants` (k,). What sub-maps were given is taken `off`, and what all but the first knew of constants before. It was
+    linearised elsewhere: where that leaves no minimum, a tenth of it stays; where this does not either, as when a filter
+    has diverged, all of it.
     """
     d, dim, k, first_guess = space.dim, world.shape[1], constants.size, (starts, world, constants)
     starts, world = starts.copy(), world.copy()
@@ -193,11 +196,11 @@ def solve(
     # What a sub-map was given is not its own: others say it.
     taken = []
     for number, each in enumerate(maps):
-        if each.given is not None and is_whole:
+        if each.given is not None and off:
             at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
-            taken.append((number, each.given.points, at, columns, inverse_of(each.given.cov)))
-    before = [(each.known.mean, inverse_of(each.known.cov)) for each in maps[1:] if k and is_whole]
+            taken.append((number, each.given.points, at, columns, off * inverse_of(each.given.cov)))
+    before = [(each.known.mean, off * inverse_of(each.known.cov)) for each in maps[1:] if k and off]
     known = sum((info for _, info in before), np.zeros((k, k)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken] + [common]
     free = [columns >= 0 for columns in blocks]  # the first start is where the world is
@@ -232,7 +235,7 @@ def solve(
             eliminated = Elimination(size, blocks, cliques, summands)
         except LinAlgError as error:
             if taken or before:
-                return solve(space, maps, ids, *first_guess, is_whole=False)
+                return solve(space, maps, ids, *first_guess, off=LESS if off == 1.0 else 0.0)
             raise InputError("the sub-maps leave a start or a landmark undetermined") from error
         step = -eliminated.solve(gradient[:size])
         starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))
@@ -240,7 +243,7 @@ def solve(
         constants = constants + step[size - k :]
         if -step @ gradient[:size] < ENOUGH**2:
             break
-    return Solution(ids, world, starts, constants, factors, eliminated, is_whole)
+    return Solution(ids, world, starts, constants, factors, eliminated, is_whole=off > 0.0)
 
 
 def _weighed(

@@ -333,6 +333,16 @@ def test_what_was_given_and_cannot_be_taken_off_stays():
     maps.solve()
     np.testing.assert_equal((maps.start, maps.about.cov), (start, cov))
     assert np.linalg.eigvalsh(maps.landmarks()[2]).min() > 0.0
+    # Where what was given is all that is known of some, a tenth of it stays: how it is linearised would decide.
+    maps.maps[3] = maps.maps[3]._replace(given=None)
+    seen, own = (whole := maps._solve(maps.ids)).seen_from(SE2, 3, np.arange(3))
+    for told, off in ((0.5, 1.0), (0.9999, 0.9), (1.2, 0.0)):
+        maps.maps[3] = maps.maps[3]._replace(given=Given(whole.ids[:3], seen, own[3:, 3:] / told))
+        found = maps._solve(maps.ids)
+        assert found.is_whole == (off > 0.0)
+        left = found.seen_from(SE2, 3, np.arange(3))[1][3:, 3:] * (1.0 - off * told)
+        np.testing.assert_allclose(left, own[3:, 3:], rtol=1e-3, atol=1e-5)
+    maps.maps[3] = maps.maps[3]._replace(given=Given(maps.about.ids[:3], maps.about.points[:3], 1e-8 * np.eye(6)))
     maps.maps[2] = maps.maps[2]._replace(cov=-maps.maps[2].cov)
     maps.solve()
     np.testing.assert_equal((maps.start, maps.about.cov), (start, cov))
