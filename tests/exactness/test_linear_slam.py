@@ -11,18 +11,8 @@ from rbpf.lie import SE2, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.range_bearing import RelativePosition
+from tests.exactness import slam
 from tests.exactness.models import Relative, Scripted, assert_unbiased, deviation
-from tests.exactness.slam import (
-    ALONG,
-    DRIFTING,
-    TURNED,
-    LinearSlam,
-    Walk,
-    turned,
-    unnormalised_errors,
-    velocity,
-    walked,
-)
 
 pytestmark = pytest.mark.slow
 
@@ -41,30 +31,30 @@ def agree(logs: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
     ids=["prior", "ekf"],
 )
 def test_fastslam_agrees_with_the_joint_kalman_filter(proposal, resampler, stream):
-    world = walked()
+    world = slam.walked()
 
     def build(rng: np.random.Generator) -> Filter:
-        return Filter(Walk(), Scripted(), LandmarkMap(Euclidean(2)), proposal, resampler, 60, rng)
+        return Filter(slam.Walk(), Scripted(), LandmarkMap(Euclidean(2)), proposal, resampler, 60, rng)
 
-    agree(*unnormalised_errors(build, world.frames(Relative()), world.kalman, stream))
+    agree(*slam.unnormalised_errors(build, world.frames(Relative()), world.kalman, stream))
 
 
 def test_a_turned_robot_with_singular_noise_and_the_compiled_kernel(stream):
     """SE(2) with a heading that is known: the noise has no component along it."""
-    world = turned()
+    world = slam.turned()
 
     def build(rng: np.random.Generator) -> Filter:
-        return Filter(OdometryMotion(SE2), Scripted(), LandmarkMap(SE2), n=60, rng=rng, start=TURNED)
+        return Filter(OdometryMotion(SE2), Scripted(), LandmarkMap(SE2), n=60, rng=rng, start=slam.TURNED)
 
-    agree(*unnormalised_errors(build, world.frames(RelativePosition(SE2)), world.kalman, stream, ALONG))
+    agree(*slam.unnormalised_errors(build, world.frames(RelativePosition(SE2)), world.kalman, stream, slam.ALONG))
 
 
 def test_a_velocity_beside_a_map_agrees_with_the_joint_kalman_filter(stream):
-    start, space = velocity(), DRIFTING.space
-    world = LinearSlam(*DRIFTING.joint(), start, np.eye(2), seed=33)
+    start, space = slam.velocity(), slam.DRIFTING.space
+    world = slam.LinearSlam(*slam.DRIFTING.joint(), start, np.eye(2), seed=33)
 
     def build(rng: np.random.Generator) -> Filter:
         substate = KalmanSubstate(space, start.mean[2:], start.cov[2:, 2:])
-        return Filter(DRIFTING, Scripted(), [substate, LandmarkMap(space)], n=80, rng=rng)
+        return Filter(slam.DRIFTING, Scripted(), [substate, LandmarkMap(space)], n=80, rng=rng)
 
-    agree(*unnormalised_errors(build, world.frames(Relative()), world.kalman, stream))
+    agree(*slam.unnormalised_errors(build, world.frames(Relative()), world.kalman, stream))

@@ -11,18 +11,7 @@ from rbpf.core.smoothing import _transition_log_density, ancestral_smoothing, ba
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from tests.exactness.models import (
-    SEEDS,
-    Frame,
-    Kalman,
-    LinearMotion,
-    LinearObservation,
-    Scripted,
-    assert_unbiased,
-    deviation,
-    single,
-    smooth,
-)
+from tests.exactness import models
 
 pytestmark = pytest.mark.slow
 
@@ -30,25 +19,25 @@ STEPS = 7
 F = np.array([[1.0, 0.7], [0.0, 0.9]])
 L = np.array([[0.35, 0.0], [0.15, 0.3]])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.3]])
-MODEL = LinearObservation(by_state=H)
+MODEL = models.LinearObservation(by_state=H)
 INPUTS = np.array([[0.5 * np.sin(t), 0.3 * (-1) ** t] for t in range(STEPS)])
 """Known, and different in each step: an input taken from the wrong step would show."""
 
 
 @pytest.fixture(scope="module")
-def measured() -> tuple[list[Frame], Kalman, list[tuple[np.ndarray, np.ndarray]]]:
+def measured() -> tuple[list[models.Frame], models.Kalman, list[tuple[np.ndarray, np.ndarray]]]:
     """Frames, the Kalman filter at the end, and the exact smoothed moments."""
     rng = np.random.default_rng(51)
     truth, frames = np.zeros(2), []
-    kalman = Kalman(np.zeros(2), np.zeros((2, 2)))
+    kalman = models.Kalman(np.zeros(2), np.zeros((2, 2)))
     for u in INPUTS:
         truth = F @ truth + u + L @ rng.normal(size=2)
         z = H @ truth + np.sqrt(R[0]) * rng.normal(size=1)
-        frames.append(Frame([single(z, R, MODEL)]))
+        frames.append(models.Frame([models.single(z, R, MODEL)]))
         kalman.predict(F, L @ L.T, u)
         kalman.update(z, H, R)
         kalman.record()
-    exact = smooth(kalman.path, F, L @ L.T, INPUTS)
+    exact = models.smooth(kalman.path, F, L @ L.T, INPUTS)
     # The smoother and the filter differ by more than what the tests could overlook.
     assert max(
         abs(mean - filtered)[0] / np.sqrt(cov[0, 0])
@@ -57,9 +46,9 @@ def measured() -> tuple[list[Frame], Kalman, list[tuple[np.ndarray, np.ndarray]]
     return frames, kalman, exact
 
 
-def run(frames: list[Frame], n: int, rng: np.random.Generator, **options) -> Filter:
-    motion = LinearMotion(F, L)
-    filter_ = Filter(motion, Scripted(), n=n, rng=rng, **options)
+def run(frames: list[models.Frame], n: int, rng: np.random.Generator, **options) -> Filter:
+    motion = models.LinearMotion(F, L)
+    filter_ = Filter(motion, models.Scripted(), n=n, rng=rng, **options)
     for frame, u in zip(frames, INPUTS, strict=True):
         filter_.step(frame, u)
     return filter_
@@ -71,7 +60,7 @@ def test_ancestral_paths_are_unbiased(measured, proposal, stream):
     frames, kalman, exact = measured
     means, covs = (np.array(part) for part in zip(*exact, strict=True))
     logs, first, second = [], [], []
-    for seed in range(SEEDS):
+    for seed in range(models.SEEDS):
         rng = np.random.default_rng([stream, seed])
         filter_ = run(frames, 60, rng, proposal=proposal, resampler=EssTriggered(Systematic(), 0.6))
         smoothed = ancestral_smoothing(filter_.space, filter_.history, filter_.particles.weights)
@@ -79,10 +68,10 @@ def test_ancestral_paths_are_unbiased(measured, proposal, stream):
         error = smoothed.mean - means
         first.append(np.exp(logs[-1]) * error)
         second.append(np.exp(logs[-1]) * (smoothed.cov + error[:, :, None] * error[:, None, :] - covs))
-    assert_unbiased(np.array(logs))
-    assert deviation(np.array(first), 0.0) <= 4.0
+    models.assert_unbiased(np.array(logs))
+    assert models.deviation(np.array(first), 0.0) <= 4.0
     rows, columns = np.triu_indices(2)
-    assert deviation(np.array(second)[:, :, rows, columns], 0.0) <= 4.0
+    assert models.deviation(np.array(second)[:, :, rows, columns], 0.0) <= 4.0
 
 
 def test_backward_simulation_agrees_with_the_exact_smoother(measured, stream):
@@ -97,7 +86,7 @@ def test_backward_simulation_agrees_with_the_exact_smoother(measured, stream):
         ancestral.append(ancestral_smoothing(filter_.space, filter_.history, filter_.particles.weights))
     std = np.sqrt(np.array([np.diag(cov) for cov in covs]))
     error, worse = ((np.array([smoothed.mean for smoothed in of]) - means) / std for of in (runs, ancestral))
-    assert deviation(error, 0.0) <= 4.0
+    assert models.deviation(error, 0.0) <= 4.0
     assert np.abs(error.mean(axis=0)).max() < 0.08
     assert np.square(error[:, 0]).mean() < 0.85 * np.square(worse[:, 0]).mean()
     spread = np.mean([smoothed.cov for smoothed in runs], axis=0)
@@ -114,12 +103,12 @@ def test_backward_simulation_says_what_it_cannot_do(measured):
     with pytest.raises(InputError, match="clouds=True and no lag"):
         backward_simulation(lagged.motion, lagged.history, 5, rng)
     kept = run(measured[0], 10, rng, clouds=True)
-    singular = LinearMotion(F, np.array([[0.3], [0.1]]))
+    singular = models.LinearMotion(F, np.array([[0.3], [0.1]]))
     with pytest.raises(InputError, match="regular noise"):
         backward_simulation(singular, kept.history, 5, rng, list(INPUTS))
-    driven = LinearMotion(F, np.eye(4), np.eye(2), np.eye(2), np.zeros(2))
+    driven = models.LinearMotion(F, np.eye(4), np.eye(2), np.eye(2), np.zeros(2))
     substate = KalmanSubstate(driven.space, np.zeros(2), np.eye(2))
-    filter_ = Filter(driven, Scripted(), substate, n=10, rng=rng, clouds=True)
+    filter_ = Filter(driven, models.Scripted(), substate, n=10, rng=rng, clouds=True)
     for frame in measured[0]:
         filter_.step(frame)
     with pytest.raises(InputError, match="without a substate"):

@@ -5,16 +5,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.camera.resection import (
-    GATE,
-    Sights,
-    refined,
-    refined_on_all,
-    resect,
-    resect_consensus,
-    squared_distances,
-)
+from rbpf.sensors.camera import Pinhole, resection
 from tests.sensors.camera_scenes import CAMERAS, PLAIN
 
 SQUARE = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.0]])
@@ -49,7 +40,7 @@ def test_without_noise_it_is_the_truth(camera, count):
     rng = np.random.default_rng(count)
     for _ in range(15):
         pose, points, px = scene(rng, camera, count)
-        found = resect(camera, points, px)
+        found = resection.resect(camera, points, px)
         assert cost(camera, found, points, px) < 1e-16
         if count > 4:
             assert distance(found, pose) < 1e-6
@@ -57,7 +48,7 @@ def test_without_noise_it_is_the_truth(camera, count):
 
 def test_too_few_points():
     with pytest.raises(InputError, match="at least four that are seen, got 3"):
-        resect(PLAIN, SQUARE[:3], np.full((3, 2), 100.0))
+        resection.resect(PLAIN, SQUARE[:3], np.full((3, 2), 100.0))
 
 
 @pytest.mark.parametrize("bend", [0.0, 1e-4])
@@ -65,7 +56,7 @@ def test_points_on_a_line(bend):
     line = np.outer(np.arange(5.0), [0.3, 0.1, 0.2]) + np.array([0.0, 0.0, 2.0])
     line[2, 0] += bend
     with pytest.raises(InputError, match="the known points lie on a line: add one beside it"):
-        resect(PLAIN, line, PLAIN.project(line))
+        resection.resect(PLAIN, line, PLAIN.project(line))
 
 
 def test_pixels_of_other_points():
@@ -74,7 +65,7 @@ def test_pixels_of_other_points():
     for _ in range(80):
         _, points, _ = scene(rng, PLAIN)
         try:
-            found = resect(PLAIN, points, rng.uniform([0.0, 0.0], [640.0, 480.0], size=(4, 2)))
+            found = resection.resect(PLAIN, points, rng.uniform([0.0, 0.0], [640.0, 480.0], size=(4, 2)))
         except InputError as error:
             refused.add(str(error))
         else:
@@ -88,7 +79,7 @@ def test_pixels_without_a_direction():
     assert np.isnan(folding.unproject(np.array([2.0, 2.0]))).all()
     px = np.array([[2.0, 2.0], [500.0, 100.0], [400.0, 400.0], [100.0, 300.0]])
     with pytest.raises(InputError, match="the camera's distortion has no direction: check the calibration"):
-        resect(folding, SQUARE, px)
+        resection.resect(folding, SQUARE, px)
 
 
 CAMERA = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.2, 0.05, 0.001, -0.001, 0.0))
@@ -107,7 +98,7 @@ def test_finds_the_camera_among_mistakes(mistaken):
     rng = np.random.default_rng(mistaken)
     points, px = seen(25 + mistaken, rng)
     px[:mistaken] = rng.uniform((0, 0), (640, 480), (mistaken, 2))
-    found = resect_consensus(CAMERA, points, px, 4.0, 300, rng)
+    found = resection.resect_consensus(CAMERA, points, px, 4.0, 300, rng)
     assert found is not None
     assert found.inliers[mistaken:].mean() > 0.95
     assert found.inliers[:mistaken].sum() <= 1
@@ -120,7 +111,7 @@ def test_information_of_known_points_is_that_of_the_error():
     for seed in range(60):
         points, px = seen(20, np.random.default_rng(1), 0.0)
         px = px + 0.5 * np.random.default_rng(seed).normal(size=px.shape)
-        found = refined(CAMERA, POSE, points, px, 10.0)
+        found = resection.refined(CAMERA, POSE, points, px, 10.0)
         assert found is not None
         errors.append(SE3.log(SE3.between(POSE, found.world_from_camera)))
         predicted = 0.25 * np.linalg.inv(found.information)
@@ -131,7 +122,9 @@ NEAR = SE3.retract(SE3.identity(), np.array([0.05, -0.1, 0.1, 0.3, -0.1, 0.1]))
 START = SE3.retract(NEAR, np.array([0.01, -0.01, 0.01, 0.02, 0.01, -0.02]))
 
 
-def sights_of(known: int, on_lines: int, rng: np.random.Generator, noise_px: float, wrong: bool = True) -> Sights:
+def sights_of(
+    known: int, on_lines: int, rng: np.random.Generator, noise_px: float, wrong: bool = True
+) -> resection.Sights:
     """Points that a camera at the origin sees; of those on lines the depth may be wrong by up to a third."""
     count = known + on_lines
     uv = rng.uniform(-0.35, 0.35, (count, 2))
@@ -143,7 +136,7 @@ def sights_of(known: int, on_lines: int, rng: np.random.Generator, noise_px: flo
         told[known:] *= 2.0 / depth[known:]
     spread = 0.5 * told
     spread[:known] = 0.0
-    return Sights(told, spread, px, np.full(count, max(noise_px, 0.5)))
+    return resection.Sights(told, spread, px, np.full(count, max(noise_px, 0.5)))
 
 
 def test_distances_are_those_of_the_covariance():
@@ -153,7 +146,7 @@ def test_distances_are_those_of_the_covariance():
     cov = sights.std_px[:, None, None] ** 2 * np.eye(2) + slope[:, :, None] * slope[:, None]
     miss = sights.px - CAMERA.project(seen)
     expected = np.einsum("mp,mpq,mq->m", miss, np.linalg.inv(cov), miss)
-    assert squared_distances(CAMERA, START[None], sights)[0] == pytest.approx(expected, rel=1e-4)
+    assert resection.squared_distances(CAMERA, START[None], sights)[0] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(("wrong", "error"), [(False, 1e-6), (True, 0.02)])
@@ -161,7 +154,7 @@ def test_lines_fix_the_motion_and_few_points_its_length(wrong, error):
     rng = np.random.default_rng(1)
     sights = sights_of(4, 60, rng, 0.0, wrong)
     sights.px[10:20] = rng.uniform((0.0, 0.0), (640.0, 480.0), (10, 2))
-    found = refined_on_all(CAMERA, START, sights)
+    found = resection.refined_on_all(CAMERA, START, sights)
     assert found is not None
     assert np.abs(SE3.log(SE3.between(NEAR, found.world_from_camera))).max() < error
     assert found.inliers[:10].all() and found.inliers[20:].all()
@@ -171,7 +164,7 @@ def test_lines_fix_the_motion_and_few_points_its_length(wrong, error):
 def test_information_is_that_of_the_error():
     errors, predicted = [], []
     for seed in range(80):
-        found = refined_on_all(CAMERA, START, sights_of(8, 60, np.random.default_rng(seed), 0.7))
+        found = resection.refined_on_all(CAMERA, START, sights_of(8, 60, np.random.default_rng(seed), 0.7))
         assert found is not None
         errors.append(SE3.log(SE3.between(NEAR, found.world_from_camera)))
         predicted.append(np.linalg.inv(found.information))
@@ -182,8 +175,8 @@ def test_information_is_that_of_the_error():
 
 def test_too_few_or_none_that_agree_fix_nothing():
     sights = sights_of(3, 0, np.random.default_rng(0), 0.0)
-    assert refined_on_all(CAMERA, START, sights) is None
+    assert resection.refined_on_all(CAMERA, START, sights) is None
     other = sights_of(0, 30, np.random.default_rng(0), 0.0)
     other.px[:] += 400.0
-    assert refined_on_all(CAMERA, START, other) is None
-    assert (squared_distances(CAMERA, START[None], other) > GATE).all()
+    assert resection.refined_on_all(CAMERA, START, other) is None
+    assert (resection.squared_distances(CAMERA, START[None], other) > resection.GATE).all()

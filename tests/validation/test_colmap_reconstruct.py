@@ -14,16 +14,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers import open_images
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.colmap.compare import (
-    Reconstruction,
-    ReconstructionOptions,
-    cloud_distance,
-    compare_folder_with_colmap,
-    compare_with_colmap,
-    compare_with_path,
-    compare_with_truth,
-    reconstruct,
-)
+from rbpf.validation.colmap import compare
 from rbpf.validation.colmap.model import HALF_PX, to_colmap_camera
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -31,7 +22,7 @@ from tests.systems import plane_sequences
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, WHOLE
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
-FEW = ReconstructionOptions(every=1, features=800)
+FEW = compare.ReconstructionOptions(every=1, features=800)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +35,7 @@ def desk(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(desk):
-    return reconstruct(*desk)
+    return compare.reconstruct(*desk)
 
 
 def made(points=None, metric=False, scale=1.0):
@@ -55,14 +46,14 @@ def made(points=None, metric=False, scale=1.0):
     cloud = rng.uniform(-1, 1, (200, 3)) * scale if points is None else points
     count = np.arange(8)
     model = pycolmap.Reconstruction()
-    return Reconstruction("by hand", count, count, 1_000 * count, poses, cloud, metric, model)
+    return compare.Reconstruction("by hand", count, count, 1_000 * count, poses, cloud, metric, model)
 
 
 @pytest.mark.slow
 def test_a_rendered_desk_is_reconstructed_and_is_right(desk, found):
     sequence, _ = desk
     assert found.fraction >= 0.9
-    compared = compare_with_truth(found, sequence.truth)
+    compared = compare.compare_with_truth(found, sequence.truth)
     assert compared.path.rmse < 0.01 * compared.extent_m
     assert len(found.points) > 100
     assert found.as_dict()["reprojection_error_mean_px"] < 1.0
@@ -70,7 +61,7 @@ def test_a_rendered_desk_is_reconstructed_and_is_right(desk, found):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_reconstruction(desk, found):
-    again = reconstruct(*desk)
+    again = compare.reconstruct(*desk)
     assert (again.world_from_camera == found.world_from_camera).all()
     assert (again.points == found.points).all()
 
@@ -79,10 +70,10 @@ def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
     truth = made()
     moved = made(scale=3.0)
     reference = Trajectory(truth.stamps_ns, truth.world_from_camera)
-    similar = compare_with_path(moved, reference)
+    similar = compare.compare_with_path(moved, reference)
     assert similar.path.rmse < 1e-12
     assert similar.reference_from_colmap.scale == pytest.approx(1 / 3)
-    rigid = compare_with_path(replace(moved, metric=True), reference)
+    rigid = compare.compare_with_path(replace(moved, metric=True), reference)
     assert rigid.path.rmse > 0.1
     assert rigid.as_dict()["scale"] == 1.0
 
@@ -92,7 +83,7 @@ def test_the_distance_from_a_surface_does_not_depend_on_how_sparse_the_cloud_is(
     wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.zeros(300)])
     landmarks = np.column_stack([rng.uniform(-0.8, 0.8, (40, 2)), np.full(40, 0.01)])
     cov = turn @ np.diag([1.0, 1.0, 0.02]) ** 2 @ turn.T
-    found = cloud_distance(wall @ turn.T, landmarks @ turn.T, np.repeat(cov[None], 40, axis=0))
+    found = compare.cloud_distance(wall @ turn.T, landmarks @ turn.T, np.repeat(cov[None], 40, axis=0))
     assert found.surface_m == pytest.approx(np.full(40, 0.01), rel=1e-6)
     assert found.sigmas == pytest.approx(np.full(40, 0.5), rel=1e-6)
     assert np.median(found.nearest_m) > 0.02
@@ -109,7 +100,7 @@ def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
     world = replace(ours, world_from_camera=SE3.compose(turn, shaken), points=SE3.transform(turn, ours.points))
     count = len(ours.points)
     points = MapEstimate(np.arange(count), ours.points, np.repeat(np.eye(3)[None], count, axis=0))
-    moved = compare_with_path(world, reference, points)
+    moved = compare.compare_with_path(world, reference, points)
     by_cameras, by_centres = (
         np.linalg.norm(move.transform(world.points) - ours.points, axis=1).max()
         for move in (moved.reference_from_colmap, moved.path.alignment)
@@ -123,22 +114,22 @@ def test_what_cannot_be_compared_is_refused():
     ours = made()
     late = Truth(ours.stamps_ns + 10**12, ours.world_from_camera)
     with pytest.raises(InputError, match="covers 0 of 8 key frames"):
-        compare_with_truth(ours, late)
+        compare.compare_with_truth(ours, late)
     with pytest.raises(InputError, match="same clock"):
-        compare_with_path(ours, Trajectory(ours.stamps_ns + 10**12, ours.world_from_camera))
+        compare.compare_with_path(ours, Trajectory(ours.stamps_ns + 10**12, ours.world_from_camera))
     with pytest.raises(InputError, match="share 2 instants"):
-        compare_with_path(ours, Trajectory(ours.stamps_ns[:2], ours.world_from_camera[:2]))
+        compare.compare_with_path(ours, Trajectory(ours.stamps_ns[:2], ours.world_from_camera[:2]))
     with pytest.raises(InputError, match="3 or more points"):
-        cloud_distance(ours.points[:2], ours.points, np.repeat(np.eye(3)[None], len(ours.points), axis=0))
+        compare.cloud_distance(ours.points[:2], ours.points, np.repeat(np.eye(3)[None], len(ours.points), axis=0))
 
 
 def test_too_few_key_frames_are_refused():
     sequence = plane_sequences.sequence(5)
     with pytest.raises(InputError, match="has 1 readable key frames of 5 images, expected 3"):
-        reconstruct(sequence, ReconstructionOptions(every=10))
+        compare.reconstruct(sequence, compare.ReconstructionOptions(every=10))
     dark = plane_sequences.sequence(4, lambda t, image: None if t % 2 else image)
     with pytest.raises(InputError, match="has 2 readable key frames"):
-        reconstruct(dark, FEW)
+        compare.reconstruct(dark, FEW)
 
 
 def test_a_run_without_images_is_refused(tmp_path):
@@ -146,15 +137,15 @@ def test_a_run_without_images_is_refused(tmp_path):
 
     (tmp_path / "config.yaml").write_text(f"rbpf: {__version__}\nsystem: range-bearing\n")
     with pytest.raises(InputError, match="needs a run over images"):
-        compare_folder_with_colmap(tmp_path)
+        compare.compare_folder_with_colmap(tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_photos_with_measured_poses_are_met_within_one_per_cent(data_dir):
     sequence = open_images(data_dir / "photos_fountain_p11")
-    found = reconstruct(sequence, ReconstructionOptions(every=1, features=2000))
-    compared = compare_with_truth(found, sequence.truth)
+    found = compare.reconstruct(sequence, compare.ReconstructionOptions(every=1, features=2000))
+    compared = compare.compare_with_truth(found, sequence.truth)
     assert found.fraction == 1.0
     assert compared.path.max < 0.01 * compared.extent_m
     assert compared.path.rmse < 0.01, "a laser scanner's truth is good to a centimetre"
@@ -167,7 +158,7 @@ def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
     truth = sequence.truth
     points = MapEstimate(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
     estimate = PathAndMap(truth.stamps_ns, truth.poses, np.empty((0, 6, 6)), points)
-    run, own = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=16, features=1500))
+    run, own = compare.compare_with_colmap(estimate, sequence, compare.ReconstructionOptions(every=16, features=1500))
     assert run.reconstruction.fraction >= 0.9
     assert own.path.rmse < 0.05, "the reference reconstruction is 0.038 m from this truth"
     assert run.path.rmse == pytest.approx(own.path.rmse, rel=0.05)

@@ -11,19 +11,8 @@ from rbpf.core.filter import Filter
 from rbpf.runs.folder import write_run
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.results import Results
+from rbpf.validation.consistency import comparison
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
-from rbpf.validation.consistency.comparison import (
-    INNOVATIONS,
-    Verdict,
-    calibration_advice,
-    compare_with_itself,
-    grade_path,
-    innovation_statistics,
-    judge,
-    motion_advice,
-    noise_advice,
-    verdict_of,
-)
 from rbpf.validation.consistency.statistic import Statistic, coverage, step_ratio, variance_ratio, whitened_errors
 from tests.core.scripted import Scripted, seen
 from tests.exactness.models import LinearMotion, LinearObservation
@@ -50,18 +39,18 @@ def test_wrong_names_are_told_by_the_innovations(tmp_path):
     """Their batch, which takes a minute, is in the study's table."""
     run = robot(lambda log: swap_names(log, 0.2, np.random.default_rng(0)), world=SHORT)()
     write_run(run, tmp_path, {"recording": "here"})
-    found = compare_with_itself(RunFolder.open(tmp_path))
-    assert verdict_of(RunFolder.open(tmp_path), [found]).trust == "do not trust"
+    found = comparison.compare_with_itself(RunFolder.open(tmp_path))
+    assert comparison.verdict_of(RunFolder.open(tmp_path), [found]).trust == "do not trust"
 
 
-def linear_gaussian(claimed: float, seed: int = 0, steps: int = 300) -> Verdict:
+def linear_gaussian(claimed: float, seed: int = 0, steps: int = 300) -> comparison.Verdict:
     """Fixes of 1 m, and what the filter is told of them."""
     rng = np.random.default_rng(seed)
     truth = np.cumsum(rng.normal(size=(steps, 2)), axis=0)
     filter_, cov = Filter(WALK, Scripted(), n=300, rng=rng), claimed**2 * np.eye(2)[None]
     reports = [filter_.step(seen(FIX, fix[None], cov)) for fix in truth + rng.normal(size=(steps, 2))]
     found = [motion_correction(report.mixture) for report in reports]
-    own = innovation_statistics(
+    own = comparison.innovation_statistics(
         np.array([report.nis for report in reports]),
         np.array([report.rows for report in reports], dtype=float),
         np.array([correction.mean for correction in found]),
@@ -69,7 +58,7 @@ def linear_gaussian(claimed: float, seed: int = 0, steps: int = 300) -> Verdict:
     )
     mean, cov = (np.array([getattr(r.estimate, name) for r in reports]) for name in ("mean", "cov"))
     poses = pose_statistics(whitened_errors(WALK.space, mean, cov, truth))
-    return judge([*poses, *own], [statistic.name for statistic in poses])
+    return comparison.judge([*poses, *own], [statistic.name for statistic in poses])
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -93,54 +82,54 @@ def test_one_that_claims_too_much_outweighs_all_that_are_cautious():
     daring = variance_ratio("poses", 20.0, 50.0, 2.0)
     few_inside = coverage(np.full(200, 30.0), 6, 200.0)[:1]
     many_inside = coverage(np.full(5000, 0.1), 6, 5000.0)[:1]
-    assert judge(many_inside, [many_inside[0].name]).leaning == "cautious"
-    assert judge([cautious, daring]).leaning == "over-confident"
-    assert judge([cautious, daring]).reason.startswith("poses: ")
-    assert judge([cautious, *few_inside]).leaning == "over-confident"
-    assert judge([variance_ratio("poses", 1.0, 2.0, 2.0)]).leaning == ""
+    assert comparison.judge(many_inside, [many_inside[0].name]).leaning == "cautious"
+    assert comparison.judge([cautious, daring]).leaning == "over-confident"
+    assert comparison.judge([cautious, daring]).reason.startswith("poses: ")
+    assert comparison.judge([cautious, *few_inside]).leaning == "over-confident"
+    assert comparison.judge([variance_ratio("poses", 1.0, 2.0, 2.0)]).leaning == ""
 
 
 def test_innovations_alone_never_say_cautious():
     """They do not see a past that the particles have forgotten: a run whose noise is too large may still claim too much."""
     small, good = variance_ratio("innovations", 0.25, 5000.0, 1.1), variance_ratio("poses", 1.0, 400.0, 2.0)
-    for verdict in (judge([small]), judge([small, good], ["poses"])):
+    for verdict in (comparison.judge([small]), comparison.judge([small, good], ["poses"])):
         assert (verdict.trust, verdict.leaning) == ("do not trust", "")
         assert "to which side the poses err innovations do not tell" in verdict.sentences[1]
     wide = variance_ratio("poses", 0.1, 400.0, 2.0)
-    assert judge([small, wide], ["poses"], truth=["poses"]).leaning == "cautious"
-    told = judge([small, good], ["poses"], truth=["poses"])  # by the truth, which has not the run's noise
+    assert comparison.judge([small, wide], ["poses"], truth=["poses"]).leaning == "cautious"
+    told = comparison.judge([small, good], ["poses"], truth=["poses"])  # by the truth, which has not the run's noise
     assert told.trust == "trust" and "noise is stated too large: innovations: " in told.reason
     far = variance_ratio("landmarks", 6.0, 3.0, 2.0)  # it may be far off
-    assert judge([good, far], ["poses", "landmarks"]).trust == "cannot tell"
+    assert comparison.judge([good, far], ["poses", "landmarks"]).trust == "cannot tell"
     # The batch has the run's calibration: only innovations that are not too large vouch for that.
     for more, trust in (([], "cannot tell"), ([0.8], "trust"), ([1.5], "cannot tell")):
-        own = [variance_ratio(INNOVATIONS, value, 5.0, 1.1) for value in more]
-        assert judge([good, *own], ["poses"]).trust == trust
+        own = [variance_ratio(comparison.INNOVATIONS, value, 5.0, 1.1) for value in more]
+        assert comparison.judge([good, *own], ["poses"]).trust == trust
     large = variance_ratio("innovations", 4.0, 5000.0, 1.1)
-    assert judge([large, good], ["poses"], truth=["poses"]).leaning == "over-confident"
+    assert comparison.judge([large, good], ["poses"], truth=["poses"]).leaning == "over-confident"
 
 
 def test_a_stated_calibration_that_the_measurements_contradict_is_not_trusted():
     """The batch optimum has it, too, and vouches for any; a truth that supports the run says that it is good enough."""
-    good, own = variance_ratio("poses", 1.0, 400.0, 2.0), variance_ratio(INNOVATIONS, 1.0, 5000.0, 1.1)
+    good, own = variance_ratio("poses", 1.0, 400.0, 2.0), variance_ratio(comparison.INNOVATIONS, 1.0, 5000.0, 1.1)
     for apart, trust in ((5.0, "cannot tell"), (7.0, "do not trust")):
         wrong = Statistic("ranges: 1 is stated", apart, apart - 3.0, apart + 3.0, (-np.inf, 3.0), 99, "calibration")
         found, names = [good, own, wrong], ["poses", wrong.name]
-        verdict = judge(found, names)
+        verdict = comparison.judge(found, names)
         assert verdict.trust == trust and f"ranges: 1 is stated, {apart:.0f} standard deviations" in verdict.reason
-        assert judge(found, names, truth=["poses"]).trust == "trust"
+        assert comparison.judge(found, names, truth=["poses"]).trust == "trust"
     for system, advice in (("range-bearing", "calibrate=odometry"), ("mono", "calibrate=online")):
-        assert advice in calibration_advice(record(system), [wrong])
+        assert advice in comparison.calibration_advice(record(system), [wrong])
 
 
 def test_the_path_has_a_light_of_its_own():
     """As good as the best, and ten times too sure: neither light knows of the other."""
-    near = grade_path("The path is near.", 0.01, 1.0, 0, 100)
+    near = comparison.grade_path("The path is near.", 0.01, 1.0, 0, 100)
     assert near.grade == "good" and "1 % of its spread" in near.sentence and "None of 100" in near.sentence
-    verdict = judge([variance_ratio("poses", 100.0, 500.0, 2.0)], ["poses"], near)
+    verdict = comparison.judge([variance_ratio("poses", 100.0, 500.0, 2.0)], ["poses"], near)
     assert (verdict.path.grade, verdict.leaning) == ("good", "over-confident")
-    assert [grade_path("", e, 1.0).grade for e in (0.03, 0.05, 0.2)] == ["good", "fair", "poor"]
-    assert grade_path("", None, None).grade == "not known"
+    assert [comparison.grade_path("", e, 1.0).grade for e in (0.03, 0.05, 0.2)] == ["good", "fair", "poor"]
+    assert comparison.grade_path("", None, None).grade == "not known"
 
 
 def record(system: str, **config: object) -> Results:
@@ -148,17 +137,19 @@ def record(system: str, **config: object) -> Results:
 
 
 def innovations(value: float):
-    return [variance_ratio(INNOVATIONS, value, 5000.0, 1.1)]
+    return [variance_ratio(comparison.INNOVATIONS, value, 5000.0, 1.1)]
 
 
 def test_where_no_setting_holds_it_the_factor_is_told_and_nothing_where_nothing_contradicts():
-    assert "measurements 3 times as large" in noise_advice(record("range-bearing"), innovations(9.0))
-    assert "times as large" in noise_advice(record("mono", search="damaged"), innovations(9.0))
-    assert noise_advice(record("mono"), innovations(1.0)) == ""
-    assert noise_advice(record("mono"), [variance_ratio("poses", 9.0, 500.0, 2.0)]) == ""
-    assert noise_advice(record("mono"), []) == ""
+    assert "measurements 3 times as large" in comparison.noise_advice(record("range-bearing"), innovations(9.0))
+    assert "times as large" in comparison.noise_advice(record("mono", search="damaged"), innovations(9.0))
+    assert comparison.noise_advice(record("mono"), innovations(1.0)) == ""
+    assert comparison.noise_advice(record("mono"), [variance_ratio("poses", 9.0, 500.0, 2.0)]) == ""
+    assert comparison.noise_advice(record("mono"), []) == ""
     for kind, value, told in ((None, 36.0, True), (None, 9.0, False), ("outliers", 36.0, False)):
-        assert ("kind=outliers" in noise_advice(record("mono", likelihood={"kind": kind}), innovations(value))) == told
+        assert (
+            "kind=outliers" in comparison.noise_advice(record("mono", likelihood={"kind": kind}), innovations(value))
+        ) == told
 
 
 def test_odometry_that_errs_alike_in_all_steps_should_be_learnt():
@@ -166,9 +157,11 @@ def test_odometry_that_errs_alike_in_all_steps_should_be_learnt():
     cov, rng = np.full((3000, 1, 1), 0.01), np.random.default_rng(0)
     for bias, calibrate, advised in ((1.0, "off", True), (0.0, "off", False), (1.0, "odometry", False)):
         correction = 0.01 * bias + 0.1 * rng.normal(size=(3000, 1))
-        _, found = innovation_statistics(np.ones(3000), np.ones(3000), correction, cov)
+        _, found = comparison.innovation_statistics(np.ones(3000), np.ones(3000), correction, cov)
         own = record("range-bearing", calibrate=calibrate, association="known")
-        assert found.kind == "bias" and ("--set calibrate=odometry" in motion_advice(own, [found])) == advised
+        assert (
+            found.kind == "bias" and ("--set calibrate=odometry" in comparison.motion_advice(own, [found])) == advised
+        )
 
 
 @pytest.mark.slow
@@ -181,8 +174,8 @@ def test_a_filter_of_fixes_is_told_its_noise(claimed):
     for _ in range(8):
         filter_, cov = Filter(WALK, Scripted(), n=200, rng=np.random.default_rng(1)), claimed**2 * np.eye(2)[None]
         reports = [filter_.step(seen(FIX, fix[None], cov)) for fix in fixes]
-        nis = step_ratio(INNOVATIONS, *np.array([(r.nis, r.rows) for r in reports], dtype=float).T)
-        advice = noise_advice(record("mono", search={"noise_px": claimed}), [nis])
+        nis = step_ratio(comparison.INNOVATIONS, *np.array([(r.nis, r.rows) for r in reports], dtype=float).T)
+        advice = comparison.noise_advice(record("mono", search={"noise_px": claimed}), [nis])
         if not advice:
             break
         claimed = float(advice.split("noise_px=")[1].split(" ")[0])

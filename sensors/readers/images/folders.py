@@ -198,7 +198,7 @@ def _sequence(
     gap_s = 1e-9 * float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
     if gap_s > LONGEST_GAP_S:
         raise InputError(
-            f"{listed or path}: the images are {gap_s:.3g} s apart, too much for seconds; write times in these."
+            f"{listed or path}: the images are {gap_s:,.0f} s apart, too much for seconds; write times in these."
         )
     if gap_s > SLOW_S:
         _log.warning("%s: the images are %.3g s apart, if their times are in seconds, as they should be", path, gap_s)
