@@ -266,7 +266,9 @@ class Filter:
             rows = float(proposed.rows[0] + (weights * (proposed.rows - proposed.rows[0])).sum())
         if groups:
             self.health.innovations(self.steps, nis, rows, ess)
-            self.health.evidence(self.steps, evidence / max(sum(group.z.size for group in groups), 1))
+            if not (rows > 0.0 and np.isfinite(nis)):
+                # Where innovations are known they tell: evidence also falls as the filter rightly knows less.
+                self.health.evidence(self.steps, evidence / max(sum(group.z.size for group in groups), 1))
         if ancestors is not None:
             self.health.descendants(self.steps, ancestors)
         if self.consolidation is None and not (self._draws and ancestors is not None):
