@@ -142,14 +142,12 @@ def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
 
 
 def calibration_advice(record: RunFolder, statistics: list[Statistic]) -> str:
-    """One sentence where a calibration contradicts the measurements: what finds a better one; else empty."""
+    """One sentence where a calibration contradicts the measurements: what finds a better one, if it is not used already."""
     wrong = [s.name for s in statistics if s.kind == "calibration" and s.outcome == "contradicts"]
-    if not wrong:
+    if not wrong or record.config.get("calibrate") in ("sensor", "online"):
         return ""
     if record.system == "mono":
-        return (
-            "--set calibrate=online finds focal lengths and distortion while it runs, rbpf recalibrate RUN afterwards."
-        )
+        return "--set calibrate=online finds focal lengths, k1 and k2 while it runs, rbpf recalibrate RUN afterwards."
     if wrong[0].startswith("ranges"):
         return "Either the ranges are wrong, or the distances of the odometry are, --set calibrate=odometry."
     return (
