@@ -114,15 +114,13 @@ def _of_camera(log: FeatureLog, camera: Pinhole, batch: Optimum) -> list[Measure
 
 
 def _of_robot(m: Measurements, batch: Optimum) -> list[Measured]:
-    problem, graph, across, turns = (
-        RobotProblem(m),
-        gtsam.NonlinearFactorGraph(),
-        m.z.shape[1],
-        m.space.dim - m.z.shape[1],
-    )
+    problem, graph = RobotProblem(m), gtsam.NonlinearFactorGraph()
+    across = m.z.shape[1]  # numbers of a place
+    turns = m.space.dim - across
     is_length = np.array([True] + [m.measurement == "position"] * (across - 1))
 
     def evaluate(values: Any) -> Residuals:
+        """Of all observations, with slopes by the sensor's turn and place and the length of ranges, too."""
         path, points = problem.estimate(values)
         poses, places = path[m.steps], np.array([points[name] for name in m.landmarks.tolist()])
 
@@ -148,14 +146,13 @@ def _of_robot(m: Measurements, batch: Optimum) -> list[Measured]:
     std = np.maximum(*stds)
     if (np.abs(change) > DOUBTFUL * std).any():
         std = np.maximum(std, _moved(graph, calm, problem.pose_keys[:1], max)[1])
+    # A turn in space is from the stated one.
     planar = isinstance(m.space, SE2Group)
-    names = [
-        ("the sensor's yaw" if planar else f"the sensor's turn about its {axis} axis", "°") for axis in "xyz"[:turns]
-    ]
+    yaw = m.robot_from_sensor[:1] if planar else np.zeros(3)
+    stated = np.concatenate([yaw, m.space.translation(m.robot_from_sensor), [1.0]])
+    turn = ["the sensor's yaw"] if planar else [f"the sensor's turn about its {axis} axis" for axis in "xyz"]
+    names = [(name, "°") for name in turn]
     names += [(f"the sensor's {axis} on the robot", " m") for axis in "xyz"[:across]]
-    stated = np.concatenate(
-        [m.robot_from_sensor[:1] if planar else np.zeros(3), m.space.translation(m.robot_from_sensor), [1]]
-    )
     unit = np.array([180.0 / np.pi] * turns + [1.0] * (across + 1))
     figures = unit * np.stack([stated, stated + change, std])
     names += [("ranges, as a multiple of the right ones", "")]
