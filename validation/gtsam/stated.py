@@ -56,8 +56,9 @@ class Measured(NamedTuple):
 
     @property
     def said(self) -> str:
-        """Half a sentence."""
-        found = f"{self.found:.4g} ± {self.std:.2g}{self.unit}"
+        """Half a sentence, with two digits of the standard deviation."""
+        digits = max(0, 1 - int(np.floor(np.log10(self.std))))
+        found = f"{self.found:.{digits}f} ± {self.std:.{digits}f}{self.unit}"
         return f"{self.name}: {self.stated:.4g}{self.unit} is stated, the measurements say {found}"
 
 
