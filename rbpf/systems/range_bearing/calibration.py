@@ -132,10 +132,9 @@ class RobotCalibration(Kept):
             if self.free[-dim - 1].any():
                 yaw, std = np.arctan2(turn[1, 0], turn[0, 0]), np.sqrt(cov[-dim - 1, -dim - 1])
                 found["yaw_deg"] = np.rad2deg(yaw), np.rad2deg(std)
-        if (self.learnt >= self.space.dim).any():
-            wheels = np.array(self.wheels(filter_)).T
-            found["heading_deg_per_m"] = tuple(np.rad2deg(wheels[0]))
-            found |= dict(zip(("turn_left", "turn_right", "distance"), map(tuple, wheels[1:]), strict=True))
+        wheels, names = np.array(self.wheels(filter_)).T, ("heading_deg_per_m", "turn_left", "turn_right", "distance")
+        for row in self.learnt[self.learnt >= self.space.dim] - self.space.dim:
+            found[names[row]] = tuple(np.rad2deg(wheels[0]) if row == 0 else wheels[row])
         stds = {f"std_{name}": float(std) for name, (_, std) in found.items()}
         return {"calibration": {name: float(value) for name, (value, _) in found.items()} | stds}
 
