@@ -33,7 +33,7 @@ from rbpf.lie import SE2, Array
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.format import Format
 from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, assemble, diagonal, require_ranges
-from rbpf.sensors.readers.text import read_columns
+from rbpf.sensors.readers.text import read_columns, require_seconds
 
 DEFAULT_NOISE = LogNoise(
     std_range_m=0.06, std_bearing_rad=0.02, std_speed_mps=0.02, std_turn_rate_radps=0.04, scale_odometry=1.0
@@ -94,6 +94,7 @@ class Mrclam(Format[LogNoise, RobotLog]):
         # The motion between them.
         table = read_columns(folder / f"{prefix}_Odometry.dat", ("time", "forward speed", "turn rate"), self.kind)
         readings_ns = table.stamps_ns()
+        require_seconds(table.path, readings_ns, "odometry's rows")
         # Holding the last reading longer than any reading was ever held would invent motion.
         late = int(stamps[-1]) - int(readings_ns[-1])
         if late > int(np.diff(readings_ns).max(initial=0)):

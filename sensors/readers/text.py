@@ -23,7 +23,11 @@ from rbpf.lie import Array
 MOST_BYTES = 1 << 30  #: No table of a recording is larger.
 LARGEST = 1e12
 LATEST_S = 4e9
-SHORTEST_GAP_NS = 1e5  #: Nothing that is read here comes as often: times that do are in another unit.
+#: Seconds between rows, on the median: what is read here comes neither as often nor, unless that is stated, as seldom.
+SHORTEST_GAP_S, LONGEST_GAP_S = 1e-4, 5.0
+OFF_RATE = (
+    1e3**0.5
+)  #: Times as long as stated between rows: beyond it the unit is rather a thousandth of what it should be.
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _PLAIN = dict.fromkeys(map(ord, "0123456789+-.eE \t,"))
@@ -280,7 +284,22 @@ def read_stamped(path: Path, hint: str, nanoseconds: bool = False) -> StampedLin
     lines, texts = [line for line, _ in kept], [parts[0].strip() for _, parts in kept]
     rests = ["".join(parts[1:]).strip() for _, parts in kept]
     stamps_ns = _stamps_ns(path, lines, texts, parse)
-    gap_ns = np.median(np.diff(stamps_ns)) if nanoseconds and len(stamps_ns) > 1 else 0.0
-    if 0.0 < gap_ns < SHORTEST_GAP_NS:
-        raise InputError(f"{path}: the times are {gap_ns:.0f} apart, too little for nanoseconds; write them in these.")
+    if nanoseconds and 0.0 < (gap_s := _median_gap_s(stamps_ns)) < SHORTEST_GAP_S:
+        raise InputError(f"{path}: times are {1e9 * gap_s:.0f} apart, too little for nanoseconds; write them in these.")
     return StampedLines(path, lines, stamps_ns, rests, separator)
+
+
+def require_seconds(path: Path, stamps_ns: NDArray[np.int64], rows: str, rate_hz: float | None = None) -> None:
+    """Refuse times (n,) of a file's `rows` that look like milliseconds, or smaller units, counted from 0.
+
+    The time between rows alone tells them from a time lapse, which has to state its rate.
+    """
+    gap_s = _median_gap_s(stamps_ns)
+    if gap_s > LONGEST_GAP_S and not (rate_hz and gap_s * rate_hz < OFF_RATE):
+        stated = f", {1.0 / rate_hz:.3g} by the rate_hz stated" if rate_hz else ""
+        lapse = "; if they are right, state rate_hz in camera.yaml" if rows == "images" else ""
+        raise InputError(f"{path}: the {rows} are {gap_s:,.0f} s apart{stated}: write times in seconds{lapse}.")
+
+
+def _median_gap_s(stamps_ns: NDArray[np.int64]) -> float:
+    return 1e-9 * float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0

@@ -75,12 +75,9 @@ CARMEN | robot.clf | 4 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 5e9 | expected the time 
 CARMEN | robot.clf | 7 | FLASER 4 1 2 3 4 0 0 0 0 0 0 10.5 | expected 5 readings as in line 4, found 4 readings
 CARMEN | robot.clf | 7 | FLASER 5 1 2 3 4 5 0 0 0 0 0 0 9.2 | the time runs backwards by 1.100 s, expected scans in order
 path | path.tum | 3 | 0.6 1 2 3 0 0 1 | expected 8 columns (timestamp, tx, ty, tz, qx, qy, qz, qw), found 7
-path | path.tum | 3 | 0.6 1 2 x 0 0 0 1 | expected tz to be a finite number, found 'x'
 path | path.tum | 2 | 0.5 1 2 3 0 0 0 0.9 | expected a quaternion of length 1, found one of length 0.9
-path | path.tum | 3 | 0.25 1 2 3 0 0 0 1 | time runs backwards from 0.5 to 0.25
 relations | some.relations | 2 | 0 1 1 0 0 0 0 | expected 8 columns (t1, t2, x, y, z, roll, pitch, yaw), found 7
 relations | some.relations | 2 | 0 5e9 1 0 0 0 0 0 | expected the time in seconds
-relations | some.relations | 2 | 0 1 nan 0 0 0 0 0 | expected x to be a finite number, found 'nan'
 known | known_points.csv | 1 | id,u_px,v_px,x_m,y_m,z_m | expected a header with the columns id,u_px,v_px,x_m,y_m
 known | known_points.csv | 3 | 7,2,3,4,5,6,0.1 | id 7 comes a second time
 known | known_points.csv | 2 | 1,2,3,4,5,6,-0.1 | expected sigma_m to be zero or positive, found -0.1
@@ -90,11 +87,11 @@ known | known_points.csv | 2 | 1,2,3,4,5,6,-0.1 | expected sigma_m to be zero or
 FILES = [
     ("MRCLAM", {"Robot3_Measurement.dat": "100.1 63 3 0.1\n104.7 63 3 0.1\n"},
      "Robot3_Odometry.dat, line 6: the odometry ends 1.700 s before the last observation"),
+    ("MRCLAM", {"Robot3_Odometry.dat": "9 1 0\n29 1 0\n"}, "Odometry.dat: the odometry's rows are 20 s apart: write"),
     ("MRCLAM", {"Robot3_Measurement.dat": "100.1 5 3 0.1\n"}, "Measurement.dat: expected observations of landmarks"),
     ("graph", {"graph.txt": GRAPH["graph.txt"].encode() + b"\xff\n"}, "graph.txt, line 7: expected text in UTF-8"),
     ("graph", {"graph.txt": "ODOMETRY 0 1 1 0 0 1 0 0 0 0 1\n"}, "expected rows of pose, landmark, x, y, cxx"),
     ("graph", {"graph.txt": "LANDMARK 1 2 3 -4 0.5 0.1 0.25\n"}, "expected rows of from, to, dx, dy, dtheta"),
-    ("MRPT", {"sensor.yaml": "[" * 5000}, "sensor.yaml"),
     ("MRPT", {"sensor.yaml": '"\\UFFFFFFFF"'}, "sensor.yaml"),
     ("MRPT", {"sensor.yaml": f"%YAML {'1' * 5000}.1\n---\na: 1\n"}, "sensor.yaml"),
     ("CARMEN", {"robot.clf": "ODOM 0 0 0 0 0 0 1\n"}, "robot.clf: expected a CARMEN log (a text file with lines FLASER"),

@@ -9,7 +9,7 @@ width: 640                              # px, must be the size of the images
 height: 480
 distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # optional; OpenCV's k1, k2, p1, p2, k3; k3 may be left out;
                                         # of a fisheye lens cv2.fisheye's k1, k2, k3, k4
-rate_hz: 30.0                           # optional; images per second, where the recording has no times
+rate_hz: 30.0                           # optional; images per second, where there are no times, or fewer than 0.2
 baseline_m: 0.12                        # optional; of a rectified pair, where the recording has two cameras
 """
 

@@ -3,8 +3,8 @@
 TUM RGB-D sequences (J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, "A benchmark for the evaluation of RGB-D
 SLAM systems", IROS 2012):
 
-- `rgb.txt`: time [s] and file of each image, `#` starting a comment; images more than an hour apart are refused, which are
-  in another unit;
+- `rgb.txt`: time [s] and file of each image, `#` starting a comment; images more than five seconds apart are refused, whose
+  times are in another unit, unless `rate_hz` of `camera.yaml` says so;
 - `camera.yaml`: the calibration, which the distributed sequences do not bring along (`calibration` describes it);
 - `groundtruth.txt`, if the truth is known: `timestamp tx ty tz qx qy qz qw`, world_from_camera.
 
@@ -51,7 +51,15 @@ from rbpf.sensors.readers.images.calibration import NAME, Calibration, read_cali
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import TUM_POSE, normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
-from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted, read_stamped, read_text
+from rbpf.sensors.readers.text import (
+    line_error,
+    numbered_lines,
+    parse_table,
+    quoted,
+    read_stamped,
+    read_text,
+    require_seconds,
+)
 
 DEFAULT_RATE_HZ = 30.0
 SCENES_RATE_HZ = 30.0
@@ -61,9 +69,6 @@ SCENES_CAMERA = Calibration("the nominal camera of 7-Scenes", Pinhole(640, 480, 
 _SCENES_IMAGE = re.compile(r"frame-(\d+)\.color\.\w+", re.ASCII)
 _PHOTO_CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
 _log = logging.getLogger(__name__)
-#: No camera that moves is followed over such gaps between images, on the median: times that have them are micro- or
-#: nanoseconds. Beyond the second they may be milliseconds, or a time lapse: a logged message says so.
-LONGEST_GAP_S, SLOW_S = 3600.0, 5.0
 
 
 @final
@@ -195,13 +200,7 @@ def _sequence(
     listed: Path | None = None,
 ) -> ImageSequence:
     """Images in files of one size, which are listed in a file or lie in the folder."""
-    gap_s = 1e-9 * float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
-    if gap_s > LONGEST_GAP_S:
-        raise InputError(
-            f"{listed or path}: the images are {gap_s:,.0f} s apart, too much for seconds; write times in these."
-        )
-    if gap_s > SLOW_S:
-        _log.warning("%s: the images are %.3g s apart, if their times are in seconds, as they should be", path, gap_s)
+    require_seconds(listed or path, stamps_ns, "images", camera.rate_hz)
     shape = first_shape(files, listed or path)
     camera.require_shape(shape, str(path))
     source = FileImages(stamps_ns, shape, files)

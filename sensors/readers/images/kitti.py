@@ -24,7 +24,7 @@ from rbpf.sensors.readers.images.calibration import Calibration, read_calibratio
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import pose_of_matrix, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
-from rbpf.sensors.readers.text import line_error, parse_number, read_columns, read_stamped, read_text
+from rbpf.sensors.readers.text import line_error, parse_number, read_columns, read_stamped, read_text, require_seconds
 
 ALIGNED_PX = 1e-2  #: How far intrinsics of the two cameras of a pair may differ.
 _PAIRS = ((0, 1), (2, 3))
@@ -64,6 +64,7 @@ class Kitti(ImageFormat):
                 raise InputError(f"{calib}: the centre of projection {problem}; give the calibration of these images.")
             used = Calibration(str(calib), Pinhole(width, height, fx, fy, cx, cy))
         used.require_shape(shape, str(path))
+        require_seconds(rows.path, rows.stamps_ns, "images", used.rate_hz)
         if stereo and (other := first_shape(files[1], folders[1])) != shape:
             sizes = f"{shape[1]}x{shape[0]} and {other[1]}x{other[0]} px"
             raise InputError(f"{path}: the left and right images have {sizes}, expected one size.")
