@@ -28,7 +28,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.ranges import Formerly, NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, match_pairs
+from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
 
@@ -137,6 +137,7 @@ class StereoMatcher:
         self.extractor = extractor or Sift()
         self.config = config or PairConfig()
         self.impulse_fraction = 0.0  #: Fraction of the pixels that were replaced in the last pair.
+        self.rows_px = 0.0  #: By how many rows the last pair is not rectified.
         #: By which columns of the right image are known to be too large: they are measured without it.
         self.offset_px = 0.0
         self._last: tuple[tuple[np.ndarray, np.ndarray], Features, Features, int] | None = None
@@ -173,16 +174,21 @@ class StereoMatcher:
 
     @property
     def remark(self) -> str:
-        """In words, what was wrong with the last pair, though it could be measured; empty where nothing was."""
-        if not self.impulse_fraction:
-            return ""
-        fraction = f"{100.0 * self.impulse_fraction:.1f} %"
-        return f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"
+        """In words, what was wrong with the last pair; empty where nothing was."""
+        found = list[str]()
+        if self.impulse_fraction:
+            fraction = f"{100.0 * self.impulse_fraction:.1f} %"
+            found += [f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"]
+        if self.rows_px:
+            where = f"{abs(self.rows_px):.1f} rows {'lower' if self.rows_px > 0.0 else 'higher'} in the right image"
+            found += [f"the pair is not rectified: things are {where}; rectify the images by the cameras' calibration"]
+        return "; ".join(found)
 
     def match(self, images: tuple[np.ndarray, np.ndarray], left: Features, right: Features) -> StereoFeatures:
         """Features of a pair of images whose keypoints are known. Raises InputError: the images are swapped."""
         matches = self._along_rows(left, right)
-        # A pair is refused whose keypoints match far better the other way round.
+        self.rows_px = 0.0
+        # A pair is refused whose keypoints match far better the other way round, and one told that does on other rows.
         if FEWER * len(matches) < min(len(left), len(right)):
             swapped = len(self._along_rows(right, left))
             if swapped >= SWAPPED and swapped > FEWER * len(matches):
@@ -190,6 +196,12 @@ class StereoMatcher:
                     f"left and right image seem to be swapped: {swapped} matches have a negative disparity and "
                     f"{len(matches)} a positive one; exchange the two cameras"
                 )
+            anywhere = match_all(left.descriptors, right.descriptors, self.config.limits)
+            if len(anywhere) >= SWAPPED:
+                lower = right.px[anywhere.second, 1] - left.px[anywhere.first, 1]
+                typical = float(np.median(lower))
+                agree = np.abs(lower - typical) < max(0.5 * abs(typical), self.config.row_px)
+                self.rows_px = typical if abs(typical) > self.config.row_px and agree.mean() > 0.5 else 0.0
         z = np.column_stack([left.px[matches.first], right.px[matches.second, 0]])
         good, z[:, 2] = self._refined(images, z[:, :2], z[:, 2])
         matches, z = matches.take(good), z[good] - [0.0, 0.0, self.offset_px]

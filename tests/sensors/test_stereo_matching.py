@@ -62,13 +62,10 @@ def disparity_error(features, index=0):
 
 
 def test_disparities_of_a_rendered_pair():
-    features = measured()
-    error = disparity_error(features)
+    error = disparity_error(measured())
     error = error[np.isfinite(error)]
-    assert len(error) > 100
-    assert np.mean(np.abs(error) > 1.0) < 0.01
-    assert abs(np.median(error)) < 0.02
-    assert np.median(np.abs(error)) < 0.06
+    assert len(error) > 100 and np.mean(np.abs(error) > 1.0) < 0.01
+    assert abs(np.median(error)) < 0.02 and np.median(np.abs(error)) < 0.06
 
 
 def test_the_stated_noise_covers_the_error():
@@ -96,16 +93,13 @@ def test_a_feature_is_seen_again_where_the_motion_takes_it():
     expected = RIG.project(SE3.transform(second_from_first, first.points))
     matches = match_all(first.descriptors, second.descriptors, MatchLimits())
     error = second.z[matches.second] - expected[matches.first]
-    assert len(matches) > 80
-    assert np.mean(np.abs(error).max(axis=1) < 1.0) > 0.9
+    assert len(matches) > 80 and np.mean(np.abs(error).max(axis=1) < 1.0) > 0.9
 
 
 def test_limits_of_the_disparity():
     features = measured(least_disparity_px=12.0, nearest_m=2.0)
     disparity = features.z[:, 0] - features.z[:, 2]
-    assert len(features) > 20
-    assert disparity.min() >= 12.0
-    assert disparity.max() <= 260.0 * 0.12 / 2.0 + 2.0
+    assert len(features) > 20 and disparity.min() >= 12.0 and disparity.max() <= 260.0 * 0.12 / 2.0 + 2.0
 
 
 @pytest.mark.parametrize(("beyond", "doubted"), [(0.0, False), (0.1, True)])
@@ -127,10 +121,16 @@ def test_swapped_images_are_noticed():
         StereoMatcher(RIG, Sift(FULL)).measure(right, left)
 
 
+def test_a_pair_on_other_rows_is_noticed():
+    (left, right), matcher = room()[0][0], StereoMatcher(RIG, Sift(FULL))
+    for rows in (4, -2, 0):
+        matcher.measure(left, np.roll(right, rows, axis=0))
+        assert matcher.rows_px == pytest.approx(rows, abs=0.2) and ("not rectified" in matcher.remark) == bool(rows)
+
+
 def test_a_pair_without_texture():
     flat = np.full((240, 320), 120, dtype=np.uint8)
     features = StereoMatcher(RIG, Sift(FULL)).measure(flat, flat)
-    assert len(features) == 0
     assert features.z.shape == (0, 3) and features.cov_points.shape == (0, 3, 3)
     assert len(match_all(features.descriptors, measured().descriptors, MatchLimits())) == 0
     assert len(match_all(measured().descriptors, features.descriptors, MatchLimits())) == 0
