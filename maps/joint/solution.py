@@ -109,8 +109,13 @@ class SubMap(NamedTuple):
 
 
 def inverse_of(cov: np.ndarray) -> np.ndarray:
-    """As `gaussian.inverse`, of one large matrix, by LAPACK."""
-    half = solve_triangular(gaussian.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False)
+    """As `gaussian.inverse`, of one large matrix, by LAPACK. Raises InputError: it is singular, or no covariance."""
+    try:
+        half = solve_triangular(gaussian.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False)
+    except InputError as error:
+        raise InputError(
+            "a sub-map's covariance is singular: the filter has diverged, or a noise is stated as 0"
+        ) from error
     return np.asarray(half.T @ half)
 
 

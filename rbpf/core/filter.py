@@ -271,7 +271,8 @@ class Filter:
                 self.health.evidence(self.steps, evidence / max(sum(group.z.size for group in groups), 1))
         if ancestors is not None:
             self.health.descendants(self.steps, ancestors)
-        if self.consolidation is None and not (self._draws and ancestors is not None):
+        # Copies have not parted yet where none was drawn anew, nor where nothing drives them, as in no time.
+        if self.consolidation is None and (ancestors is None if self._draws else prior.factor.any()):
             self.health.states(self.steps, state)
         self._end(stamp_ns)
         if self.consolidation is not None:

@@ -343,6 +343,9 @@ def test_what_was_given_and_cannot_be_taken_off_stays():
         left = found.seen_from(SE2, 3, np.arange(3))[1][3:, 3:] * (1.0 - off * told)
         np.testing.assert_allclose(left, own[3:, 3:], rtol=1e-3, atol=1e-5)
     maps.maps[3] = maps.maps[3]._replace(given=Given(maps.about.ids[:3], maps.about.points[:3], 1e-8 * np.eye(6)))
-    maps.maps[2] = maps.maps[2]._replace(cov=-maps.maps[2].cov)
-    maps.solve()
-    np.testing.assert_equal((maps.start, maps.about.cov), (start, cov))
+    for factor in (-1.0, 0.0):
+        maps.maps[2] = maps.maps[2]._replace(cov=factor * maps.maps[2].cov)
+        maps.solve()
+        np.testing.assert_equal((maps.start, maps.about.cov), (start, cov))
+    with pytest.raises(InputError, match="sub-map's covariance is singular"):
+        maps.landmarks()
