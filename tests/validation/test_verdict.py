@@ -145,6 +145,7 @@ def test_where_no_setting_holds_it_the_factor_is_told_and_nothing_where_nothing_
     assert "measurements 3 times as large" in comparison.noise_advice(record("range-bearing"), innovations(9.0))
     assert "times as large" in comparison.noise_advice(record("mono", search="damaged"), innovations(9.0))
     assert comparison.noise_advice(record("mono"), innovations(1.0)) == ""
+    assert comparison.noise_advice(record("mono"), [variance_ratio(comparison.INNOVATIONS, 0.01, 50.0, 1.1)]) == ""
     assert comparison.noise_advice(record("mono"), [variance_ratio("poses", 9.0, 500.0, 2.0)]) == ""
     assert comparison.noise_advice(record("mono"), []) == ""
     for kind, value, told in ((None, 36.0, True), (None, 9.0, False), ("outliers", 36.0, False)):

@@ -19,7 +19,7 @@ from rbpf.errors import InputError
 from rbpf.runs.files import write_text
 from rbpf.runs.plots import lost_frames
 from rbpf.runs.reading import RunFolder
-from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, Statistic, motion_statistics, step_ratio
+from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, NOISE_FACTOR, Statistic, motion_statistics, step_ratio
 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 #: By system, where its configuration holds the one standard deviation of all measurements, px.
@@ -107,11 +107,14 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     σ √r (R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", 1970, in its simplest form:
     the noise of the measurements is taken to dominate what the filter expects). It is a hint for the next run, not an
     estimate: errors that repeat from step to step, such as a known point that is given a little beside itself, are in
-    no innovation. Nothing is advised that would make a filter claim more which claims too much already.
+    no innovation. Nothing is advised that would make a filter claim more which claims too much already, nor a number that
+    is not known to `NOISE_FACTOR`, as after a few steps.
     """
     daring = any(s.kind == "ratio" and s.low > s.zone[1] for s in statistics)
     found = [s for s in statistics if s.name == INNOVATIONS and s.outcome == "contradicts"]
     if not found or found[0].value <= 0.0 or (daring and found[0].value < 1.0):
+        return ""
+    if found[0].high > NOISE_FACTOR**4 * found[0].low:  # of variances, both ways
         return ""
     factor = float(found[0].value) ** 0.5
     how = f"standard deviations of the measurements {factor:.2g} times as large"
