@@ -20,7 +20,10 @@ $(STAMP): pyproject.toml requirements.lock
 	  { echo "$(PYTHON) is older than Python 3.11; name a newer one: make PYTHON=python3.12 setup" >&2; exit 2; }
 	@echo "setting up .venv, which is done once. 1 of 2: download and install the packages; pip says nothing for some minutes …"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet --no-compile --requirement requirements.lock  # what is imported gets bytecode then
+	@$(BIN)/python -m pip install --quiet --no-compile --constraint requirements.lock lazy-loader numba
+	@# The largest kernels are compiled beside the rest, of which what is imported gets bytecode then.
+	@$(BIN)/python -c 'import rbpf.kernels.landmarks' & \
+	  $(BIN)/python -m pip install --quiet --no-compile --requirement requirements.lock && wait
 	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@echo "2 of 2: compile the kernels, and try what is installed …"
 	@$(BIN)/rbpf doctor

@@ -4,7 +4,8 @@ Beside the table there are a plan of the laboratory with the robot's way, and a 
 """
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -41,17 +42,20 @@ class Moment:
     disparity: np.ndarray | None = None
 
 
-def rendered(seed: int, noise_std: float, width: int, moments: int) -> Iterator[Moment]:
-    """The laboratory at times spread over the tour, as `python -m examples.studies.lab --noise-std` renders it."""
+def rendered(seed: int, noise_std: Sequence[float], width: int, moments: int) -> dict[str, list[Moment]]:
+    """The laboratory at times spread over the tour, as `examples.studies.lab --noise-std` renders it, by its noise."""
     camera = Pinhole(width, 3 * width // 4, 0.78125 * width, 0.78125 * width, 0.5 * width - 0.5, 0.375 * width - 0.5)
     rng = np.random.default_rng(seed)
     scene = TexturedLab(texel_m=1.92 / width).build(rng)
-    renderer = Renderer(scene.rectangles, camera)
-    shutter = Shutter(scene, Imaging(noise_std=noise_std, known=0), camera, renderer, rng)
-    for frame in np.linspace(0, 3990, moments).astype(int).tolist():
-        left, right = shutter.images(frame, BASELINE_M)
-        depth, _ = renderer.depth(scene.world_from_camera[frame])
-        yield Moment(left, right, shutter.images(frame + 1)[0], camera.fx * BASELINE_M / depth)
+    renderer, taken = Renderer(scene.rectangles, camera), dict[str, list[Moment]]()
+    for std in noise_std:
+        shutter = Shutter(scene, Imaging(noise_std=std, known=0), camera, renderer, deepcopy(rng))
+        pictures = taken[f"lab, noise {std:g}"] = list[Moment]()
+        for frame in np.linspace(0, 3990, moments).astype(int).tolist():
+            left, right = shutter.images(frame, BASELINE_M)
+            depth, _ = renderer.depth(scene.world_from_camera[frame])
+            pictures.append(Moment(left, right, shutter.images(frame + 1)[0], camera.fx * BASELINE_M / depth))
+    return taken
 
 
 def recorded(folder: Path, moments: int) -> Iterator[Moment]:
@@ -171,7 +175,7 @@ def main(
         quick: few small images.
     """
     width, moments = (320, 2) if quick else (640, moments)
-    taken = {f"lab, noise {std:g}": list(rendered(seed, std, width, moments)) for std in noise_std}
+    taken = rendered(seed, noise_std, width, moments)
     table = {name: statistics(pictures) for name, pictures in taken.items()}
     table |= {folder.name: statistics(recorded(folder, moments)) for folder in beside}
     out.mkdir(parents=True, exist_ok=True)

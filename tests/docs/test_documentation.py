@@ -43,6 +43,7 @@ def test_what_a_page_shows_works(page, shelf, tmp_path, monkeypatch, plain_pictu
     monkeypatch.syspath_prepend(ROOT)
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("rbpf.validation.gtsam.self_calibration.ITERATIONS", 10)  # so few images determine little
     lay_out(name_of(page), shelf, tmp_path)
     names: dict[str, object] = {}
     exec(PREAMBLE.get(name_of(page), ""), names)

@@ -18,8 +18,7 @@ def mean_scores(path, seeds, *settings):
     rows = []
     for seed in range(seeds):
         config = load_settings(RangeBearingConfig, "range-bearing", None, settings, {"seed": seed})
-        log = open_log(path, config.noise)
-        finished = filter_opened(open_robot_log(log, config))
+        finished = filter_opened(open_robot_log(open_log(path, config.noise), config))
         found = score_estimate(PathAndMap.of_run(finished), finished.truth, config.association == "ml")
         names = "path_rmse_m", "ate_rmse_m", "landmark_error_mean_m", "landmark_error_aligned_mean_m"
         rows.append([found.get(name, np.nan) for name in names])
@@ -52,8 +51,7 @@ def test_errors(data_dir, name, seeds, setting, most):
 def test_the_refined_proposal_beats_the_bootstrap_one(data_dir):
     folder = data_dir / "mrpt_kf_slam_2d"
     refined = mean_scores(folder, 2, "map=particles")[2]
-    bootstrap = mean_scores(folder, 2, "map=particles", "proposal.kind=prior")[2]
-    assert bootstrap >= 2.5 * refined
+    assert mean_scores(folder, 2, "map=particles", "proposal.kind=prior")[2] >= 2.5 * refined
 
 
 def test_sub_maps_close_the_loops_of_victoria_park(data_dir):

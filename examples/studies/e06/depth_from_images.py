@@ -46,7 +46,7 @@ def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[n
 
 def reproduce(setting: Setting) -> list[Row]:
     """Follows corners past a desk, and compares how far both likelihoods are from Gaussians."""
-    world = SidewaysDesk(texel_m=0.002 if setting.quick else 0.001)
+    world = SidewaysDesk(texel_m=0.003 if setting.quick else 0.001)
     sequence, _ = setting.sequence("sideways", world)
     config = SearchConfig()
     px, track = follow(sequence, 10 if setting.quick else FEATURES, config)

@@ -59,7 +59,7 @@ def line_lengths(observation: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def round_a_desk(setting: Setting) -> tuple[ImageSequence, KnownPixels | None]:
     """The sequence of figures 5, 7 and 8."""
-    return setting.sequence("loop", LoopOverDesk(frames=75, texel_m=0.002) if setting.quick else LoopOverDesk())
+    return setting.sequence("loop", LoopOverDesk(frames=75, texel_m=0.003) if setting.quick else LoopOverDesk())
 
 
 def reproduce(setting: Setting) -> list[Row]:
