@@ -14,12 +14,15 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays, whole
+from rbpf.lie import SE3
 from rbpf.runs import files
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space, write_tum
 from rbpf.runs.truth import write_truth
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 
@@ -27,6 +30,9 @@ from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 #: A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth.
 STILL = 0.01
+#: Features are in the image, not in the world, that stay within so many px in so many frames, over which others move so far
+#: and the camera, by its own account, stands still or turns as far; fewer of them do no harm.
+STAY_PX, FRAMES, MOVE_PX, FEATURES = 1.5, 30, 5.0, 5
 
 
 def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:
@@ -95,7 +101,7 @@ def summarise(run: Run) -> dict[str, Any]:
 
 
 def remarks(run: Run) -> list[str]:
-    """Sentences that come before all figures of a run: nothing was measured, or nothing moved."""
+    """Sentences that come before all figures of a run: nothing was measured, nothing moved, or what was seen is no world."""
     log, landmarks = run.log, run.system.map()
     seen = [state in (TrackingState.TRACKED, TrackingState.INITIALISING) for state in log.states]
     if not any(seen):
@@ -106,12 +112,40 @@ def remarks(run: Run) -> list[str]:
         return []
     reach = float(np.linalg.norm(at - at[0], axis=1).max())
     distance = float(np.median(np.linalg.norm(landmarks.mean - at[0], axis=1)))
-    if reach > STILL * distance:
-        return []
+    features = run.system.measurements(run.name, log)
+    in_image = _in_the_image(features, log.poses, reach <= STILL * distance) if isinstance(features, FeatureLog) else []
+    if reach > STILL * distance or in_image:
+        return in_image
     depth = ", from which no depth can be measured" if run.system.gauge == "similarity" else ""
     return [
         f"It stood still, or nearly: the path stays within {100 * reach / distance:.2g} % of the landmarks' median "
         f"distance from where it begins{depth}."
+    ]
+
+
+def _in_the_image(features: FeatureLog, poses: np.ndarray, is_still: bool) -> list[str]:
+    """In one sentence, that features stay at their pixels while others move, as dirt on a lens does, where they do."""
+    names = np.concatenate([frame.landmarks for frame in features.frames])
+    steps = np.repeat(np.arange(len(features.frames)), [frame.landmarks.size for frame in features.frames])
+    order = np.argsort(names, kind="stable")
+    px, steps = np.concatenate([frame.z[:, :2] for frame in features.frames])[order], steps[order]
+    _, begin, count = np.unique(names[order], return_index=True, return_counts=True)
+    if not count.size:
+        return []
+    reach = (np.maximum.reduceat(px, begin) - np.minimum.reduceat(px, begin)).max(axis=1)
+    lens = features.camera if isinstance(features.camera, Pinhole) else features.camera.camera
+    stay = (reach <= STAY_PX) & (count >= FRAMES)
+    for row in np.flatnonzero(stay) if not is_still else ():
+        seen = poses[steps[begin[row] : begin[row] + count[row]]]
+        turn = np.linalg.norm(SE3.log(SE3.between(seen[0], seen))[:, :3], axis=1)
+        stay[row] = lens.fx * turn.max() > MOVE_PX
+    moved = reach[~stay & (count >= FRAMES // 3)]
+    if stay.sum() < FEATURES or moved.size < FEATURES or np.median(moved) < MOVE_PX:
+        return []
+    return [
+        f"{stay.sum()} features stay at their pixels while others move by {np.median(moved):.0f} px: unless something moves "
+        "before a camera that stands still, they are dirt on the lens, a border or writing in the images, which take the "
+        "camera along; crop or mask them."
     ]
 
 

@@ -115,12 +115,6 @@ def test_cameras_that_cannot_have_taken_the_pair_are_noticed(beyond, doubted):
     assert bool(calibration_doubt(*matcher.impossible)) is doubted
 
 
-def test_swapped_images_are_noticed():
-    left, right = room()[0][0]
-    with pytest.raises(InputError, match=r"seem to be swapped: \d+ matches have a negative disparity"):
-        StereoMatcher(RIG, Sift(FULL)).measure(right, left)
-
-
 def test_a_pair_on_other_rows_is_noticed():
     (left, right), matcher = room()[0][0], StereoMatcher(RIG, Sift(FULL))
     for rows in (4, -2, 0):

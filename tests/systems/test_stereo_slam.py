@@ -124,7 +124,7 @@ class TestBadPairs:
 
     def test_swapped_images(self):
         """The first pair is refused at once; later the run ends and keeps what it has."""
-        with pytest.raises(InputError, match="seem to be swapped"):
+        with pytest.raises(InputError, match=r"seem to be swapped: \d+ matches have a negative"):
             filtered(pairs(3, lambda t, frame: swapped(frame)), CONFIG)
         run = filtered(pairs(4, lambda t, frame: swapped(frame) if t == 2 else frame), CONFIG)
         assert run.failure is not None and run.failure.startswith("pair 2 of plane: ")

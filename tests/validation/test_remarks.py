@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from rbpf.runs.folder import remarks
+from rbpf.lie import SE3
+from rbpf.runs.folder import _in_the_image, remarks
 from rbpf.runs.recordings import filter_opened, open_pairs
 from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.finish import finish_run
@@ -55,3 +57,13 @@ def test_a_still_camera_is_said_to_be_still():
     assert said.startswith("It stood still, or nearly: the path stays within 0") and "depth" not in said
     run.log._path["poses"][-1] = run.log.poses[-1] + [0, 0, 0, 0, 0, 0, 0.05]
     assert remarks(run) == []
+
+
+@pytest.mark.parametrize(("of_camera", "told"), [("still", True), ("turns", True), ("shifted", False)])
+def test_what_stays_in_the_image_while_other_things_move_is_no_world(of_camera, told):
+    """Six of twelve; a camera that is shifted without turning may see them far away."""
+    ids, apart = np.arange(12), 20.0 * np.arange(24.0).reshape(12, 2) % 230.0
+    moving = (ids % 2)[:, None]
+    frames = [FeatureFrame(t, ids, apart + t * moving * [1.0, 0.0], np.tile(np.eye(2), (12, 1, 1))) for t in range(40)]
+    poses = SE3.exp(np.arange(40)[:, None] * np.array([0.0, 0.001 * (of_camera == "turns"), 0.0, 0.1, 0.0, 0.0]))
+    assert len(_in_the_image(FeatureLog("dirt", CAMERA, frames), poses, of_camera == "still")) == told
