@@ -10,7 +10,7 @@ sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
 from rbpf import __version__  # noqa: E402
 
 # All pages are held until the end: to look for garbage among them as often as Python does takes a third of the time.
-gc.set_threshold(50_000, 20, 20)
+gc.set_threshold(50_000, 1_000)
 
 project = "rbpf"
 copyright = "The rbpf authors"
