@@ -27,7 +27,7 @@ def kernel_modules() -> list[str]:
         paths += (_ROOT / folder).rglob("*kernel*.py")
     sources = {path: path.read_text(encoding="utf-8") for path in paths}
     compiled = {path: s.count("@njit(") + s.count("@observation_kernel") for path, s in sources.items()}
-    chosen = [path for path, count in compiled.items() if count > sources[path].count('inline="always"')]
+    chosen = [path for path, count in compiled.items() if count > sources[path].count("inline=")]
     waits = {path: path.parent.name != "kernels" and bool(_SHARED.search(sources[path])) for path in chosen}
     chosen.sort(key=lambda path: (path.stem != "landmarks", not waits[path], -len(sources[path]), path))
     return [".".join(["rbpf", *path.relative_to(_ROOT).with_suffix("").parts]) for path in chosen]

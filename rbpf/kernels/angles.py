@@ -13,7 +13,7 @@ _PAIRS = 10  #: Pairs of terms of arctan: the first one left out, z²⁰/41 with
 _NESTED = 8  #: Terms of sine and cosine: the first ones left out, (π/4)¹⁷/17! and (π/4)¹⁸/18!, are below 5e−17.
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def cos_sin(angle):
     """Cosine and sine, within 2e−16 up to a million radians and within the angle's own rounding beyond.
 
@@ -35,7 +35,7 @@ def cos_sin(angle):
     return -cosine if turn == 1.0 or turn == 2.0 else cosine, -sine if turn >= 2.0 else sine
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def arctan2(y, x):
     """Angle of (x, y) in [−π, π], within 5e−16 of `math.atan2`; ±0 at the origin, NaN where x and y are infinite.
 

@@ -12,7 +12,7 @@ from rbpf.kernels.se3 import rotation
 from rbpf.kernels.signature import BLOCK, prefetch
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def packed(a, b):
     """Index of entry (a, b) of a symmetric matrix stored as its lower triangle by rows."""
     return a * (a + 1) // 2 + b if a >= b else b * (b + 1) // 2 + a
@@ -99,13 +99,13 @@ def expect_record(pool, slab, rows, start, count):
             prefetch(field + 8 * rows[start + i])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def flat(array):
     """A block's rows end to end: row m starts at m · BLOCK, a constant that lets the compiler tell rows apart."""
     return array.reshape(array.size)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def store_by_state(a0, a1, a2, x, y, z, row, i):
     """A row of ∂z/∂ξ, flat, from that of the slope a at a point (x, y, z) of the moving frame: a × p, then −a."""
     row[i] = a1 * z - a2 * y
@@ -116,7 +116,7 @@ def store_by_state(a0, a1, a2, x, y, z, row, i):
     row[5 * BLOCK + i] = -a2
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def rotation_at(pose, i):
     """Rotation of lane i."""
     return rotation(pose[i], pose[BLOCK + i], pose[2 * BLOCK + i], pose[3 * BLOCK + i])

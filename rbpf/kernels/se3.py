@@ -50,7 +50,7 @@ def coefficients(x):
     return (theta - sine) / (x * theta), (0.5 * x + cosine - 1.0) / (x * x), e
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def rotation(qx, qy, qz, qw):
     """Rotation matrix by rows."""
     return (
@@ -66,13 +66,13 @@ def rotation(qx, qy, qz, qw):
     )
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def times(r, x, y, z):
     """A rotation matrix by rows times a vector."""
     return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def back(r, x, y, z):
     """The transposed of a rotation matrix by rows times a vector."""
     return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z

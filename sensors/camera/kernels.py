@@ -19,7 +19,7 @@ KIND = 9  #: Place of the lens in `Pinhole.params`, the last one: 0 radial-tange
 Projected = tuple[float, float, float, float, float, float, float, float]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def project(x: float, y: float, z: float, params: np.ndarray) -> Projected:
     """Pixel of a point (right, down, forward) and its Jacobian, of `Pinhole.params`; z = 0 divides as the error model says."""
     if params[KIND] == 0.0:
@@ -27,7 +27,7 @@ def project(x: float, y: float, z: float, params: np.ndarray) -> Projected:
     return project_equidistant(x, y, z, params)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def project_radial(x: float, y: float, z: float, params: np.ndarray) -> Projected:
     """As `project`, with radial-tangential distortion: without a branch, for loops that become vector instructions."""
     fx, fy = params[0], params[1]
@@ -69,13 +69,13 @@ def project_equidistant(x: float, y: float, z: float, params: np.ndarray) -> Pro
     return px, py, d00, d01, -(d00 * u + d01 * v), d10, d11, -(d10 * u + d11 * v)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def clamp_depth(x, y, z):
     """The depth kept positive."""
     return max(z, MIN_DEPTH_FRACTION * math.sqrt(x * x + y * y + z * z))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def locate(pose, point, n, place):
     """Points in the camera's frame, their depth kept positive, into the first three rows of `place`."""
     for i in range(n):
@@ -85,7 +85,7 @@ def locate(pose, point, n, place):
         place[i], place[BLOCK + i], place[2 * BLOCK + i] = x, y, clamp_depth(x, y, z)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def measure(place, z0, z1, params, n, nu, across, down):
     """Residuals, and both rows by the state, of what lies at `place` in the camera's frame."""
     if params[KIND] != 0.0:
@@ -108,7 +108,7 @@ def measure(place, z0, z1, params, n, nu, across, down):
         store_by_state(d10, d11, d12, x, y, depth, down, i)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def turn(pose, row, n, by_point):
     """One row by the point, a Rᵀ, from the −a in the row by the state."""
     for i in range(n):
@@ -128,7 +128,7 @@ def camera_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
         turn(pose, flat(jac_state[a]), n, by_point[3 * a * BLOCK :])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _store_pixel(place, fx, fy, baseline, n, row):
     """A row by the state, of fx (x − baseline) / z + fy y / z."""
     for i in range(n):
@@ -158,7 +158,7 @@ def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
         turn(pose, flat(jac_state[a]), n, by_point[3 * a * BLOCK :])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _turn_ray(pose, anchor, row, n, by_ray):
     """One row by (u, v, ρ) from the −a in the row by the state."""
     for i in range(n):
@@ -174,7 +174,7 @@ def _turn_ray(pose, anchor, row, n, by_ray):
         )
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _scale_shift(ray, n, row):
     """A direction moves with the camera's position by ρ times as much as a point."""
     for i in range(n):
@@ -184,7 +184,7 @@ def _scale_shift(ray, n, row):
         row[5 * BLOCK + i] *= rho
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Residual and derivatives of the full 2-D measurement."""
     pose, ray, anchor, by_ray = flat(state), flat(mean), flat(const), flat(jac_landmark)
@@ -211,7 +211,7 @@ def camera_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _take_out(along, n, first, second):
     """From vectors (first, second) their part along ∂h/∂ρ, (2, BLOCK) flat."""
     for i in range(n):

@@ -10,7 +10,7 @@ from rbpf.kernels.se3 import back, times
 from rbpf.kernels.signature import BLOCK, observation_kernel
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _face_planar(state, mean, n, point, heading):
     """The landmark in the robot's frame, and cosine and sine of the heading, into the first two rows of each."""
     for i in range(n):
@@ -20,14 +20,14 @@ def _face_planar(state, mean, n, point, heading):
         heading[i], heading[BLOCK + i] = c, s
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _in_sensor(params, x, y):
     """A point of the robot's frame in the sensor's, in the plane."""
     a, b = x - params[4], y - params[5]
     return params[0] * a + params[2] * b, params[1] * a + params[3] * b
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _store_planar(row, a0, a1, params, c, s, x, y, jac_state, jac_landmark, i):
     """One row (a0, a1) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
     d0, d1 = params[0] * a0 + params[1] * a1, params[2] * a0 + params[3] * a1
@@ -72,7 +72,7 @@ def position_planar(state, mean, const, z, params, n, nu, jac_state, jac_landmar
         out[i], out[BLOCK + i] = z0 - u, z1 - v
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark, i):
     """One row (a0, a1, a2) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
     d0, d1, d2 = times(params, a0, a1, a2)
@@ -81,7 +81,7 @@ def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark
     jac_landmark[start], jac_landmark[start + BLOCK], jac_landmark[start + 2 * BLOCK] = times(rotation, d0, d1, d2)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _locate(state, mean, params, n, point):
     """The landmark in the sensor's frame, into the rows of `point`."""
     for i in range(n):
@@ -93,7 +93,7 @@ def _locate(state, mean, params, n, point):
         point[i], point[BLOCK + i], point[2 * BLOCK + i] = x, y, z
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _in_robot(params, a, b, c):
     """A point of the sensor's frame in the robot's."""
     x, y, z = times(params, a, b, c)
