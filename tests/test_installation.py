@@ -174,12 +174,12 @@ def test_importing_the_package_imports_hardly_anything_else():
 
 
 def test_the_command_line_keeps_blas_on_one_thread_before_numpy_is_there():
-    """Which reads it as it is imported; who has set it otherwise is heeded."""
+    """Which reads it as it is imported; results are the same bytes whatever was set."""
     early = "import sys, tyro; assert 'numpy' not in sys.modules"
     said = "import os, rbpf.cli; print(os.environ['OPENBLAS_NUM_THREADS'])"
     without = "import os; os.environ.pop('OPENBLAS_NUM_THREADS', None)"
     given = "import os; os.environ['OPENBLAS_NUM_THREADS'] = '3'"
-    for before, threads in ((f"{without}\n{early}", "1"), (given, "3")):
+    for before, threads in ((f"{without}\n{early}", "1"), (given, "1")):
         assert run([sys.executable, "-c", f"{before}\n{said}"]).strip() == threads
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated
 
 # Before NumPy is imported, which nothing above does: a filter's matrices are small, and BLAS's threads, which wait for one
-# another, make a run take twice as long where other programs keep the cores busy. The results are the same bytes.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# another, make a run take twice as long where other programs keep the cores busy. A large one's last digits depend on them.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from rbpf import __version__
 from rbpf.cli import cameras, installed, judging

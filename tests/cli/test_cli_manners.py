@@ -152,9 +152,9 @@ def recordings(tmp_path_factory):
 
 RUN_ALL = """
 import json, sys
+from rbpf.cli import main
 import pytest
 from tests.conftest import paint_plainly
-from rbpf.cli import main
 paint_plainly(pytest.MonkeyPatch())
 sys.exit(max(main(words) for words in json.loads(sys.argv[1])))
 """
