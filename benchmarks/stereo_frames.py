@@ -36,7 +36,7 @@ def rendered(pairs: int) -> ImageSequence:
 def run(settings: Settings) -> list[Row]:
     """The system beside OpenCV's SIFT alone on both whole images, without matching, map or filter."""
     sequence = rendered(SETTLING + settings.repetitions(TIMED))
-    log = filter_opened(open_pairs(sequence, StereoConfig())).log
+    log = filter_opened(open_pairs(sequence, StereoConfig.s05())).log
     whole = 1e3 * log["seconds"][SETTLING:]
     plain = 1e3 * sift_alone(sequence)
     median = float(np.median(whole))

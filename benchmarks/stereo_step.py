@@ -29,7 +29,7 @@ class Drive:
     """A robot that turns on the spot among landmarks on all sides."""
 
     def __init__(self, landmarks: int, turns: int) -> None:
-        rng, config = np.random.default_rng(0), StereoConfig()
+        rng, config = np.random.default_rng(0), StereoConfig.s05()
         self.rng, self.config, self.turn = rng, config, 0
         slam = StereoSlam(RIG, config)
         self.sensor, self.filter = slam.front_end.landmarks, slam.filter

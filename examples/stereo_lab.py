@@ -32,7 +32,7 @@ def render(folder: Path, frames: int, width: int) -> Path:
 
 
 def main(
-    frames: int = 240, particles: int = 400, out: Path = Path("demo/stereo_lab"), quick: bool = False
+    frames: int = 240, particles: int = 50, out: Path = Path("demo/stereo_lab"), quick: bool = False
 ) -> dict[str, float]:
     """Renders, filters, and prints the main figures.
 
@@ -42,7 +42,7 @@ def main(
         out: folder for images, run, table and picture.
         quick: few small pairs and few particles.
     """
-    frames, particles, width = (12, 50, 320) if quick else (frames, particles, 640)
+    frames, particles, width = (12, 20, 320) if quick else (frames, particles, 640)
     recording = StereoRecording(render(out / "lab", frames, width))
     run = filter_recording(recording, StereoConfig(particles=particles), out / "run")
     entries = finish_run(run, out / "run", recording.sources())

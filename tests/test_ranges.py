@@ -151,7 +151,7 @@ def test_memory_is_estimated_before_it_is_taken():
 
 def test_the_rest_of_a_group_keeps_the_systems_defaults():
     found = load_settings(StereoConfig, "stereo", None, ["likelihood.truncation=9", "sift.length=128"], {})
-    assert found.likelihood.kind == "truncated" != LikelihoodConfig().kind
+    assert found.likelihood.kind == "student" != LikelihoodConfig().kind
     assert found.likelihood.truncation == 9.0
     assert found.likelihood.outlier_volume == StereoConfig().likelihood.outlier_volume
     assert found.sift.length == 128 and found.sift.working_scale == 0.5
@@ -159,13 +159,13 @@ def test_the_rest_of_a_group_keeps_the_systems_defaults():
     assert found.proposal.iterations == MonoConfig().proposal.iterations != ProposalConfig().iterations
 
 
-def test_nothing_given_is_the_default_a_joint_map_of_two_cameras_brings_its_own_and_what_is_set_wins():
+def test_nothing_given_is_the_default_maps_of_the_particles_own_bring_theirs_and_what_is_set_wins():
     for kind in (MonoConfig, StereoConfig):
         assert asdict(load_settings(kind, "any", None, [], {})) == asdict(kind())
-    joint = load_settings(StereoConfig, "stereo", None, ["map.kind=joint"], {"particles": 20})
-    assert joint == replace(StereoConfig.joint(), particles=20) and joint.likelihood.build().normalised
-    assert joint.likelihood.outlier_volume == StereoConfig().likelihood.outlier_volume
-    assert not load_settings(StereoConfig, "stereo", None, ["map.window=3"], {}).likelihood.build().normalised
+    own = load_settings(StereoConfig, "stereo", None, ["map.kind=particles"], {"particles": 20})
+    assert own == replace(StereoConfig.s05(), particles=20) and not own.likelihood.build().normalised
+    assert own.likelihood.outlier_volume == StereoConfig().likelihood.outlier_volume
+    assert load_settings(StereoConfig, "stereo", None, ["map.window=3"], {}).likelihood.build().normalised
 
 
 def test_a_group_can_be_nothing():

@@ -268,12 +268,15 @@ def of_images(desk: Path, quick: bool) -> list[Outcome]:
     faults = usual_faults(RATE_HZ, len(mono)), usual_faults(RATE_HZ / 2, len(stereo))
     if quick:
         faults = {name: faults[0][name] for name in list(faults[0])[:1]}, {}
-    config = replace(StereoConfig(), particles=100)
     focal = {name: fault for name, fault in faults[0].items() if name.startswith("focal")}
     calibrating = (
         try_mono(mono, known, MonoConfig(calibrate="online"), focal, "mono, calibrate=online") if focal else []
     )
-    return [*try_mono(mono, known, MonoConfig(), faults[0]), *calibrating, *try_stereo(stereo, config, faults[1])]
+    return [
+        *try_mono(mono, known, MonoConfig(), faults[0]),
+        *calibrating,
+        *try_stereo(stereo, StereoConfig(), faults[1]),
+    ]
 
 
 def of_machine(desk: Path, out: Path, kills: int, quick: bool) -> dict[str, Ended]:

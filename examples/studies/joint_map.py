@@ -159,11 +159,16 @@ def recorded(folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]) -
     return rows
 
 
-_EVERY_PAIR = StereoConfig(trigger=TriggerConfig(0.0, 0.0), likelihood=LikelihoodConfig("gaussian"))
+_EVERY_PAIR = replace(
+    StereoConfig.s05(), trigger=TriggerConfig(0.0, 0.0), likelihood=LikelihoodConfig("gaussian"), calibrate="off"
+)
 STEREO_FILTERS = {
     "joint, 50 particles": replace(_EVERY_PAIR, particles=50, map=MapConfig(kind="joint")),
     "particles, 400": replace(
-        _EVERY_PAIR, proposal=ProposalConfig(), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
+        _EVERY_PAIR,
+        proposal=ProposalConfig(),
+        odometry=OdometryConfig(role="proposal"),
+        map=MapConfig(kind="particles", weigh="all"),
     ),
 }
 """Of the same likelihood, and with each pixel once."""

@@ -44,7 +44,7 @@ class Figures(NamedTuple):
 
 def variants(particles: int) -> dict[str, StereoConfig]:
     """What is changed, one thing at a time."""
-    base = StereoConfig(particles=particles, trigger=TriggerConfig(0.0, 0.0))
+    base = replace(StereoConfig.s05(), particles=particles, trigger=TriggerConfig(0.0, 0.0))
     refined = ProposalConfig("ekf", iterations=1)
     clipped = replace(base, likelihood=truncated(4.0, 4.0))
     noisy = OdometryConfig(std_added_rad=2e-4, std_added_m=5e-4)
@@ -67,7 +67,7 @@ def variants(particles: int) -> dict[str, StereoConfig]:
             proposal=ProposalConfig("ekf"),
             likelihood=density,
             odometry=OdometryConfig(role="proposal"),
-            map=MapConfig(weigh="all"),
+            map=MapConfig(kind="particles", weigh="all"),
         ),
     }
 

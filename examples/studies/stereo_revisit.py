@@ -95,7 +95,7 @@ WAYS = "there", "there and back"
 def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5, particles: int = 400) -> dict[str, float]:
     """Prints a table in metres, medians over the seeds, and writes it to a folder; `quick` simulates a short path."""
     out.mkdir(parents=True, exist_ok=True)
-    configs = [StereoConfig(particles, seed) for seed in range(1 if quick else seeds)]
+    configs = [replace(StereoConfig.s05(), particles=particles, seed=seed) for seed in range(1 if quick else seeds)]
     rows = list(simulated(configs, 20 if quick else 60))
     if not quick:
         rows += recorded(Path(os.environ.get("RBPF_DATA", "../shared/data")), configs)

@@ -205,9 +205,9 @@ class FrameLog:
             self._path[name].append(value)
         revision = tracked.revision
         if revision is not None:
-            first = len(self) - len(revision.poses)
-            self._path["poses"][first:] = list(revision.poses)
-            self._path["covs"][first:] = list(revision.covs)
+            known = min(len(self), len(revision.poses))  # a log may have begun later
+            self._path["poses"][-known:] = list(revision.poses[-known:])
+            self._path["covs"][-known:] = list(revision.covs[-known:])
 
     def table(self, name: str) -> tuple[list[str], list[list[Any]]]:
         """A table of the run folder: its header, and its columns as plain numbers; times in milliseconds."""

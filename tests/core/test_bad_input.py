@@ -7,20 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rbpf.core import models as core
 from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import (
-    NEW,
-    NULL,
-    Jacobians,
-    Likelihood,
-    MotionModel,
-    NewLandmarks,
-    ObservationModel,
-    Part,
-    Resampler,
-    Transition,
-)
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.errors import InputError
@@ -39,7 +28,7 @@ LINE = Euclidean(1)
 STATE = Curved(np.copy)
 
 
-class Walk(MotionModel):
+class Walk(core.MotionModel):
     """A random walk on the line; `given` replaces parts of its transition."""
 
     space = LINE
@@ -48,10 +37,10 @@ class Walk(MotionModel):
         self.given = given
 
     def transition(self, state, control, dt):
-        return replace(Transition(state, 0.1 * np.ones((1, 1, 1))), **self.given)
+        return replace(core.Transition(state, 0.1 * np.ones((1, 1, 1))), **self.given)
 
 
-def on_a_line(motion: MotionModel | None = None, **options) -> Filter:
+def on_a_line(motion: core.MotionModel | None = None, **options) -> Filter:
     return Filter(motion or Walk(), Scripted(), n=N, rng=np.random.default_rng(0), **options)
 
 
@@ -122,13 +111,13 @@ class TestMeasurements:
     def test_no_particle_explains_them(self):
         # Far beyond the range of floating point is still a weight; what cannot be is none.
         assert on_a_line().step(seen(STATE, [[1e3]], [[[1e-2]]])).log_evidence < -1e5
-        clutter = {"ids": np.array([NULL]), "log_clutter": -np.inf}
+        clutter = {"ids": np.array([core.NULL]), "log_clutter": -np.inf}
         groups = seen(RangeBearing(SE2), [[5.0, 0.0]], **clutter)
         fails(in_the_plane(), "step 0: all particle weights are zero, no particle explains", groups)
 
     def test_one_particle_cannot_explain_them(self):
-        ids = np.full((N, 1), NEW)
-        ids[2] = NULL
+        ids = np.full((N, 1), core.NEW)
+        ids[2] = core.NULL
         filter_, model = in_the_plane(resampler=EssTriggered(Systematic(), 0.0)), RangeBearing(SE2)
         filter_.step(seen(model, [[5.0, 0.0]], ids=ids, log_clutter=-np.inf, log_new=-3.0))
         expected = np.full(N, 1 / (N - 1))
@@ -146,7 +135,7 @@ class TestModels:
     def test_observations_of_wrong_shape(self):
         flat, slope = Curved(np.copy), Curved(np.copy)
         flat.predict = lambda *parts: np.zeros((1, 1))
-        slope.jacobians = lambda state, *parts: Jacobians(np.ones((*state.shape[:-1], 2, 1)))
+        slope.jacobians = lambda state, *parts: core.Jacobians(np.ones((*state.shape[:-1], 2, 1)))
         match = rf"Curved.predict returned shape \(1, 1\), expected \({N}, 1, 1\)"
         fails(on_a_line(), match, seen(flat, [[1.0]]))
         match = rf"jacobians returned a block of shape \({N}, 1, 2, 1\), expected \({N}, 1, 1"
@@ -181,13 +170,13 @@ class TestModels:
 
     def test_landmark_and_substate_in_one_observation(self):
         model = RangeBearing(SE2)
-        model.reads = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
+        model.reads = frozenset({core.Part.STATE, core.Part.LANDMARK, core.Part.SUBSTATE})
         groups = seen(model, [[5.0, 0.0]], ids=np.zeros(1, dtype=int))
         fails(in_the_plane(), "reads a landmark and the substate, which couples them", groups)
 
     @pytest.mark.parametrize("ancestors", [np.zeros(N - 1, dtype=int), np.full(N, N), np.full(N, -1)])
     def test_resampler_without_manners(self, ancestors):
-        class Rude(Resampler):
+        class Rude(core.Resampler):
             def ancestors(self, weights, rng):
                 return ancestors
 
@@ -234,10 +223,10 @@ class TestLandmarks:
 
     def test_landmarks_that_cannot_be_added(self, filter_):
         class Bearing(RangeBearing):  # type: ignore[misc]
-            invert = ObservationModel.invert
+            invert = core.ObservationModel.invert
 
         held = filter_.belief().map
-        new = NewLandmarks(np.ones((1, 2)), np.eye(2)[None], RangeBearing(SE2), Point(2))
+        new = core.NewLandmarks(np.ones((1, 2)), np.eye(2)[None], RangeBearing(SE2), Point(2))
         for changed, match in (
             ({"mask": np.ones((N, 1), dtype=bool)}, "only need a map with evidence=True"),
             ({"z": np.array([[np.nan, 0.0]])}, "a new Point has a mean or covariance that is not finite"),
@@ -259,7 +248,7 @@ def test_particles_of_weight_zero_do_no_harm():
     assert filter_.particles.weights[2] == 0.0
 
 
-class Impossible(Likelihood):
+class Impossible(core.Likelihood):
     """Zero everywhere, which only the correction finds out."""
 
     def log_density(self, nu, cov):

@@ -4,18 +4,9 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
+from rbpf.core import models as core
 from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import (
-    FusedKernel,
-    Jacobians,
-    MotionModel,
-    NewLandmarks,
-    ObservationModel,
-    Observations,
-    Records,
-    Transition,
-)
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
@@ -42,7 +33,7 @@ FORMS = {
 }
 
 
-class Moved(MotionModel):
+class Moved(core.MotionModel):
     """Goes on by half a metre, and drives a substate that nothing depends on."""
 
     space = SE2
@@ -54,10 +45,10 @@ class Moved(MotionModel):
         mean = SE2.retract(state, np.array([0.1, 0.5, 0.0]))
         noise = np.diag([0.02, 0.05, 0.05, 1.0])[None]
         blocks = np.zeros((1, 3, 1)), np.ones((1, 1, 1)), np.zeros((1, 1))
-        return Transition(*map(self.form, (mean, noise, *blocks)))
+        return core.Transition(*map(self.form, (mean, noise, *blocks)))
 
 
-class Seen(ObservationModel):
+class Seen(core.ObservationModel):
     """Range and bearing, with everything that it says in one form."""
 
     dim = INNER.dim
@@ -71,18 +62,18 @@ class Seen(ObservationModel):
 
     def jacobians(self, state, landmark=None, const=None, substate=None):
         found = INNER.jacobians(state, landmark)
-        return Jacobians(*(None if block is None else self.form(np.array(block)) for block in found))
+        return core.Jacobians(*(None if block is None else self.form(np.array(block)) for block in found))
 
     def residual(self, z, predicted):
         return self.form(INNER.residual(z, predicted))
 
     def initialise(self, state, z, cov):
         first = INNER.initialise(state, z, cov)
-        return Records(self.form(first.mean), self.form(first.cov))
+        return core.Records(self.form(first.mean), self.form(first.cov))
 
     def kernel(self):
         kernel = INNER.kernel()
-        return FusedKernel(kernel.function, self.form(kernel.params)) if self.fused else None
+        return core.FusedKernel(kernel.function, self.form(kernel.params)) if self.fused else None
 
 
 def drive(form, fused):
@@ -96,8 +87,8 @@ def drive(form, fused):
         pose = SE2.retract(pose, np.array([0.1, 0.5, 0.0]))
         z = INNER.predict(pose, points) + 0.05 * rng.normal(size=(3, 2))
         z, cov = form(z), form(np.tile(np.eye(2), (3, 1, 1)))
-        old = [Observations(z, cov, model, None, np.arange(3, dtype=np.int32))] if step else []
-        filter_.step(Frame(old, [] if step else [NewLandmarks(z, cov, model, Point(2))]))
+        old = [core.Observations(z, cov, model, None, np.arange(3, dtype=np.int32))] if step else []
+        filter_.step(Frame(old, [] if step else [core.NewLandmarks(z, cov, model, Point(2))]))
     return filter_.particles, held.read(held.ids)
 
 

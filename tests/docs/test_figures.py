@@ -26,10 +26,10 @@ TWICE = {
                        _MEASURED: r"mono_redkitchen_a, 500 frames[^|]*\|[^|]*\| "},
     "without known points": {_README: r"the same without known points \| Sim\(3\) ",
                              _MEASURED: r"mono_redkitchen_a without known points \| \| "},
-    "two cameras, room": {_README: r"two cameras \(`stereo_zed_room1`\) \| ",
+    "two cameras, room": {_README: r"two cameras \(`stereo_zed_room1`\).*in every particle ",
                           _MEASURED: r"stereo_zed_room1, 105 pairs, 1.9 m \|[^|]*\| "},
     "two cameras, road": {
-        _README: r"`stereo_kitti_seq1`, 60 m\) \| ", _MEASURED: r"stereo_kitti_seq1, 51 pairs, 60 m \|[^|]*\| ",
+        _README: r"60 m\).*in every particle ", _MEASURED: r"stereo_kitti_seq1, 51 pairs, 60 m \|[^|]*\| ",
         _STEREO: r"`stereo_kitti_seq1`, 51 pairs, 60 m \| ",
     },
     "its odometry, road": {

@@ -1,5 +1,7 @@
 """Stereo SLAM on recordings, beside its own odometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ pytestmark = [pytest.mark.real_data, pytest.mark.slow, pytest.mark.usefixtures("
 
 
 def scores(run: Run) -> dict[str, float]:
-    assert run.failure is None and run.messages == []
+    assert run.failure is None and all("the pair calibrates itself" in message for message in run.messages)
     return scores_of(run)
 
 
@@ -49,7 +51,8 @@ def test_there_and_back_again(data_dir):
     found = scores(run)
     assert found["ate_rmse_m"] <= 0.009
     assert found["ate_rmse_m"] < found["vo_ate_rmse_m"]
-    off = scores(filter_opened(open_pairs(sequence, StereoConfig(map=MapConfig(used=False)))))
+    without = replace(StereoConfig.s05(), map=MapConfig(used=False, kind="particles"))
+    off = scores(filter_opened(open_pairs(sequence, without)))
     assert found["ate_rmse_m"] < off["ate_rmse_m"]
 
 

@@ -19,7 +19,7 @@ from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
-from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.config import CalibrationConfig, MapConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import LAG, System, TrackingState
@@ -33,9 +33,8 @@ pytestmark = pytest.mark.usefixtures("keypoints_once")
 KNOWN, LOG, DARK = known_points(), desk(2, frames=8), np.zeros((240, 320), dtype=np.uint8)
 ROOM = simulate_features(RoomWorld(frames=24, laps=0.15, points=120), Measuring(), MONO, 0)
 """A way along a wall: points leave the view."""
-PIXELS = simulate_features(
-    LabWorld(LabDrive(frames=8, every=4), points=2000), Measuring(known=0, measurements=20, new_per_frame=20), STEREO, 0
-)
+FAST, NEW = LabWorld(LabDrive(frames=9, every=12), points=2000), Measuring(known=0, measurements=40, new_per_frame=20)
+PIXELS = simulate_features(FAST, NEW, STEREO, 0)
 LOST = {TrackingState.TRACKED, TrackingState.LOST}
 
 
@@ -44,11 +43,11 @@ def mono(points=None, **options) -> System:
 
 
 def stereo(**options) -> System:
-    return StereoSlam(pairs(1).rig, StereoConfig(particles=60, **options))
+    return StereoSlam(pairs(1).rig, replace(StereoConfig.s05(), particles=60, **options))
 
 
-def named_pairs() -> System:
-    config = StereoConfig(particles=10, trigger=TriggerConfig(0.0, 0.0))
+def named_pairs(disparity_px: float = 0.1) -> System:
+    config = StereoConfig(10, trigger=TriggerConfig(0.0, 0.0), self_calibration=CalibrationConfig(disparity_px))
     return StereoSlam(PIXELS.camera, config, front_end=NamedFrontEnd(PIXELS.camera, config))
 
 
@@ -119,14 +118,15 @@ RESUMED = {
         stereo, lambda: pairs(12, lambda t, pair: missing(pair) if t in (0, 5) else pair).frames(), (0, 5, 6, 9)
     ),
     "pairs, joint map": Case(
-        lambda: stereo(
-            map=MapConfig(kind="joint", submap=30), likelihood=StereoConfig.joint().likelihood, calibrate="online"
-        ),
+        lambda: StereoSlam(pairs(1).rig, StereoConfig(particles=60, map=MapConfig(submap=30))),
         lambda: pairs(12).frames(),
         (0, 5, 7),
     ),
     "pairs, lost": Case(stereo, blurred, (12,), LOST),
     "named pairs": Case(named_pairs, lambda: PIXELS.frames, (0, 5)),
+    "named pairs, calibrating": Case(
+        lambda: named_pairs(8.0), lambda: (replace(one, z=np.add(one.z, [0, 0, 8])) for one in PIXELS.frames), (0, 3)
+    ),
     "robot, own maps": Case(
         lambda: robot(RangeBearingConfig(particles=4, map="particles"))[0], lambda: islice(robot()[1], 12), (0, 5, 9)
     ),

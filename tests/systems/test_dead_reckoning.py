@@ -31,7 +31,7 @@ def frames(count: int = 4, missing: tuple[int, ...] = ()) -> list[FeatureFrame]:
 
 
 def slam(dof: int = 6, **options) -> StereoSlam:
-    config = StereoConfig(particles=20, dof=dof, map=MapConfig(used=False), **options)
+    config = replace(StereoConfig.s05(), particles=20, dof=dof, map=MapConfig(kind="particles", used=False), **options)
     return StereoSlam(RIG, config, front_end=NamedFrontEnd(RIG, config))
 
 

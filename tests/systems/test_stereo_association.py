@@ -20,7 +20,8 @@ from tests.systems.stereo_sequences import half_exchanged, pairs
 
 pytestmark = pytest.mark.usefixtures("keypoints_once")
 COUNT = 10
-CONFIG = StereoConfig(
+CONFIG = replace(
+    StereoConfig.s05(),
     particles=60,
     trigger=TriggerConfig(0.0, 0.0),
     likelihood=replace(StereoConfig().likelihood, kind="outliers"),

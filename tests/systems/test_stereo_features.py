@@ -28,13 +28,14 @@ from rbpf.validation.gtsam.camera import solve_features
 
 pytestmark = pytest.mark.slow
 
-CONFIG = StereoConfig(
+CONFIG = replace(
+    StereoConfig.s05(),
     particles=200,
     trigger=TriggerConfig(0.0, 0.0),
     likelihood=LikelihoodConfig("gaussian"),
     proposal=ProposalConfig("ekf", iterations=1),
 )
-JOINT = replace(CONFIG, particles=50, map=MapConfig(kind="joint"))
+JOINT = replace(CONFIG, particles=50, map=MapConfig(kind="joint"), calibrate="off")
 
 
 def simulated(frames: int = 40, seed: int = 0, camera=STEREO, **options) -> FeatureLog:
@@ -105,9 +106,8 @@ def test_nees_of_the_pose():
     """
     density = replace(StereoConfig().likelihood, kind="outliers")
     twice = replace(CONFIG, likelihood=density)
-    once = replace(
-        twice, proposal=ProposalConfig("ekf"), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
-    )
+    role, own = OdometryConfig(role="proposal"), MapConfig(kind="particles", weigh="all")
+    once = replace(twice, proposal=ProposalConfig("ekf"), odometry=role, map=own)
     nees, logs = [], [simulated(20, seed) for seed in range(12)]
     for config in (once, twice, JOINT):
         nees.append(np.mean([nees_of(filtered(log, config)) for log in logs]))
@@ -153,7 +153,7 @@ def test_slopes_by_an_error_of_all_disparities():
 
 def test_an_error_of_all_disparities_is_found():
     """As exactly as it says, by runs whose paths know their errors; what they hand on is without it. Six recordings."""
-    joint, error, squared, nees = replace(StereoConfig.joint(), trigger=CONFIG.trigger), [0.0, 0.0, 0.3], [], []
+    joint, error, squared, nees = StereoConfig(trigger=CONFIG.trigger), [0.0, 0.0, 0.3], [], []
     online = replace(joint, calibrate="online", self_calibration=CalibrationConfig(disparity_px=0.3))
     for seed in range(6):
         log = simulated(60, seed)
@@ -170,13 +170,27 @@ def test_an_error_of_all_disparities_is_found():
     assert np.mean(nees, axis=0)[0] < 1.3 and np.mean(nees, axis=0)[1] > 2.5
 
 
+def test_a_pair_calibrates_itself_where_that_explains_it_better(log):
+    """Then it is as if it had done so from the start; else as if its calibration were certain, to the last byte."""
+    config = StereoConfig(trigger=CONFIG.trigger, self_calibration=CalibrationConfig(disparity_px=2.0))
+    wrong = replace(log, frames=[replace(frame, z=frame.z + np.array([0.0, 0.0, 2.0])) for frame in log.frames])
+    tried, online, off = (filtered(wrong, replace(config, calibrate=each)) for each in ("auto", "online", "off"))
+    (found, std), right = tried.system.calibration(), online.system.calibration()[0]
+    assert abs(found - right) < std and not tried.log["offset_px"][:5].any()
+    assert [message.split(": ")[-1] for message in tried.messages] == ["the pair calibrates itself from here on"]
+    apart = [np.abs(SE3.translation(run.log.poses) - SE3.translation(online.log.poses)).max() for run in (tried, off)]
+    assert apart[0] < 0.2 * apart[1] and abs((tried.log["log_evidence"] - online.log["log_evidence"]).sum()) < 3.0
+    tried, off = (filtered(log, replace(config, calibrate=each)) for each in ("auto", "off"))
+    assert tried.log.poses.tobytes() == off.log.poses.tobytes() and "calibration" not in tried.system.summary(tried.log)
+
+
 def test_settings_that_do_not_go_together_are_refused(log):
-    with pytest.raises(InputError, match=r"calibrate=online holds .* set map\.kind=joint"):
+    with pytest.raises(InputError, match=r"calibrate=online holds .* leave out map\.kind=particles"):
         filtered(log, replace(CONFIG, calibrate="online"))
     with pytest.raises(InputError, match=r"odometry\.role=proposal needs proposal\.kind=ekf and map\.weigh=all"):
         filtered(log, replace(CONFIG, odometry=OdometryConfig(role="proposal")))
     with pytest.raises(InputError, match=r"a likelihood that is a density, and likelihood\.kind=truncated is none"):
-        filtered(log, replace(JOINT, likelihood=StereoConfig().likelihood))
+        filtered(log, replace(JOINT, likelihood=StereoConfig.s05().likelihood))
 
 
 def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:

@@ -21,7 +21,7 @@ from tests.systems.plane_sequences import texture
 from tests.systems.stereo_sequences import Pairs, errors_m, filtered, half_exchanged, pairs, swapped
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
-CONFIG = StereoConfig(particles=60)
+CONFIG = replace(StereoConfig.s05(), particles=60)
 ALWAYS = replace(CONFIG, trigger=TriggerConfig(0.0, 0.0))
 COUNT = 12
 
@@ -81,7 +81,7 @@ class TestPath:
         np.testing.assert_allclose(mean, log.poses[-1], atol=1e-9)
 
     def test_without_a_map_the_particles_follow_the_odometry(self):
-        config = replace(CONFIG, particles=400, map=MapConfig(used=False))
+        config = replace(CONFIG, particles=400, map=MapConfig(kind="particles", used=False))
         run = filtered(pairs(COUNT), config)
         assert run.system.map().ids.size == 0 and run.log["observed"].sum() == 0
         off = SE3.translation(run.log.poses[-1]) - SE3.translation(run.log["odometry"][-1])

@@ -123,7 +123,7 @@ def test_visual_odometry_alone(tracks, solved):
     log = tracks.log
     frames = [replace(frame, stamp_ns=100_000_000 * frame.stamp_ns) for frame in log.frames]
     odometry = OdometryConfig(prior=MotionPrior(std_speed=10.0))
-    config = StereoConfig(1, odometry=odometry, map=MapConfig(used=False))
+    config = replace(StereoConfig.s05(), particles=1, odometry=odometry, map=MapConfig(kind="particles", used=False))
     slam = StereoSlam(log.camera, config, front_end=NamedFrontEnd(log.camera, config))
     said = [slam.take(frame) for frame in frames]
     path = np.array([one.values["odometry"] for one in said])

@@ -70,7 +70,8 @@ def test_monocular_configurations_are_compared_on_features():
             compare_evidence(*pair, log, range(2))
 
 
-APART = StereoConfig(particles=60, odometry=OdometryConfig(split="apart"), likelihood=LikelihoodConfig(kind="gaussian"))
+S05, HALVES = StereoConfig.s05(), OdometryConfig(split="apart")
+APART = replace(S05, particles=60, odometry=HALVES, likelihood=LikelihoodConfig(kind="gaussian"))
 
 
 def test_stereo_configurations_are_compared_on_what_odometry_has_not_used():
@@ -84,7 +85,7 @@ def test_stereo_configurations_are_compared_on_what_odometry_has_not_used():
 @pytest.mark.parametrize(
     ("first", "second", "message"),
     [
-        (StereoConfig(), APART, "the first configuration has no evidence.*'truncated' is not a density"),
+        (S05, APART, "the first configuration has no evidence.*'truncated' is not a density"),
         (replace(APART, odometry=OdometryConfig()), APART, "count them twice"),
         (replace(APART, dof=3), APART, "differ in dof"),
         (replace(APART, trigger=TriggerConfig(moved_m=0.5)), APART, "differ in trigger"),

@@ -1,5 +1,7 @@
 """What runs over images keep of each frame, the frames, views and videos that are drawn of it, and names of videos."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ from tests.cli.sequences import full_disk
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 
-CONFIG, COUNT, BAD = StereoConfig(particles=40, trigger=TriggerConfig(0.0, 0.0)), 8, 5
+CONFIG, COUNT, BAD = replace(StereoConfig.s05(), particles=40, trigger=TriggerConfig(0.0, 0.0)), 8, 5
 
 
 def sequence():

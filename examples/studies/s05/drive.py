@@ -1,7 +1,7 @@
 """The robot's drive: rendered once, its features measured once, filtered as often as it takes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from examples.studies.feature_cache import CachedSequence, cache_features
@@ -52,12 +52,13 @@ class Setting:
         return self.out / "lab"
 
     def config(self) -> StereoConfig:
-        """Settings of the filter: the defaults, which are the paper's, with its three degrees of freedom."""
+        """Settings of the filter: the paper's, with its three degrees of freedom."""
         if self.dof not in (3, 6):
             raise InputError(f"dof must be 3 or 6, got {self.dof}")
         trigger = TriggerConfig(self.trigger_m, self.trigger_m)
         odometry = OdometryConfig(independent=True)
-        return StereoConfig(self.particles, self.seed, 3 if self.dof == 3 else 6, trigger=trigger, odometry=odometry)
+        base, dof = StereoConfig.s05(), 3 if self.dof == 3 else 6
+        return replace(base, particles=self.particles, seed=self.seed, dof=dof, trigger=trigger, odometry=odometry)
 
 
 def measured_drive(

@@ -1,9 +1,16 @@
-"""A pair that calibrates itself: an error common to all disparities is a constant of the joint map, learnt with all else."""
+"""A pair that calibrates itself: an error common to all disparities is a constant of the joint map, learnt with all else.
 
-from typing import Any, final
+Whether there is one is decided by evidence (`calibrate=auto`): a *trial*, which learns it, takes the same pairs beside a run
+that takes the calibration as it is given. By how many standard deviations what it learns differs from 0 does not decide: where
+pixels err alike for other reasons, an offset explains a little of that.
+"""
+
+from dataclasses import replace
+from typing import Any, ClassVar, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import Kept, integers, numbers, poses
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
 from rbpf.errors import InputError
@@ -11,22 +18,68 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd
 from rbpf.systems.stereo.landmarks import F
+from rbpf.systems.system import Revision, Tracked
+
+DECISIVE = 18.0
+"""Nats by which one of the two explains the pairs better when that is no chance any more: as much as six sigma."""
+UPDATES = 100
+"""After which the calibration is taken as it is given, if nothing is decided."""
+REVISED = 1000
+"""Pairs before the decision whose poses are told anew, at most."""
+
+
+@final
+class Comparison(Kept):
+    """By how much a trial explains the pairs better than a run that takes the calibration as it is given."""
+
+    kept: ClassVar = {
+        "sums": numbers(2),
+        "stamps_ns": integers("pairs"),
+        "poses": poses("pairs"),
+        "covs": numbers("pairs", 6, 6),
+    }
+    prefix = "trial/compared/"
+
+    def __init__(self) -> None:
+        self.sums = np.zeros(2)  #: Nats, and updates in which both could be compared.
+        #: The trial's path: (T,), (T, 7) and (T, 6, 6).
+        self.stamps_ns, self.poses = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
+        self.covs = np.zeros((0, 6, 6))
+
+    def add(self, given: Tracked, trial: Tracked) -> bool | None:
+        """What both say of a pair. Whether the trial is right, None as long as that is not decided."""
+        gained = trial.values["log_evidence"] - given.values["log_evidence"]
+        self._before = float(self.sums[0])
+        if given.values["updated"] and trial.values["updated"] and np.isfinite(gained):
+            self.sums += gained, 1.0
+        self.stamps_ns = np.append(self.stamps_ns, trial.stamp_ns)[-REVISED:]
+        self.poses = np.append(self.poses, trial.pose[None], axis=0)[-REVISED:]
+        self.covs = np.append(self.covs, trial.cov[None], axis=0)[-REVISED:]
+        gain, updates = self.sums
+        return bool(gain > DECISIVE) if abs(gain) > DECISIVE or updates >= UPDATES else None
+
+    def told(self, trial: Tracked, message: str) -> Tracked:
+        """What the trial, which is right, says of the last pair, with its path; the evidence of all pairs is then its own."""
+        values = {**trial.values, "log_evidence": trial.values["log_evidence"] + self._before}
+        revision = Revision(self.stamps_ns, self.poses, self.covs)
+        return replace(trial, values=values, messages=(*trial.messages, message), revision=revision)
 
 
 @final
 class SelfCalibration:
-    """By how many px all disparities are too small; nothing, and certain, where `calibrate` is off.
+    """By how many px all disparities are too small; nothing, and certain, where that is not learnt.
 
-    `own_model` is whether landmarks are measured by a model of the user's, which cannot be tuned. Raises InputError: what is
-    to be learnt has no place in the map that is asked for.
+    Raises InputError: it is asked for, and has no place in the map.
     """
 
-    def __init__(self, config: StereoConfig, front_end: FrontEnd[Any], own_model: bool) -> None:
+    def __init__(self, config: StereoConfig, front_end: FrontEnd[Any]) -> None:
         self.front_end, self.is_online = front_end, config.calibrate == "online"
-        if self.is_online and (config.map.kind != "joint" or own_model):
+        #: Whether the map and the front end have a place for it.
+        self.is_possible = config.map.kind == "joint" and config.map.used and front_end.is_tunable
+        if self.is_online and not self.is_possible:
             raise InputError(
-                "calibrate=online holds the error of all disparities in a joint map of points: set map.kind=joint, and leave "
-                "out a model of your own"
+                "calibrate=online holds the error of all disparities in a joint map of points: leave out map.kind=particles, "
+                "and a model of your own"
             )
         variance = config.self_calibration.disparity_px**2
         #: Mean (1,) and covariance (1, 1) before anything is seen, for the joint map; None where it is not learnt.

@@ -49,12 +49,12 @@ class MapConfig(Ranged):
     """Which features of a pair are landmarks of the map."""
 
     used: bool = True  #: whether there is a map; without one the filter is the odometry and its noise.
-    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one Gaussian
-    #: of all landmarks and the frame, given the last few updates (joint): an uncertainty that stays true. With it
-    #: the odometry is the proposal, linearised once, and all candidates weigh, whatever odometry.role, proposal and
-    #: map.weigh say. It needs a likelihood that is a density: `StereoConfig.joint` has the defaults that go with it, as do
-    #: the settings of a run that asks for it.
-    kind: Literal["particles", "joint"] = "particles"
+    #: one Gaussian of all landmarks and the frame, given the last few updates (joint): an uncertainty that stays true; or
+    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), as in S05. With a
+    #: joint map the odometry is the proposal, linearised once, and all candidates weigh, whatever odometry.role, proposal and
+    #: map.weigh say, and the likelihood must be a density. `StereoConfig.s05` has the defaults that go with particles, as
+    #: do the settings of a run that asks for them.
+    kind: Literal["particles", "joint"] = "joint"
     #: of a joint map: updates sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.
     window: Count = 5
@@ -130,7 +130,7 @@ class CalibrationConfig(Ranged):
 class StereoConfig(RunConfig):
     """A run of stereo SLAM."""
 
-    particles: Count = 400  #: number of particles.
+    particles: Count = 50  #: number of particles.
     #: degrees of freedom of the camera: 6, or 3 for one that moves in its x–z plane and turns about y.
     dof: Literal[3, 6] = 6
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
@@ -141,29 +141,31 @@ class StereoConfig(RunConfig):
     map: MapConfig = field(default_factory=MapConfig)  #: which features are landmarks.
     #: which features become landmarks, and how long they stay.
     new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
-    #: of a joint map: the pair calibrates itself, an error common to all disparities being estimated with everything else.
-    calibrate: Literal["off", "online"] = "off"
+    #: of a joint map: the pair calibrates itself, an error common to all disparities being estimated with everything else
+    #: (online); by default if that explains the pairs better, which a second run beside this one tells (auto).
+    calibrate: Literal["auto", "off", "online"] = "auto"
     #: what is known of a pair that calibrates itself.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    #: of a landmark's innovation, S05 (6) by default.
+    #: of a landmark's innovation: with heavy tails, or S05 (6) with maps of the particles' own.
     likelihood: LikelihoodConfig = field(
-        default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
+        default_factory=lambda: LikelihoodConfig("student", outlier_volume=OUTLIER_VOLUME_PX3)
     )
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))  #: where particles are sampled.
     #: what is done after a motion that was only assumed.
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
 
     @classmethod
-    def joint(cls) -> Self:
-        """The defaults that go with a joint map: noise that is far off now and then, and fifty particles."""
+    def s05(cls) -> Self:
+        """The defaults that go with maps of the particles' own: 400 of them, and S05's truncated likelihood."""
         return cls(
-            particles=50,
-            map=MapConfig(kind="joint"),
-            likelihood=LikelihoodConfig("student", outlier_volume=OUTLIER_VOLUME_PX3),
+            particles=400,
+            map=MapConfig(kind="particles"),
+            likelihood=LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3),
         )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Self:
         """The defaults that go with settings that are given, by name."""
         group = given.get("map")
-        return cls.joint() if isinstance(group, dict) and group.get("kind") == "joint" else cls()
+        asked = isinstance(group, dict) and (group.get("kind") == "particles" or group.get("used") is False)
+        return cls.s05() if asked else cls()

@@ -1,6 +1,6 @@
 """Stereo SLAM (S05): visual odometry moves the particles, landmarks of a shared map weigh them.
 
-    slam = StereoSlam(rig, StereoConfig(particles=400))
+    slam = StereoSlam(rig)
     for stamp_ns, left, right in source:
         frame = slam.track(left, right, stamp_ns)     # pose, covariance, state of tracking, what was observed
 
@@ -8,12 +8,13 @@
 """
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, numbers, poses, read, truths
+from rbpf.core.checkpoint import integers, load_arrays, numbers, poses, read, truths
 from rbpf.core.models import NULL, Landmark, Part, Proposal
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
@@ -31,8 +32,9 @@ from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
-from rbpf.systems.stereo.calibration import SelfCalibration
+from rbpf.systems.stereo.calibration import UPDATES, Comparison, SelfCalibration
 from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.dead_reckoning import DeadReckoning
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd
 from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN, camera_motion, contradicts
@@ -41,6 +43,7 @@ from rbpf.systems.system import (
     DIAGNOSTICS,
     ESS,
     LOG_EVIDENCE,
+    MAP_IDS,
     NIS,
     NIS_DOF,
     RESAMPLED,
@@ -62,106 +65,6 @@ _STEREO = {
     "impossible": numbers(2),
     "doubted": truths(),
 }
-
-
-_RECKONING = {
-    "stamp_ns": integers("stamps"),
-    "velocity": numbers(6),
-    "delta": poses(),
-    "cov": numbers(6, 6),
-    "world_from_camera": poses(),
-    "missed": integers(4, least=0),
-    "velocity_at_update": numbers(6),
-    "noise": numbers("noisy", 6, 3),
-    "left_over": numbers("followed", 3, 4),
-}
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class DeadReckoning:
-    """Where the camera has come by visual odometry, pair after pair, also over pairs that could not be used.
-
-    What is known of its motion at a pair, before the filter sees it.
-    """
-
-    stamp_ns: int | None = None  #: time of the last pair that was measured, from which the next one is; None before.
-    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  #: (6,) [ω, v] of the camera then, rad/s, m/s.
-    since_update: Odometry = field(default_factory=Odometry.at_rest)  #: motion since the filter's last update.
-    #: (7,) by odometry alone; the first camera is the world.
-    world_from_camera: np.ndarray = field(default_factory=SE3.identity)
-    assumed: int = 0  #: pairs since the filter's last update over which the motion was only assumed.
-    waiting: int = 0  #: pairs since the first of these.
-    hidden: bool = False  #: whether nothing in the pair stood still.
-    passed_over: int = 0  #: pairs since that could not be measured.
-    velocity_at_update: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    #: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the last
-    #: measured pair, which the next step shares; none where the step was not chained or not measured.
-    noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 6, 3)))
-    #: (K, 3, 4) pixels and their covariance, at the filter's last update, of each feature of the last measured pair that was
-    #: followed from there on and was of no use to a joint map then; zeros for others, and none with other maps.
-    left_over: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4)))
-
-    def seconds(self, stamp_ns: int) -> float:
-        """Time since the last pair that was measured; infinite before the first."""
-        return np.inf if self.stamp_ns is None else 1e-9 * (stamp_ns - self.stamp_ns)
-
-    def moved(
-        self,
-        stamp_ns: int,
-        step: Odometry,
-        velocity: np.ndarray,
-        is_assumed: bool = False,
-        hidden: bool = False,
-        cross: np.ndarray | None = None,
-        noise: np.ndarray | None = None,
-        left_over: np.ndarray | None = None,
-    ) -> "DeadReckoning":
-        """At a pair, `step` after the last measured one, which it was matched with, or that is passed over.
-
-        `step` is what was expected where it `is_assumed`; `cross` (6, 6) is the covariance of the last step's error and this
-        one's, None for independent ones; `noise` and `left_over` are those after this step, as the attributes.
-        """
-        missed = 1 + self.passed_over if is_assumed else 0
-        return DeadReckoning(
-            stamp_ns,
-            velocity,
-            self.since_update.then(step, cross=cross),
-            SE3.compose(self.world_from_camera, step.delta),
-            assumed=self.assumed + missed,
-            waiting=self.waiting + 1 if missed or self.assumed else 0,
-            hidden=hidden,
-            velocity_at_update=self.velocity_at_update,
-            noise=np.zeros((0, 6, 3)) if noise is None else noise,
-            left_over=np.zeros((0, 3, 4)) if left_over is None else left_over,
-        )
-
-    def updated(self) -> "DeadReckoning":
-        """After the filter has taken the motion up to the last measured pair."""
-        world = self.world_from_camera
-        return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=world, velocity_at_update=self.velocity)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {
-            "reckoning/stamp_ns": np.array([] if self.stamp_ns is None else [self.stamp_ns], dtype=np.int64),
-            "reckoning/velocity": self.velocity,
-            "reckoning/delta": self.since_update.delta,
-            "reckoning/cov": self.since_update.cov,
-            "reckoning/world_from_camera": self.world_from_camera,
-            "reckoning/missed": np.array([self.assumed, self.waiting, self.hidden, self.passed_over]),
-            "reckoning/velocity_at_update": self.velocity_at_update,
-            "reckoning/noise": self.noise,
-            "reckoning/left_over": self.left_over,
-        }
-
-    @classmethod
-    def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":
-        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        stamps, velocity, delta, cov, world, missed, *rest = read(arrays, _RECKONING, "reckoning/").values()
-        assumed, waiting, hidden, passed_over = missed.tolist()
-        stamp_ns = int(stamps[0]) if stamps.size else None
-        motion = Odometry(delta, cov)
-        return cls(stamp_ns, velocity, motion, world, assumed, waiting, bool(hidden), passed_over, *rest)
 
 
 @final
@@ -234,12 +137,12 @@ class StereoSlam(System):
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
-        joint, self._calibration = None, SelfCalibration(config, front_end, own_model=model is not None)
+        joint, self._calibration = None, SelfCalibration(config, front_end)
         if config.map.kind == "joint":
             if not config.likelihood.build().normalised:
                 raise InputError(
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
-                    "none: begin with StereoConfig.joint(), or set likelihood.kind=outliers"
+                    "none: set likelihood.kind=student, or map.kind=particles"
                 )
             joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True)
         self._once = joint is not None or config.odometry.role == "proposal"
@@ -264,6 +167,13 @@ class StereoSlam(System):
         self._kept: Pair[Any] | None = None
         # Matches that no point in space has, and all, of the last pairs; whether that was said.
         self._impossible, self._doubted = np.zeros(2), False
+        # A run that calibrates the pair, beside this one as long as it is not decided which of them is right.
+        self._trial: StereoSlam | None = None
+        self._comparison = Comparison()
+        if config.calibrate == "auto" and self._calibration.is_possible:
+            self._trial = StereoSlam(rig, replace(config, calibrate="online"), front_end=front_end.copied())
+            # Both name landmarks, and a name is of one thing in the whole run.
+            self._trial.front_end.landmarks.name_from(UPDATES * config.new_landmarks.max_per_frame)
 
     def track(self, left: np.ndarray | None, right: np.ndarray | None, stamp_ns: int) -> Tracked:
         """A pair of rectified images (H, W) uint8, taken at one time.
@@ -279,24 +189,31 @@ class StereoSlam(System):
 
     def take(self, frame: Any) -> Tracked:
         """`track` with a frame of a recording, an `ImageFrame`, or another one that the front end takes."""
-        started, messages = time.perf_counter(), list[str]()
-        front_end, config = self.front_end, self.config
+        started, front_end = time.perf_counter(), self.front_end
         if not isinstance(frame, front_end.takes):
             taken = front_end.takes.__name__
             raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {taken} here")
         # The first frame is refused if it is not the cameras'.
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
-        landmarks, offset_px = front_end.landmarks, self._calibration.tune(self.filter)
+        offset_px = self._calibration.tune(self.filter)
 
         # 1. Measure the pair: features that both cameras see.
         pair, problem = front_end.measure(frame)
+        tracked = self._take(frame.stamp_ns, pair, problem, offset_px, started)
+        return tracked if self._trial is None else self._compare(self._trial, tracked, pair, problem)
+
+    def _take(
+        self, stamp_ns: int, pair: Pair[Any], problem: str, offset_px: float, started: float, due: bool | None = None
+    ) -> Tracked:
+        """`take` with a pair that has been measured; `due` is whether the filter is updated, None to decide it here."""
+        messages, front_end, config, landmarks = list[str](), self.front_end, self.config, self.front_end.landmarks
         seconds_features = time.perf_counter() - started
 
         # 2. How the camera has moved since the last pair that was measured; where this one tells too little, as before.
         dt, least = self.reckoning.seconds(pair.stamp_ns), config.odometry.estimate.min_matches
         if dt < 0.0:
-            raise InputError(f"time runs backwards: a pair has the stamp {frame.stamp_ns} ns, the last one a later one")
+            raise InputError(f"time runs backwards: a pair has the stamp {stamp_ns} ns, the last one a later one")
         measured = len(pair) >= least and dt > 0.0
         if measured:
             motion = self._motion_to(pair, dt)
@@ -322,7 +239,8 @@ class StereoSlam(System):
         # 3. Update the filter if the camera has moved enough, and, where its motion was only assumed, if the map says where
         # it has come: until then no particle moves.
         report, seconds_filter = None, 0.0
-        due = self.filter.steps == 0 or config.trigger.reached(at.since_update, self.frames - self._last_update)
+        if due is None:
+            due = self.filter.steps == 0 or config.trigger.reached(at.since_update, self.frames - self._last_update)
         if measured:
             self.reckoning = at
         if measured and due:
@@ -375,7 +293,7 @@ class StereoSlam(System):
         previous = np.full(len(pair), NULL, dtype=np.int64)
         previous[motion.rows[1][motion.inliers]] = motion.rows[0][motion.inliers]
         return Tracked(
-            frame.stamp_ns,
+            stamp_ns,
             pose,
             cov,
             state,
@@ -396,6 +314,40 @@ class StereoSlam(System):
             {"z": pair.features.z, "cov_z": pair.features.cov, "kind": kinds, "landmarks": ids, "previous": previous},
             tuple(messages),
         )
+
+    def _compare(self, trial: "StereoSlam", tracked: Tracked, pair: Pair[Any], problem: str) -> Tracked:
+        """The same pair in a run that calibrates it, which goes on in place of this one where it explains more."""
+        started, updated = time.perf_counter(), bool(tracked.values["updated"])
+        trial.filter.rng = np.random.default_rng((self.config.seed, self.frames))  # which a checkpoint need not hold
+        offset_px = trial._calibration.tune(trial.filter)
+        seen = trial.front_end.pair(pair.stamp_ns, trial.front_end.shifted(pair.features, -offset_px))
+        try:
+            other = trial._take(tracked.stamp_ns, seen, problem, offset_px, started, updated)
+        except InputError:  # nothing explains the pair there
+            self._trial = None
+            return tracked
+        is_right = self._comparison.add(tracked, other)
+        if is_right:
+            self._go_on_as(trial)
+            offset_px, std_px = self.calibration()
+            found = f"all disparities are {offset_px:.2f} ± {std_px:.2f} px too small: the pair calibrates itself from here on"
+            return self._comparison.told(other, found)
+        if is_right is False:
+            self._trial = None
+        seconds = tracked.values["seconds_filter"] + time.perf_counter() - started
+        return replace(tracked, values={**tracked.values, "seconds_filter": seconds})
+
+    def _go_on_as(self, trial: "StereoSlam") -> None:
+        """The pairs so far are as they were in the trial, from where the run goes on."""
+        self.filter, self.front_end, self._calibration = trial.filter, trial.front_end, trial._calibration
+        self.reckoning, self.at_update, self.since_update = trial.reckoning, trial.at_update, trial.since_update
+        self._kept, self._last_update, self._trial = trial._kept, trial._last_update, None
+
+    def load(self, path: Path | str) -> dict[str, np.ndarray]:
+        # A trial that has won has another map.
+        if self._trial and load_arrays(Path(path), "extra/stereo/calibrated").get("extra/stereo/calibrated"):
+            self._go_on_as(self._trial)
+        return super().load(path)
 
     def map(self) -> MapEstimate:
         """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
@@ -421,7 +373,7 @@ class StereoSlam(System):
         return FeatureLog(name, self.rig, frames)
 
     def calibration(self) -> tuple[float, float]:
-        """By how many px all disparities are too small, and its standard deviation; both 0 where `calibrate` is off."""
+        """By how many px all disparities are too small, and its standard deviation; both 0 where that is not learnt."""
         return self._calibration.estimate(self.filter)
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
@@ -448,10 +400,14 @@ class StereoSlam(System):
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The last measured pair, the landmarks' descriptors or names, and the odometry."""
-        kept = {} if self._kept is None else self.front_end.arrays(self._kept)
+        """The last measured pair, the landmarks' descriptors or names, the odometry, and the trial."""
+        kept, trial = {} if self._kept is None else self.front_end.arrays(self._kept), self._trial
+        if trial is not None:
+            kept |= {f"trial/{name}": array for name, array in (trial.filter.arrays() | trial.arrays()).items()}
+            kept |= self._comparison.arrays()
         return {
             **kept,
+            "stereo/calibrated": np.array(self._calibration.is_online),
             **self.front_end.landmarks.arrays(),
             **self.reckoning.arrays(),
             "stereo/frames": np.array([self.frames, self._last_update]),
@@ -471,6 +427,14 @@ class StereoSlam(System):
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
+        own = {name.removeprefix("trial/"): array for name, array in arrays.items() if name.startswith("trial/")}
+        if self._trial and own:
+            self._comparison.restore(arrays)
+            self._trial.filter.restore(own)
+            assert self._trial.joint is not None
+            self._trial.restore(own | {MAP_IDS: self._trial.joint.all_ids})
+        else:
+            self._trial = None
 
     def _motion_to(self, pair: Pair[Any], dt: float) -> "_Motion":
         """The motion from the last measured pair to this one, `dt` seconds later."""

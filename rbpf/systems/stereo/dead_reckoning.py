@@ -1,0 +1,109 @@
+"""Where a stereo camera has come by its odometry alone, between the filter's updates and beyond them."""
+
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from rbpf.core.checkpoint import integers, numbers, poses, read
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+
+_KEPT = {
+    "stamp_ns": integers("stamps"),
+    "velocity": numbers(6),
+    "delta": poses(),
+    "cov": numbers(6, 6),
+    "world_from_camera": poses(),
+    "missed": integers(4, least=0),
+    "velocity_at_update": numbers(6),
+    "noise": numbers("noisy", 6, 3),
+    "left_over": numbers("followed", 3, 4),
+}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class DeadReckoning:
+    """Where the camera has come by visual odometry, pair after pair, also over pairs that could not be used.
+
+    What is known of its motion at a pair, before the filter sees it.
+    """
+
+    stamp_ns: int | None = None  #: time of the last pair that was measured, from which the next one is; None before.
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  #: (6,) [ω, v] of the camera then, rad/s, m/s.
+    since_update: Odometry = field(default_factory=Odometry.at_rest)  #: motion since the filter's last update.
+    #: (7,) by odometry alone; the first camera is the world.
+    world_from_camera: np.ndarray = field(default_factory=SE3.identity)
+    assumed: int = 0  #: pairs since the filter's last update over which the motion was only assumed.
+    waiting: int = 0  #: pairs since the first of these.
+    hidden: bool = False  #: whether nothing in the pair stood still.
+    passed_over: int = 0  #: pairs since that could not be measured.
+    velocity_at_update: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    #: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the last
+    #: measured pair, which the next step shares; none where the step was not chained or not measured.
+    noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 6, 3)))
+    #: (K, 3, 4) pixels and their covariance, at the filter's last update, of each feature of the last measured pair that was
+    #: followed from there on and was of no use to a joint map then; zeros for others, and none with other maps.
+    left_over: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4)))
+
+    def seconds(self, stamp_ns: int) -> float:
+        """Time since the last pair that was measured; infinite before the first."""
+        return np.inf if self.stamp_ns is None else 1e-9 * (stamp_ns - self.stamp_ns)
+
+    def moved(
+        self,
+        stamp_ns: int,
+        step: Odometry,
+        velocity: np.ndarray,
+        is_assumed: bool = False,
+        hidden: bool = False,
+        cross: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
+        left_over: np.ndarray | None = None,
+    ) -> "DeadReckoning":
+        """At a pair, `step` after the last measured one, which it was matched with, or that is passed over.
+
+        `step` is what was expected where it `is_assumed`; `cross` (6, 6) is the covariance of the last step's error and this
+        one's, None for independent ones; `noise` and `left_over` are those after this step, as the attributes.
+        """
+        missed = 1 + self.passed_over if is_assumed else 0
+        return DeadReckoning(
+            stamp_ns,
+            velocity,
+            self.since_update.then(step, cross=cross),
+            SE3.compose(self.world_from_camera, step.delta),
+            assumed=self.assumed + missed,
+            waiting=self.waiting + 1 if missed or self.assumed else 0,
+            hidden=hidden,
+            velocity_at_update=self.velocity_at_update,
+            noise=np.zeros((0, 6, 3)) if noise is None else noise,
+            left_over=np.zeros((0, 3, 4)) if left_over is None else left_over,
+        )
+
+    def updated(self) -> "DeadReckoning":
+        """After the filter has taken the motion up to the last measured pair."""
+        world = self.world_from_camera
+        return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=world, velocity_at_update=self.velocity)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "reckoning/stamp_ns": np.array([] if self.stamp_ns is None else [self.stamp_ns], dtype=np.int64),
+            "reckoning/velocity": self.velocity,
+            "reckoning/delta": self.since_update.delta,
+            "reckoning/cov": self.since_update.cov,
+            "reckoning/world_from_camera": self.world_from_camera,
+            "reckoning/missed": np.array([self.assumed, self.waiting, self.hidden, self.passed_over]),
+            "reckoning/velocity_at_update": self.velocity_at_update,
+            "reckoning/noise": self.noise,
+            "reckoning/left_over": self.left_over,
+        }
+
+    @classmethod
+    def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
+        stamps, velocity, delta, cov, world, missed, *rest = read(arrays, _KEPT, "reckoning/").values()
+        assumed, waiting, hidden, passed_over = missed.tolist()
+        stamp_ns = int(stamps[0]) if stamps.size else None
+        motion = Odometry(delta, cov)
+        return cls(stamp_ns, velocity, motion, world, assumed, waiting, bool(hidden), passed_over, *rest)
