@@ -228,10 +228,10 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
             yield robot_ratio(data / name, RangeBearingConfig(map="particles"), range(seeds))
     for name in PAIRS:
         if (data / name).is_dir():
-            yield stereo_ratio(StereoRecording(data / name), StereoConfig(), range(seeds))
+            yield stereo_ratio(StereoRecording(data / name), StereoConfig.s05(), range(seeds))
     if (data / TRACKS).is_dir():
         tracks = read_stereo_tracks(data / TRACKS)
-        yield tracks_ratio(tracks.log, StereoConfig(), range(seeds), tracks.world_from_camera)
+        yield tracks_ratio(tracks.log, StereoConfig.s05(), range(seeds), tracks.world_from_camera)
     for name in CAMERAS:
         if (data / name).is_dir():
             yield camera_ratio(MonoRecording(data / name, data / name / "known_points.csv"), MonoConfig(), range(seeds))

@@ -98,6 +98,10 @@ def log_likelihoods(group: Observations, state: np.ndarray) -> np.ndarray:
     return found
 
 
+#: Of a sum of few terms, as a standard deviation: a few times the root of the last digit.
+ROUNDING = 8.0 * np.sqrt(np.finfo(float).eps)
+
+
 @final
 class KalmanSubstate(Conditional):
     """A linear substate s ~ N(ŝ, P) in every particle, given the sampled states.
@@ -249,7 +253,16 @@ def _split(joint: Array, d: int) -> tuple[Array, Array, Array]:
     gain = joint[:, d:, :d] @ np.linalg.pinv(of_increment, hermitian=True)
     # In a form that rounding cannot make indefinite.
     closed = np.concatenate([-gain, np.broadcast_to(np.eye(m), (len(joint), m, m))], axis=2)
-    return factor, gain, gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+    rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+    # What an increment tells exactly leaves the rounding of what cancels, which the next inverse would take for knowledge.
+    # It is small beside the terms that cancel, of each number in its own unit.
+    terms = np.abs(closed) @ np.sqrt(np.diagonal(joint, axis1=1, axis2=2))[..., None]
+    scale = np.where(terms > 0.0, ROUNDING * terms, 1.0)
+    values, vectors = np.linalg.eigh(rest / scale / np.swapaxes(scale, -1, -2))
+    if (values <= 1.0).any():
+        half = scale * vectors * np.sqrt(np.where(values > 1.0, values, 0.0))[:, None]
+        rest = half @ np.swapaxes(half, -1, -2)
+    return factor, gain, rest
 
 
 @lru_cache(maxsize=64)

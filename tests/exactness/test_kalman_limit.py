@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.marginals import KalmanSubstate
+from rbpf.core.marginals import KalmanSubstate, _split
 from rbpf.core.models import Jacobians, ObservationModel, Part
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
@@ -97,6 +97,11 @@ def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, 
             np.testing.assert_allclose(substate.mean[i], kalman.mean, atol=TOLERANCE)
             np.testing.assert_allclose(substate.cov[i], kalman.cov, atol=TOLERANCE)
         before = after
+
+
+def test_what_increments_tell_exactly_leaves_nothing():
+    half = np.random.default_rng(0).normal(size=(40, 4, 2)) * [[1e-3], [1.0], [1e-5], [1e3]]
+    assert not _split(half @ half.mT, 2)[2].any()
 
 
 # A velocity that is marginalised: the joint Kalman filter where that is exact, and the sampled velocity's law.

@@ -7,19 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from rbpf.core import models as base
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import GaussianWithOutliers
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import (
-    Conditional,
-    Likelihood,
-    MotionModel,
-    ObservationModel,
-    Part,
-    Proposal,
-    Resampler,
-    Transition,
-)
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Residual, Stratified, Systematic
 from rbpf.lie import SE2, Euclidean
@@ -41,7 +32,7 @@ from tests.exactness.models import (
 pytestmark = pytest.mark.slow
 
 PROPOSALS = {"prior": PriorProposal(), "ekf": EkfProposal(), "iterated": EkfProposal(iterations=3)}
-SCHEDULES: dict[str, Resampler] = {
+SCHEDULES: dict[str, base.Resampler] = {
     "always": Stratified(),
     "triggered": EssTriggered(Residual(), 0.5),
     "never": EssTriggered(Systematic(), 0.0),
@@ -56,7 +47,7 @@ class World:
 
     motion: LinearMotion
     frames: list[Frame]
-    marginalised: Callable[[], list[Conditional]]
+    marginalised: Callable[[], list[base.Conditional]]
     log_evidence: float
 
     def build(self, proposal: str, schedule: str, rng: np.random.Generator) -> Filter:
@@ -160,7 +151,7 @@ def test_marginalising_and_refining_lower_the_spread():
 Function = Callable[[np.ndarray], np.ndarray]
 
 
-class Moving(MotionModel):
+class Moving(base.MotionModel):
     """x' = f(x) + w on the line."""
 
     def __init__(self, f: Function, std: float):
@@ -168,7 +159,7 @@ class Moving(MotionModel):
         self.space = Euclidean(1)
 
     def transition(self, state, control, dt):
-        return Transition(self.f(state), np.full((1, 1, 1), self.std))
+        return base.Transition(self.f(state), np.full((1, 1, 1), self.std))
 
 
 @dataclass(frozen=True)
@@ -180,7 +171,7 @@ class Scalar:
     h: Function
     variance: float
     start: float
-    likelihood: Likelihood | None = None
+    likelihood: base.Likelihood | None = None
 
     def measurements(self, seed: int, outlier: float = 0.0) -> np.ndarray:
         rng = np.random.default_rng(seed)
@@ -201,7 +192,7 @@ class Scalar:
             density, total = density / mass, total + float(np.log(mass))
         return total
 
-    def log_ratios(self, zs: np.ndarray, proposal: Proposal, stream: int, seeds: int) -> np.ndarray:
+    def log_ratios(self, zs: np.ndarray, proposal: base.Proposal, stream: int, seeds: int) -> np.ndarray:
         model, cov = Curved(self.h), np.array([[self.variance]])
         frames = [Frame([single(z, cov, model, likelihood=self.likelihood)]) for z in zs]
 
@@ -273,20 +264,20 @@ DELTA = np.array([0.5, 1.2, 0.1])
 FIX = np.array([3.2, 0.6])
 
 
-class Antenna(ObservationModel):
+class Antenna(base.ObservationModel):
     """The position of an antenna away from the robot's origin; a substate is its drift."""
 
     dim = 2
 
     def __init__(self, drifting: bool = False):
-        self.reads = frozenset({Part.STATE, Part.SUBSTATE}) if drifting else frozenset({Part.STATE})
+        self.reads = frozenset({base.Part.STATE, base.Part.SUBSTATE}) if drifting else frozenset({base.Part.STATE})
 
     def predict(self, state, landmark=None, const=None, substate=None):
         world = SE2.transform(state, LEVER)
         return world if substate is None else world + 0.5 * substate
 
 
-class Turning(MotionModel):
+class Turning(base.MotionModel):
     """x' = x Exp(B s + w₁), s' = A s + w₂: turn rate and speed are marginalised."""
 
     space = SE2
@@ -295,7 +286,7 @@ class Turning(MotionModel):
     L = np.vstack([np.linalg.cholesky(COV), 0.2 * np.ones((2, 3))])
 
     def transition(self, state, control, dt):
-        return Transition(state, self.L[None], self.B[None], self.A[None], np.zeros((1, 2)))
+        return base.Transition(state, self.L[None], self.B[None], self.A[None], np.zeros((1, 2)))
 
 
 def positions(state: np.ndarray) -> np.ndarray:
