@@ -25,9 +25,8 @@ LARGEST = 1e12
 LATEST_S = 4e9
 #: Seconds between rows, on the median: what is read here comes neither as often nor, unless that is stated, as seldom.
 SHORTEST_GAP_S, LONGEST_GAP_S = 1e-4, 5.0
-OFF_RATE = (
-    1e3**0.5
-)  #: Times as long as stated between rows: beyond it the unit is rather a thousandth of what it should be.
+#: Times as long as stated between rows: beyond it the unit is rather a thousandth of what it should be.
+OFF_RATE = 1e3**0.5
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _PLAIN = dict.fromkeys(map(ord, "0123456789+-.eE \t,"))
