@@ -41,7 +41,7 @@ class Comparison(Kept):
     prefix = "trial/compared/"
 
     def __init__(self) -> None:
-        self.sums = np.zeros(2)  #: Nats, and updates in which both could be compared.
+        self.sums = np.zeros(2)  #: Nats, and updates of the run that takes it as given.
         #: The trial's path: (T,), (T, 7) and (T, 6, 6).
         self.stamps_ns, self.poses = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
         self.covs = np.zeros((0, 6, 6))
@@ -50,8 +50,9 @@ class Comparison(Kept):
         """What both say of a pair. Whether the trial is right, None as long as that is not decided."""
         gained = trial.values["log_evidence"] - given.values["log_evidence"]
         self._before = float(self.sums[0])
-        if given.values["updated"] and trial.values["updated"] and np.isfinite(gained):
-            self.sums += gained, 1.0
+        if given.values["updated"]:
+            comparable = trial.values["updated"] and np.isfinite(gained)
+            self.sums += gained if comparable else 0.0, 1.0
         self.stamps_ns = np.append(self.stamps_ns, trial.stamp_ns)[-REVISED:]
         self.poses = np.append(self.poses, trial.pose[None], axis=0)[-REVISED:]
         self.covs = np.append(self.covs, trial.cov[None], axis=0)[-REVISED:]
