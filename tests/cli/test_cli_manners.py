@@ -137,14 +137,14 @@ def recordings(tmp_path_factory):
     """Arguments by system; enough particles that the kernels do run on several threads."""
     folder = tmp_path_factory.mktemp("rendered")
     imaging = Imaging(noise_std=1.0)
-    simulate_images(TexturedDesk(frames=5, texel_m=0.003), imaging, CAMERA, folder / "desk", seed=1)
+    simulate_images(TexturedDesk(frames=4, texel_m=0.003), imaging, CAMERA, folder / "desk", seed=1)
     rig = RectifiedStereo(CAMERA, 0.12)
-    simulate_images(TexturedRoom(frames=5, rate_hz=5.0), Imaging(known=0), rig, folder / "room", seed=1)
+    simulate_images(TexturedRoom(frames=4, rate_hz=5.0), Imaging(known=0), rig, folder / "room", seed=1)
     simulate_robot(RobotWorld(20, 40), folder / "log", 0)
     desk = folder / "desk"
     known = ["--known-points", str(desk / "known_points.csv")]
     return {
-        "mono": [str(desk), *known, "--particles", "900", "--no-batch"],
+        "mono": [str(desk), *known, "--particles", "900", "--no-video", "--no-batch"],
         "range-bearing": [str(folder / "log"), "--particles", "3000", "--no-batch"],
         "stereo": [str(folder / "room"), "--particles", "600", "--no-video", "--no-batch"],
     }

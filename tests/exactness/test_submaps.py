@@ -200,7 +200,7 @@ def turning(space, each: SubMap, known: Constants, by: np.ndarray) -> SubMap:
 def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most, by):
     """NEES per degree of freedom of the last start and the landmarks about it, over the runs; going round holds no more."""
     pose, near = [], []
-    for seed in range(20):
+    for seed in range(10):
         finished, ends, landmarks = ring(space, seed, count=count)
         wrong = by * np.random.default_rng(seed).normal(size=int(by > 0.0))
         prior = Constants(0.0 * wrong, by**2 * np.eye(wrong.size))

@@ -13,6 +13,7 @@ from rbpf.runs.run import Run
 from rbpf.sensors.descriptors import MatchLimits, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.readers import open_stereo
+from rbpf.sensors.readers.part import Part
 from rbpf.sensors.stereo import PairConfig, StereoMatcher
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
 
@@ -35,22 +36,19 @@ def test_the_room(data_dir):
 
 
 def test_the_road(data_dir):
-    """The median of three seeds is level with that of their odometry, and better but for the scale."""
-    sequence = open_stereo(data_dir / "stereo_kitti_seq1")
-    found = [scores(filter_opened(open_pairs(sequence, StereoConfig(seed=seed)))) for seed in range(3)]
-    median = {name: np.median([one[name] for one in found]) for name in found[0]}
-    assert median["ate_sim3_rmse_m"] <= 0.035
-    assert median["ate_rmse_m"] <= 0.25
-    assert median["ate_rmse_m"] <= 1.05 * median["vo_ate_rmse_m"]
-    assert median["ate_sim3_rmse_m"] <= median["vo_ate_sim3_rmse_m"]
+    """It is level with its odometry, and better but for the scale."""
+    found = scores(filter_opened(open_pairs(open_stereo(data_dir / "stereo_kitti_seq1"), StereoConfig())))
+    assert found["ate_sim3_rmse_m"] <= 0.035
+    assert found["ate_rmse_m"] <= 0.1
+    assert found["ate_rmse_m"] <= 1.05 * found["vo_ate_rmse_m"]
+    assert found["ate_sim3_rmse_m"] <= found["vo_ate_sim3_rmse_m"]
 
 
 def test_there_and_back_again(data_dir):
     """A path that comes back: with the map better than without, along all of it."""
-    sequence = pairs_there_and_back(open_stereo(data_dir / "stereo_zed_room1"))
-    run = filter_opened(open_pairs(sequence, StereoConfig()))
-    found = scores(run)
-    assert found["ate_rmse_m"] <= 0.009
+    sequence = pairs_there_and_back(open_stereo(data_dir / "stereo_zed_room1", part=Part(end_s=1.92)))
+    found = scores(filter_opened(open_pairs(sequence, StereoConfig())))
+    assert found["ate_rmse_m"] <= 0.006
     assert found["ate_rmse_m"] < found["vo_ate_rmse_m"]
     without = replace(StereoConfig.s05(), map=MapConfig(used=False, kind="particles"))
     off = scores(filter_opened(open_pairs(sequence, without)))

@@ -31,7 +31,7 @@ LANDMARKS, LEAST, MOST, PARTICLES = 265, 20, 30, 50
 
 def reproduce(setting: Setting) -> list[Row]:
     """Filters the sequence."""
-    frames = 60 if setting.quick else 3000
+    frames = 40 if setting.quick else 3000
     setting = replace(setting, width=WIDTH)
     world = LoopOverDesk(frames=frames, laps=frames / LAP, texel_m=0.002)
     sequence, known = setting.sequence("long_loop", world)

@@ -9,7 +9,6 @@ from examples.studies.e06.new_landmarks import round_a_desk
 from examples.studies.e06.setting import Row, Setting, true_poses
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
-from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
 
@@ -65,8 +64,7 @@ def started_until(frames: list[dict[str, np.ndarray]], until: int) -> int:
 
 def reproduce(setting: Setting) -> list[Row]:
     """Filters the loop."""
-    sequence, known = round_a_desk(setting)
-    run = filter_opened(open_mono(sequence, setting.config(), known))
+    sequence, run, _ = round_a_desk(setting)
     mapped = run.system.map()
     first = started_until([*map(run.log.observed, range(len(run.log)))], START)
     closure = find_closure([*map(run.log.observed, range(len(run.log)))], first)

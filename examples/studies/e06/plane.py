@@ -69,7 +69,7 @@ def unknown_points(run: Run, mapped: MapEstimate) -> np.ndarray:
 
 def reproduce(setting: Setting) -> list[Row]:
     """Filters 20 s over a flat desk."""
-    frames = 90 if setting.quick else 600
+    frames = 60 if setting.quick else 600
     sequence, known = setting.sequence("flat_desk", flat_desk(frames, 0.003 if setting.quick else 0.001))
     run = filter_opened(open_mono(sequence, setting.config(), known))
     mapped = run.system.map()
