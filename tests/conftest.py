@@ -68,8 +68,8 @@ def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
 def plain_pictures() -> Iterator[None]:
     """Pictures are painted small and without ticks and words, which takes a tenth of the time.
 
-    They still depend on what they show, so that runs can be compared by their bytes. Who asks for a run whose
-    pictures are looked at does without this fixture.
+    They still depend on what they show, so that runs can be compared by their bytes, and are painted once, not as vectors
+    again. Who asks for a run whose pictures are looked at does without this fixture.
     """
     with pytest.MonkeyPatch.context() as patch:
         paint_plainly(patch)
@@ -89,7 +89,8 @@ def paint_plainly(patch: pytest.MonkeyPatch) -> None:
             axes.set_title("")
             if (legend := axes.get_legend()) is not None:
                 legend.remove()
-        savefig(figure, path, format=options.get("format"), dpi=30, metadata=options.get("metadata"))
+        kept = {name: options.get(name) for name in ("format", "metadata")}
+        path.write_bytes(b"%PDF") if kept["format"] == "pdf" else savefig(figure, path, dpi=30, **kept)
 
     patch.setattr(Figure, "savefig", plain)
 

@@ -405,11 +405,11 @@ def main(
         seed: of the filter.
         workers: processes.
         out: folder for picture, tables, checkpoints and rendered sequences.
-        quick: four blackouts on a short desk, seen coarsely by few particles, not before 2 s: the map of the first
+        quick: two blackouts on a short desk, seen coarsely by few particles, not before 2 s: the map of the first
             seconds has too few landmarks of known depth to recognise anything.
     """
     if quick:
-        blackouts, first_s, frames, particles = 4, 2.0, 180, 10
+        blackouts, first_s, frames, particles = 2, 2.0, 165, 10
     config = MonoConfig(particles=particles, seed=seed)
     all_series = []
     for folder in sequences or simulated(out, frames, quick):

@@ -15,13 +15,13 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.cli.sequences import run, sentence, summary
 
 CAMERA = Pinhole(320, 240, 256.0, 256.0, 159.5, 119.5)
-MAPPED, FRAMES = 120, 170
+MAPPED, FRAMES = 90, 115
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rendered") / "desk"
-    simulate_images(TexturedDesk(frames=FRAMES), Imaging(jpeg=90), CAMERA, folder, seed=3)
+    simulate_images(TexturedDesk(frames=FRAMES, texel_m=0.002), Imaging(jpeg=90), CAMERA, folder, seed=3)
     return folder
 
 

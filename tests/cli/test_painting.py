@@ -29,6 +29,7 @@ def check(out: Path) -> None:
         edge = np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[:, :2].ravel(), image[:, -2:].ravel()])
         assert (edge == 255).all(), name
         assert 0.005 < (image < 200).any(axis=-1).mean() < 0.7, name
+        assert (out / name).with_suffix(".pdf").read_bytes().endswith(b"%%EOF\n"), name
     assert (out / "report.html").read_text().count("data:image/png;base64,") == len(names)
 
 
@@ -38,6 +39,6 @@ def test_a_robot_among_landmarks_one_camera_and_two(desk, room, tmp_path):
     assert main(["run", "range-bearing", str(log), "--out", str(out), "--particles", "30"]) == 0
     check(out)
     assert run(desk, tmp_path / "one") == 0
-    assert run_stereo(room, tmp_path / "two") == 0
+    assert run_stereo(room, tmp_path / "two", "--no-video", "--no-batch") == 0
     check(tmp_path / "one")
     check(tmp_path / "two")

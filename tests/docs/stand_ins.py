@@ -111,7 +111,7 @@ class Shelf:
             "board.mp4": lambda path: _film(_coloured(pictures()), path),
             "drive.bag": lambda path: _bagged(path, film_images, open_images(self.get("desk"))),
             "stereo.bag": lambda path: _bagged(path, film_pairs, open_stereo(self.get("pairs"))),
-            "wide.mp4": lambda path: _film(_coloured(pictures(20, FISHEYE)), path),
+            "wide.mp4": lambda path: _film(_coloured(pictures(10, FISHEYE)), path),
             "walk.mp4": self._walk,
         }
 

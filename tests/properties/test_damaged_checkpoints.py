@@ -10,7 +10,7 @@ import pytest
 from tests.properties.damaged_checkpoints import CASES
 
 ROOT = Path(__file__).resolve().parents[2]
-DAMAGES = 30
+DAMAGES = 15
 
 
 @pytest.mark.slow

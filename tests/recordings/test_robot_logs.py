@@ -21,8 +21,8 @@ def mean_scores(path, seeds, *settings):
     for seed in range(seeds):
         config = load_settings(RangeBearingConfig, "range-bearing", None, settings, {"seed": seed})
         log = open_log(path, config.noise)
-        if config.association == "ml":  # half of it tells as much, in half the time
-            log = replace(log, frames=log.frames[: len(log.frames) // 2])
+        part = 2 if config.association == "ml" else 1  # of which half tells as much
+        log = replace(log, frames=log.frames[: len(log.frames) // part])
         finished = filter_opened(open_robot_log(log, config))
         found = score_estimate(PathAndMap.of_run(finished), finished.truth, config.association == "ml")
         names = "path_rmse_m", "ate_rmse_m", "landmark_error_mean_m", "landmark_error_aligned_mean_m"

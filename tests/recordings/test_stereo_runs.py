@@ -38,21 +38,17 @@ def test_the_room(data_dir):
 def test_the_road(data_dir):
     """It is level with its odometry, and better but for the scale."""
     found = scores(filter_opened(open_pairs(open_stereo(data_dir / "stereo_kitti_seq1"), StereoConfig())))
-    assert found["ate_sim3_rmse_m"] <= 0.035
-    assert found["ate_rmse_m"] <= 0.1
-    assert found["ate_rmse_m"] <= 1.05 * found["vo_ate_rmse_m"]
-    assert found["ate_sim3_rmse_m"] <= found["vo_ate_sim3_rmse_m"]
+    assert found["ate_rmse_m"] <= min(0.1, 1.05 * found["vo_ate_rmse_m"])
+    assert found["ate_sim3_rmse_m"] <= min(0.035, found["vo_ate_sim3_rmse_m"])
 
 
 def test_there_and_back_again(data_dir):
     """A path that comes back: with the map better than without, along all of it."""
     sequence = pairs_there_and_back(open_stereo(data_dir / "stereo_zed_room1", part=Part(end_s=1.92)))
     found = scores(filter_opened(open_pairs(sequence, StereoConfig())))
-    assert found["ate_rmse_m"] <= 0.006
-    assert found["ate_rmse_m"] < found["vo_ate_rmse_m"]
     without = replace(StereoConfig.s05(), map=MapConfig(used=False, kind="particles"))
     off = scores(filter_opened(open_pairs(sequence, without)))
-    assert found["ate_rmse_m"] < off["ate_rmse_m"]
+    assert found["ate_rmse_m"] < min(0.006, found["vo_ate_rmse_m"], off["ate_rmse_m"])
 
 
 # Stereo SIFT features on the stereo recordings, against their ground truth.
