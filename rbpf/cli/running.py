@@ -246,12 +246,12 @@ class RunMono(ImageRunOptions):
 @RUN.add("stereo")
 @dataclass(frozen=True, kw_only=True)
 class RunStereo(ImageRunOptions):
-    """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
+    """Stereo SLAM over a sequence of pairs of images (SIFT landmarks in a joint map, visual odometry)."""
 
     #: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0 and cam1,
     #: of KITTI odometry with image_0 and image_1, or a ROS bag with two topics of images.
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PAIRS")]
-    particles: WholeCount = None  #: number of particles; by default 400, or as in --config.
+    particles: WholeCount = None  #: number of particles; by default 50, or as in --config.
     #: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default 6, or as in --config.
     dof: Annotated[Optional[Literal[3, 6]], tyro.conf.arg(metavar="{3,6}", help_behavior_hint="")] = None
 
