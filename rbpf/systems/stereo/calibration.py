@@ -59,9 +59,13 @@ class Comparison(Kept):
         gain, updates = self.sums
         return bool(gain > DECISIVE) if abs(gain) > DECISIVE or updates >= UPDATES else None
 
-    def told(self, trial: Tracked, message: str) -> Tracked:
-        """What the trial, which is right, says of the last pair, with its path; the evidence of all pairs is then its own."""
-        values = {**trial.values, "log_evidence": trial.values["log_evidence"] + self._before}
+    def told(self, given: Tracked, trial: Tracked, message: str) -> Tracked:
+        """What the trial, which is right, says of the last pair, with its path; the evidence of all pairs is then its own.
+
+        Odometry alone goes on from where it was told to be, without a jump.
+        """
+        evidence = trial.values["log_evidence"] + self._before
+        values = {**trial.values, "log_evidence": evidence, "odometry": given.values["odometry"]}
         revision = Revision(self.stamps_ns, self.poses, self.covs)
         return replace(trial, values=values, messages=(*trial.messages, message), revision=revision)
 

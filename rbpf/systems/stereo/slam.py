@@ -330,17 +330,19 @@ class StereoSlam(System):
         if is_right:
             self._go_on_as(trial)
             offset_px, std_px = self.calibration()
-            found = f"all disparities are {offset_px:.2f} ± {std_px:.2f} px too small: the pair calibrates itself from here on"
-            return self._comparison.told(other, found)
+            size = f"{abs(offset_px):.2f} ± {std_px:.2f} px too {'small' if offset_px > 0.0 else 'large'}"
+            found = f"all disparities are {size}: the pair calibrates itself from here on"
+            return self._comparison.told(tracked, other, found)
         if is_right is False:
             self._trial = None
         seconds = tracked.values["seconds_filter"] + time.perf_counter() - started
         return replace(tracked, values={**tracked.values, "seconds_filter": seconds})
 
     def _go_on_as(self, trial: "StereoSlam") -> None:
-        """The pairs so far are as they were in the trial, from where the run goes on."""
+        """The pairs so far are as they were in the trial, but for odometry alone, whose path is not told anew."""
         self.filter, self.front_end, self._calibration = trial.filter, trial.front_end, trial._calibration
-        self.reckoning, self.at_update, self.since_update = trial.reckoning, trial.at_update, trial.since_update
+        self.reckoning = replace(trial.reckoning, world_from_camera=self.reckoning.world_from_camera)
+        self.at_update, self.since_update = trial.at_update, trial.since_update
         self._kept, self._last_update, self._trial = trial._kept, trial._last_update, None
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
@@ -387,6 +389,7 @@ class StereoSlam(System):
             "updates": int(updated.sum()),
             "distance_m": float(np.linalg.norm(steps, axis=1).sum()),
             "dof": self.config.dof,
+            "map": self.config.map.kind if self.config.map.used else "none",
             **self._calibration.entries(self.filter),
             "ms_per_update": {
                 "median": round(float(np.median(milliseconds)), 3),
