@@ -20,7 +20,7 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 
 def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
     """Renders a desk, filters it, and compares; leaves the run as a COLMAP model and PLY files in `out`."""
-    width, frames, every = (320, 150, 15) if quick else (640, 300, 5)
+    width, frames, every = (320, 90, 9) if quick else (640, 300, 5)
     camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, width / 2 - 0.5, 3 * width / 8 - 0.5)
     with TemporaryDirectory() as folder:
         desk = Path(folder) / "desk"

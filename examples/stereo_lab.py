@@ -27,7 +27,7 @@ def render(folder: Path, frames: int, width: int) -> Path:
         height, focal = 3 * width // 4, 0.78125 * width
         camera = Pinhole(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
         world = TexturedLab(LabDrive("tour", frames=frames, every=4), texel_m=1.92 / width)
-        simulate_images(world, Imaging(noise_std=4.0), RectifiedStereo(camera, 0.12), folder, seed=0)
+        simulate_images(world, Imaging(known=0, noise_std=4.0), RectifiedStereo(camera, 0.12), folder, seed=0)
     return folder
 
 

@@ -277,7 +277,7 @@ def main(
         quick: one short log and few particles.
     """
     if quick:
-        runs, steps, particles, windows, room_runs, frames = 2, 120, (20,), (1,), 1, 60
+        runs, steps, particles, windows, room_runs, frames = 2, 80, (20,), (1,), 1, 40
     out.mkdir(parents=True, exist_ok=True)
     results = dict[str, float]()
     if room_runs:

@@ -99,7 +99,7 @@ class Shelf:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        long_enough = TexturedDesk(frames=120, texel_m=0.002)  # for a map in which a camera can be found
+        long_enough = TexturedDesk(frames=80, texel_m=0.003)  # for a map in which a camera can be found
         self.makers: dict[str, Callable[[Path], object]] = {
             "desk": render_desk,
             "longer": partial(simulate_images, long_enough, Imaging(jpeg=90), DESK_CAMERA, seed=3),

@@ -19,7 +19,7 @@ from rbpf.core.models import (
 )
 from rbpf.lie import Euclidean
 
-SEEDS = 400
+SEEDS = 250
 
 
 class LinearMotion(MotionModel):

@@ -232,7 +232,7 @@ def test_the_grid_is_fine_enough(world):
 )
 def test_evidence_is_unbiased(name, proposal, stream):
     world = WORLDS[name]
-    assert_unbiased(world.log_ratios(world.measurements(2), PROPOSALS[proposal], stream, 300))
+    assert_unbiased(world.log_ratios(world.measurements(2), PROPOSALS[proposal], stream, 200))
 
 
 @pytest.mark.parametrize(("name", "iterations"), [("square", 1), ("arctan", 3)])
@@ -250,7 +250,7 @@ def test_evidence_with_outliers_is_unbiased(proposal, stream):
     """The gate decides who moves the proposal, the density of both decides the weight."""
     world = Scalar(lambda x: 0.9 * x, 0.6, lambda x: x, 0.6, 0.5, GaussianWithOutliers(0.1, 20.0))
     zs = world.measurements(4, outlier=5.0)
-    assert_unbiased(world.log_ratios(zs, PROPOSALS[proposal], stream, 300))
+    assert_unbiased(world.log_ratios(zs, PROPOSALS[proposal], stream, 200))
 
 
 # On SE(2) proposal and prior are densities in one chart: evidence against quadrature and many particles.
