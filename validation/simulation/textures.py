@@ -137,9 +137,9 @@ def _scatter(image: np.ndarray, rng: Generator, per_texel: float, size: tuple[fl
         place = rng.uniform(0.0, 1.0, 2) * image.shape[::-1]
         radius = 1.0 / rng.uniform(1.0 / size[1], 1.0 / size[0])
         column, row = place.astype(int)
-        level = float(image[row, column]) + rng.choice([-1.0, 1.0]) * contrast * rng.uniform(0.4, 1.0)
+        level = float(image[row, column]) + (-1.0, 1.0)[rng.integers(2)] * contrast * rng.uniform(0.4, 1.0)
         draw = _polygon if rng.random() < 0.75 else _disc
-        draw(image, place, radius, float(np.clip(level, 0.0, 255.0)), rng)
+        draw(image, place, radius, min(max(level, 0.0), 255.0), rng)
 
 
 def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: Generator) -> None:
@@ -148,7 +148,7 @@ def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, 
 
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, rng.integers(3, 7)))
     reach = radius * rng.uniform(0.5, 1.0, (angle.size, 1))
-    corners = place + reach * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    corners = place + reach * np.array([np.cos(angle), np.sin(angle)]).T
     fixed = np.round(corners * 2**FINE).astype(np.int32)
     cv2.fillPoly(image, [fixed], level, cv2.LINE_AA, FINE)
 
