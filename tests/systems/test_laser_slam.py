@@ -117,7 +117,7 @@ def test_beams_start_at_the_scanner_and_count_by_the_wall_that_they_see():
 @pytest.mark.slow
 def test_a_run_leaves_a_map_that_map_server_reads(tmp_path: Path):
     log, out = tmp_path / "log", tmp_path / "out"
-    assert main(["simulate", "laser", "--out", str(log), "--scans", "60", "--laps", "1"]) == 0
+    assert main(["simulate", "laser", "--out", str(log), "--scans", "40", "--laps", "1"]) == 0
     words = ["run", "laser", str(log / "robot.clf"), "--particles", "8", "--out", str(out)]
     assert main(words) == 0
     head, size, depth, cells = (out / "grid.pgm").read_bytes().split(b"\n", 3)

@@ -143,7 +143,7 @@ def test_features_of_old_sub_maps_are_found_again():
 @pytest.mark.slow
 def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     """Once round a room, until the first landmarks are seen again: as good and as sure of itself as one Gaussian of all."""
-    log = simulate_features(RoomWorld(frames=300, laps=1.3, points=300), Measuring(), MONO, 0)
+    log = simulate_features(RoomWorld(frames=220, laps=1.3, points=300), Measuring(), MONO, 0)
     whole, submaps = (filter_features(log, MonoConfig(submap=most)) for most in (3000, 80))
     assert len(submaps.system.joint.old.maps) > 2 and submaps.log["points"].max() < whole.log["points"].max() / 2
     off = [np.linalg.norm(errors(run)[:, 3:], axis=1) for run in (whole, submaps)]

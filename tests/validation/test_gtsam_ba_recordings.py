@@ -86,7 +86,7 @@ def tracks(data_dir):
 @pytest.fixture(scope="module")
 def solved(tracks):
     start = InitialEstimate(tracks.world_from_camera, first_observations(tracks))
-    return solve_features(tracks.log, start, marginals=False)
+    return solve_features(tracks.log, start, marginals=False, tolerance=1e-3)
 
 
 def first_observations(tracks):
