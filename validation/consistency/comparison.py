@@ -201,7 +201,7 @@ def grade_path(
     if error_m is not None and spread_m:
         fraction = error_m / spread_m
         grade = next((name for name, least, most in GRADES if fraction <= least and gone <= most), "poor")
-        said.append(f"That is {100 * fraction:.2g} % of its spread about its centre: {grade}.")
+        said.append(f"That is {_number(100 * fraction)} % of its spread about its centre: {grade}.")
     if lost is not None:
         # What was lost comes first: the error of a path that was lost says little.
         gone_frames = f"{lost or 'None'} of {frames} frames {'was' if lost == 1 else 'were'} lost."
