@@ -226,12 +226,14 @@ class StereoSlam(System):
             if dt > 0.0:
                 few = f"it shows {len(pair)} features, {least} are needed"
             why = f"{problem}; {few}" if problem and len(pair) else problem or few
-            messages.append(f"passed over: {why}; the last velocity is assumed, widely")
             expected = last = self.reckoning
+            then = "the world begins with the first pair that is measured"
             if last.stamp_ns is not None:  # the next pair is measured from the same one as this
+                then = "the last velocity is assumed, widely"
                 self.reckoning = replace(last, passed_over=last.passed_over + 1)
                 step = self._constrained(self.visual_odometry.prior.increment(last.velocity, dt))
                 expected = last.moved(last.stamp_ns, step, last.velocity, is_assumed=True)
+            messages.append(f"passed over: {why}; {then}")
             motion = _Motion(expected)
         at = motion.at
         seconds_odometry = time.perf_counter() - started - seconds_features
@@ -281,7 +283,7 @@ class StereoSlam(System):
         if not updated:
             moved = Odometry(pose, cov).then(at.since_update)
             pose, cov = moved.delta, moved.cov
-        assumed = 0 if updated and config.recovery.used else at.assumed
+        assumed = self.frames if at.stamp_ns is None else 0 if updated and config.recovery.used else at.assumed
         state = TrackingState.PREDICTED
         if measured and not (updated and assumed):
             state = TrackingState.LOST if assumed else TrackingState.TRACKED
