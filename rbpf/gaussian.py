@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dpotri
 
 from rbpf.arrays import Array, Float, Like
 from rbpf.errors import InputError
@@ -135,6 +136,9 @@ def solve_lower_matrix(
 def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Inverse of positive definite matrices, exactly symmetric. Raises InputError: one is not positive definite."""
     chol = cholesky(cov)
+    if chol.ndim == 2 and len(chol) > _UNROLLED:
+        lower = dpotri(chol.T)[0].T  # of the transposed, the upper triangle
+        return np.asarray(lower + np.tril(lower, -1).T)
     half = solve_lower_matrix(chol, np.eye(chol.shape[-1]))
     return gram(np.swapaxes(half, -1, -2))
 

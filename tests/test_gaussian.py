@@ -55,6 +55,8 @@ def test_triangular_solves_and_inverse(n, rng):
     inverse = gaussian.inverse(cov)
     np.testing.assert_array_equal(inverse, np.swapaxes(inverse, -1, -2))
     np.testing.assert_allclose(inverse @ cov, np.broadcast_to(np.eye(n), cov.shape), atol=1e-9)
+    large = covariances(rng, (), 5 * n)
+    np.testing.assert_allclose(gaussian.inverse(large) @ large, np.eye(5 * n), atol=1e-9)
 
 
 @every_dimension

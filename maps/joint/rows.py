@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrsm
-from scipy.linalg.lapack import dpotri
 from scipy.special import digamma, gammaln
 
 from rbpf import gaussian
@@ -364,8 +363,7 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
     scales = {at: np.ones(len(parts[at].rows)) for at in heavy}
     weights = {at: np.linalg.inv(groups[at].cov[taken[at]]) for at in heavy}
     for _ in range(ROUNDS if of_heavy.size else 0):
-        lower, settled = dpotri(np.asfortranarray(gaussian.cholesky(cov)), lower=1)[0], True
-        inverse = lower + np.tril(lower, -1).T
+        inverse, settled = gaussian.inverse(cov), True
         solved = inverse @ nu
         for at in heavy:
             # Of the noise given all measurements, mean R S⁻¹ν and covariance R − R (S⁻¹) R; then by how much it is stated.

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, solve_triangular
+from scipy.linalg import LinAlgError, block_diag
 
 from rbpf import gaussian
 from rbpf.errors import InputError
@@ -109,14 +109,13 @@ class SubMap(NamedTuple):
 
 
 def inverse_of(cov: np.ndarray) -> np.ndarray:
-    """As `gaussian.inverse`, of one large matrix, by LAPACK. Raises InputError: it is singular, or no covariance."""
+    """Of a sub-map's covariance. Raises InputError: it is singular, or none."""
     try:
-        half = solve_triangular(gaussian.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False)
+        return gaussian.inverse(cov)
     except InputError as error:
         raise InputError(
             "a sub-map's covariance is singular: the filter has diverged, or a noise is stated as 0"
         ) from error
-    return np.asarray(half.T @ half)
 
 
 class Factor(NamedTuple):
