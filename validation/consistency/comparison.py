@@ -278,8 +278,9 @@ def judge(
     elif judging:
         first = (doubtful or judging)[0]
         zone = first.zone if first.kind != "ratio" else tuple(map(_root, first.zone))
+        worth = f"{first.samples:.0f} independent sample{'s'[: first.samples >= 1.5]}"
         reason = (
-            f"{described(first)}; the run is worth only {first.samples:.0f} independent samples of it, too few to say "
+            f"{described(first)}; the run is worth only {worth} of it, too few to say "
             f"that this lies within {_number(max(zone[0], 0.0))} to {_number(zone[1])}, or that it does not"
         )
     elif statistics:
