@@ -194,7 +194,7 @@ class StereoMatcher:
             if swapped >= SWAPPED and swapped > FEWER * len(matches):
                 raise InputError(
                     f"left and right image seem to be swapped: {swapped} matches have a negative disparity and "
-                    f"{len(matches)} a positive one; exchange the two cameras"
+                    f"{len(matches)} a positive one; exchange the two cameras, unless one of them has frozen"
                 )
             anywhere = match_all(left.descriptors, right.descriptors, self.config.limits)
             if len(anywhere) >= SWAPPED:
