@@ -195,14 +195,14 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     known = replace(read_known_points(tmp_path / "desk" / "known_points.csv"), across_m=None)
     damaged = cover_view(1 / 3, 60, 60)(recording)
     stamps, own = recording.stamps_ns, MonoConfig(map="particles")
-    # Runs differ by more than the kinds do: of six seeds these are the ones whose credulous run is taken along, by 10 cm.
+    # Runs differ from seed to seed by more than the kinds do: their means over six.
     kinds = {"credulous": replace(own, search=SearchConfig(trusted_fraction=0.0)), "usual": own, "joint": MonoConfig()}
     off: dict[str, list[float]] = {name: [] for name in kinds}
     for name, config in kinds.items():
-        for seed in (4, 5):
+        for seed in range(6):
             run = filter_opened(open_mono(damaged, replace(config, seed=seed), known))
             off[name].append(ate(Trajectory(stamps, run.log.poses), Trajectory(stamps, run.truth.poses)).rmse)
-    assert np.mean(off["usual"]) < 0.02
+    assert np.mean(off["usual"]) < 0.02 and np.median(off["usual"]) < 0.015
     assert np.mean(off["credulous"]) > 2.0 * np.mean(off["usual"])
     assert np.mean(off["joint"]) < 0.025
 

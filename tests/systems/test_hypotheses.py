@@ -139,9 +139,9 @@ def blind_turn(seed: int) -> RobotLog:
 
 @pytest.mark.slow
 def test_wrong_readings_do_not_choose_the_heading():
-    """NEES over the seeds, 0.5; by a Gaussian likelihood 1.8, for the first wrong reading leaves one heading of many."""
+    """NEES over the seeds, 0.77; by a Gaussian likelihood 1.45, for the first wrong reading leaves one heading of many."""
     nees = []
-    for seed in range(4, 8):
+    for seed in range(8):
         log = blind_turn(seed)
         run = filter_opened(open_robot_log(log, RangeBearingConfig(seed=seed)))
         _, truth = poses_at(SE2, log.truth.stamps_ns, log.truth.poses, run.log.stamps_ns)
