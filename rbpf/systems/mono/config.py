@@ -59,9 +59,9 @@ class InverseDepthConfig(Ranged):
 
 @dataclass(frozen=True)
 class StartConfig(Ranged):
-    """A start without known points: the first frames are adjusted in batch, and the particles resampled from the result."""
+    """The first frames are adjusted in batch; without known points the particles are resampled from the result."""
 
-    #: whether they are; else the particles go on with what the prior of depth has made of the first frames.
+    #: whether they are, without known points; else the particles go on with what the prior of depth has made of them.
     batch_adjust: Annotated[bool, Formerly("redraw")] = True
     first_adjustment: Annotated[int, Range(ge=3), Formerly("first")] = 6  #: the first one comes after so many frames …
     growth: Annotated[float, Range(gt=1.0, le=100.0)] = 1.25  #: … and the next ones after this many times as many each.
@@ -69,6 +69,13 @@ class StartConfig(Ranged):
     max_frames: Annotated[int, Range(ge=3), Formerly("frames")] = 60
     #: the start ends when half of the depths in view have a standard deviation below this fraction of them.
     depth_std_ratio: Annotated[Positive, Formerly("depth_share")] = 0.03
+
+    def is_due(self, count: int) -> bool:
+        """Whether an adjustment comes after so many frames."""
+        due = self.first_adjustment
+        while due < count:
+            due = max(int(np.ceil(self.growth * due)), due + 1)
+        return due == count
 
 
 @dataclass(frozen=True)
@@ -190,7 +197,8 @@ class MonoConfig(RunConfig):
     #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
     #: below the threshold of resampling, which does not take place.
     window: Count = 5
-    #: of a joint map: particles have maps of their own until half of the depths in view were known in so many frames in a row.
+    #: of a joint map: particles have maps of their own until half of the depths in view were known in so many frames in a row;
+    #: with known points until an adjustment of the first frames knows them, and all are adjusted once more then.
     settled_frames: Count = 30
     #: of a joint map: landmarks beyond which a sub-map ends; those in view, and others up to half of these, go over into the
     #: next one, and old ones come back when they are in view. No point is dropped; rays that are left behind are.

@@ -102,18 +102,21 @@ class InverseDepthRays(UnknownDepth):
         self.camera, self.model = camera, CameraRay(camera, self.model.rho, about=about)
 
     def starting(self, depths: np.ndarray) -> CameraModel:
-        """At the median inverse depth of the points in view, where there are enough of them.
+        """At the median inverse depth of the points in view, where there are enough of them."""
+        return CameraRay(self.camera, self.prior(depths), about=self.model.about)
+
+    def prior(self, depths: np.ndarray) -> tuple[float, float]:
+        """Mean and standard deviation of inverse depths, 1/m, where points are at these depths (K,).
 
         Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
         independent, the scene's depth is common to them.
         """
+        mean, std = self.config.mean_per_m, self.config.std_per_m
         if not self.config.from_scene_depth or depths.size < MIN_DEPTHS:
-            return self.model
+            return mean, std
         rho = 1.0 / depths
         middle = float(np.median(rho))
-        fraction = self.config.std_per_m / self.config.mean_per_m
-        prior = middle, max(fraction * middle, float(rho.std()))
-        return CameraRay(self.camera, prior, about=self.model.about)
+        return middle, max(std / mean * middle, float(rho.std()))
 
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool

@@ -33,7 +33,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.start.adjustment import (
-    MIN_FRAMES,
     Adjusted,
     FirstFrames,
     Known,
@@ -45,7 +44,7 @@ from rbpf.systems.mono.start.adjustment import (
     residual_px,
     tangents,
 )
-from rbpf.systems.mono.start.known import world_of
+from rbpf.systems.mono.start.known import KnownStart
 from rbpf.systems.system import Revision
 
 LINEARISATIONS = 3  #: Of the proposal: moments of the samples hand on what a few weights cannot mend.
@@ -127,38 +126,66 @@ class HandOver:
 
     @property
     def is_ahead(self) -> bool:
-        """Whether the map will become a joint one."""
-        return self._rays is not None and self.joint is None
+        """Whether the map will become a joint one, or be adjusted once more."""
+        return self._rays is not None and self._settled < self.config.settled_frames
 
     def after_frame(self, filter_: Filter, sensor: ImageSensor, seen: FeatureFrame) -> Adjusted | None:
-        """Takes note of what a frame has shown that was tracked; the filter on the joint map, when it is time for it."""
+        """Takes note of what a frame has shown that was tracked; the filter on the joint map, when it is time for it.
+
+        It is when depths are known. Where known points tell the baseline a first one begins before: each image alone leaves
+        two motions that look alike, and a few particles may all take the wrong one.
+        """
         if not self.is_ahead:
             return None
         self.first.thin(MAX_FRAMES)
         ratio, belief = self.config.inverse_depth.promote_std_ratio, filter_.belief()
         known = sensor.features.depth_known(belief, seen.landmarks, ratio)
         self._settled = self._settled + 1 if known.size and known.mean() >= KNOWN_FRACTION else 0
-        return self.become(filter_, sensor) if self._settled >= self.config.settled_frames else None
+        if self.joint is not None and self.joint.old.maps:
+            self._settled = self.config.settled_frames  # what has left the frame is not begun anew
+            return None
+        is_early = self.known is not None and self.joint is None and self.config.start.is_due(len(self.first.stamps_ns))
+        if self.is_ahead and not is_early:
+            return None
+        adjusted = self.become(filter_, sensor, self.is_ahead)
+        if adjusted is None:
+            self._settled = min(self._settled, self.config.settled_frames - 1)
+        return adjusted
 
-    def become(self, filter_: Filter, sensor: ImageSensor) -> Adjusted | None:
-        """The filter on a joint map, from an adjustment of the frames so far; None where they do not yet determine one."""
+    def become(self, filter_: Filter, sensor: ImageSensor, if_known: bool = False) -> Adjusted | None:
+        """The filter on a joint map, from an adjustment of the frames so far; None where they do not yet determine one.
+
+        With `if_known`, half of the depths in view must be known there; if not, the next adjustment starts from this one.
+        """
         assert self._rays is not None
         found = self._adjusted(filter_, sensor.features)
         if found is None:
             return None
+        if if_known:
+            names, seen, best = found
+            in_view = np.isin(names, self.first.seen[-1].landmarks)
+            if not best.depth_std_ratio(in_view) < self.config.inverse_depth.promote_std_ratio:
+                self.first.path = list(between(seen.stamps_ns, best.structure.path[None], self._kept_ns())[:, 0])
+                return None
         new = self._new_filter(self._rays, sensor, filter_.rng)
         new.steps, new.stamp_ns, new.log_evidence = filter_.steps, filter_.stamp_ns, filter_.log_evidence
         revision = self._begin(self._use(new, self._rays, sensor), *found)
         self.tune(new, sensor)
+        kept = np.searchsorted(self.first.stamps_ns, self._kept_ns())
+        self.first.path, self.first.last = list(revision.poses[kept]), revision.poses[-1]
         return Adjusted(new, revision, self.first.seen_first(revision.poses))
+
+    def _kept_ns(self) -> np.ndarray:
+        return np.array([frame.stamp_ns for frame in self.first.seen])
 
     def _adjusted(self, filter_: Filter, features: FeatureSensor) -> tuple[np.ndarray, Window, Optimum] | None:
         """Names (F,), what was seen of them, and the optimum downhill from the particles; None where there is none."""
         belief, config, given = filter_.belief(), self.config, self.known
         always = None if given is None else given.names
-        steps, names, seen, start = gathered(self.first, features, belief, MAX_FRAMES, always)
-        if steps.size < MIN_FRAMES:
+        found = gathered(self.first, features, belief, MAX_FRAMES, always)
+        if found is None:
             return None
+        _, names, seen, start = found
         if self._numbers:
             seen = replace(seen, tuning=np.linalg.inv(config.self_calibration.cov()))
             start = replace(start, tuned=np.zeros(len(self._numbers)))
@@ -166,9 +193,13 @@ class HandOver:
             _, at, row = np.intersect1d(names, given.names, return_indices=True)
             whitener = np.linalg.inv(gaussian.cholesky(given.cov[row] + LEAST * np.eye(3)))
             seen = replace(seen, known=Known(at, given.positions[row], whitener))
-            world = world_of(filter_)
-            of_points = SE3.identity() if world is None else world.mean[belief.mode]
-            start = replace(start, frame=SE3.between(self.first.path[steps[0]], of_points))
+            world_from_first = KnownStart.from_frame(self.camera, given, self.first.seen[0]).world_from_camera
+            start = replace(start, frame=SE3.inverse(world_from_first))
+            # As the rays of the particles: the scene is about as far away as the known points.
+            assert self._rays is not None
+            away = np.linalg.norm(SE3.inverse_transform(world_from_first, given.positions[row]), axis=1)
+            mean, std = self._rays.prior(away)
+            config = replace(config, inverse_depth=replace(config.inverse_depth, mean_per_m=mean, std_per_m=std))
         best = optimum(seen, config, start)
         if best is not None and self.noise is not None:
             # That noise is less than stated the first frames do not tell: errors grow as the view changes.

@@ -294,7 +294,8 @@ class MonoSlam(System):
         revision: Revision | None = None
         if not self.start.over or self.hand_over.is_ahead:
             # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
-            self.first.note(seen, mixture_estimate(*report.mixture).mean[:7])
+            is_joint = self.joint is not None
+            self.first.note(seen, pose if is_joint else mixture_estimate(*report.mixture).mean[:7])
             is_usable, is_lost = not sensor.bad_frames, sensor.lost and len(sensor.table) > 0
             adjusted, words = self.start.after_frame(self.filter, is_usable, is_lost)
             messages = [words, *messages] if words is not None else messages

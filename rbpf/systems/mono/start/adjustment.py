@@ -23,6 +23,7 @@ from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.active_search import CAUCHY_SCALE
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.system import Revision
 
 MIN_VIEWS = 3  #: Frames that must see a feature for it to take part.
@@ -54,6 +55,7 @@ _FRAMES = {
     "px": numbers("seen", 2),
     "cov_px": numbers("seen", 2, 2),
     "path": poses("frames"),
+    "last": poses(),
 }
 
 
@@ -65,6 +67,7 @@ class FirstFrames:
         stamps_ns: of all frames.
         seen: those that are kept.
         path: as many poses, from which an adjustment may start.
+        last: where the last camera is in the particles' world, from which the next pose is counted on.
     """
 
     def __init__(self) -> None:
@@ -74,12 +77,14 @@ class FirstFrames:
         self.stamps_ns: list[int] = []
         self.seen: list[FeatureFrame] = []
         self.path: list[np.ndarray] = []
+        self.last = SE3.identity()
 
     def note(self, seen: FeatureFrame, pose: np.ndarray) -> None:
-        """The next frame."""
+        """The next frame; of its pose counts how far it is from the last one."""
         self.stamps_ns.append(seen.stamp_ns)
         self.seen.append(seen)
-        self.path.append(pose)
+        self.path.append(SE3.compose(self.path[-1], SE3.between(self.last, pose)) if self.path else pose)
+        self.last = pose
 
     def thin(self, most: int) -> None:
         """Of more than `most` those are dropped that lie closest for their age: the longer ago, the fewer are left."""
@@ -106,6 +111,7 @@ class FirstFrames:
             "px": np.concatenate([frame.z for frame in self.seen]),
             "cov_px": np.concatenate([frame.cov_z for frame in self.seen]),
             "path": np.array(self.path),
+            "last": self.last,
         }
         return {f"{_PREFIX}{name}": array for name, array in found.items()}
 
@@ -118,7 +124,7 @@ class FirstFrames:
             parts = zip(*(split(column, held["counts"].tolist(), _PREFIX[:-1]) for column in columns), strict=True)
             self.stamps_ns = held["all_ns"].tolist()
             self.seen = [FeatureFrame(t, *part) for t, part in zip(held["stamps_ns"].tolist(), parts, strict=True)]
-            self.path = list(held["path"])
+            self.path, self.last = list(held["path"]), held["last"]
 
 
 @dataclass(frozen=True)
@@ -169,19 +175,20 @@ class Window:
 
 def gathered(
     first: FirstFrames, features: FeatureSensor, belief: Belief, most: int, known: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, Window, "Structure"]:
+) -> tuple[np.ndarray, np.ndarray, Window, "Structure"] | None:
     """Numbers (T,) of `most` frames to adjust, names (F,) of features in the map that were seen often enough, what was seen.
 
     The frames see something, with a stamp of their own, the first and the last among them. Features that are `known` take
-    part however seldom they were seen. Last, where path and features are as far as the particles know.
+    part however seldom they were seen. Last, where path and features are as far as the particles know. None: too few frames.
     """
     stamps = np.array([frame.stamp_ns for frame in first.seen])
     fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in first.seen]
     steps = np.flatnonzero(fresh)
+    if steps.size < MIN_FRAMES:
+        return None
     steps = steps[np.linspace(0, steps.size - 1, min(most, steps.size)).round().astype(np.int64)]
     chosen = [first.seen[t] for t in steps.tolist()]
-    none = [np.zeros(0, dtype=np.int64)]
-    seen_by = np.concatenate(none + [frame.landmarks for frame in chosen])
+    seen_by = np.concatenate([frame.landmarks for frame in chosen])
     held = belief.map.holds(seen_by) | (features.members(seen_by) >= 0)
     names, views = np.unique(seen_by[held], return_counts=True)
     names = names[(views >= MIN_VIEWS) | np.isin(names, [] if known is None else known)]
@@ -190,14 +197,15 @@ def gathered(
         features.camera,
         stamps[steps],
         np.repeat(np.arange(len(chosen)), [part.sum() for part in parts]),
-        np.searchsorted(names, np.concatenate(none + [f.landmarks[p] for f, p in zip(chosen, parts, strict=True)])),
-        np.concatenate([np.zeros((0, 2)), *(f.z[p] for f, p in zip(chosen, parts, strict=True))]),
-        float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z] or [1.0]))),
+        np.searchsorted(names, seen_by[np.concatenate(parts)]),
+        np.concatenate([f.z[p] for f, p in zip(chosen, parts, strict=True)]),
+        float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in chosen for cov in frame.cov_z]))),
     )
     which, position = features.positions(belief, names)
     path, position = np.array(first.path)[steps], position[np.argsort(which)]
-    length = np.linalg.norm(position[:, :3], axis=1)
-    start = Structure(SE3.between(path[:1], path), position[:, :3] / length[:, None], position[:, 3] / length)
+    direction = directions(position, path[0])
+    length = np.linalg.norm(direction, axis=1)
+    start = Structure(SE3.between(path[:1], path), direction / length[:, None], position[:, 3] / length)
     return steps, names, seen, start
 
 
@@ -247,6 +255,11 @@ class Optimum:
         out = np.broadcast_to(path, (n, *path.shape)).copy()
         out[:, 1:] = SE3.retract(path[1:], step[:, : 6 * (path.shape[0] - 1)].reshape(n, -1, 6))
         return out
+
+    def depth_std_ratio(self, features: np.ndarray) -> float:
+        """Median standard deviation of the inverse distances of some features, as a fraction of each; infinite of none."""
+        relative = (self.std_inverse() / np.maximum(self.structure.inverse, np.finfo(float).tiny))[features]
+        return float(np.median(relative)) if relative.size else np.inf
 
     def std_inverse(self) -> np.ndarray:
         """Standard deviations (F,) of the inverse distances, 1/m."""

@@ -21,7 +21,7 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.start.adjustment import MIN_FRAMES, Adjusted, FirstFrames, between, gathered, optimum
+from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, optimum
 from rbpf.systems.system import Revision
 
 #: Of a start without known points that ended before depths were known.
@@ -29,8 +29,6 @@ DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
     "camera sideways at first, or start with known points"
 )
-
-TINY = np.finfo(float).tiny
 
 
 @final
@@ -73,16 +71,16 @@ class UnknownStart(Kept):
         if self.over or count < self._next or not usable:
             return None, None
         self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
-        steps, names, seen, start = gathered(first, self.features, filter_.belief(), self.config.start.max_frames)
-        if steps.size < MIN_FRAMES:
+        found = gathered(first, self.features, filter_.belief(), self.config.start.max_frames)
+        if found is None:
             return None, None
+        steps, names, seen, start = found
         best = optimum(seen, self.config, start) if seen.is_connected() else None
         if best is None:
             self.over = True
             return None, DISCONNECTED
-        relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
-        relative = relative[np.isin(names, first.seen[-1].landmarks)]
-        self.over = bool(relative.size > 0 and np.median(relative) < self.config.start.depth_std_ratio)
+        in_view = np.isin(names, first.seen[-1].landmarks)
+        self.over = best.depth_std_ratio(in_view) < self.config.start.depth_std_ratio
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         stamps = np.array(first.stamps_ns)
@@ -92,7 +90,7 @@ class UnknownStart(Kept):
         equal = uniform_log_weights(paths.shape[1])
         means = [mixture_estimate(Prior.exactly(SE3, poses), None, equal) for poses in paths]
         poses, covs = np.array([each.mean for each in means]), np.array([each.cov for each in means])
-        first.path = list(poses)
+        first.path, first.last = list(poses), poses[-1]
         seen_first = first.seen_first(paths[:, filter_.belief().mode])
         return Adjusted(filter_, Revision(stamps, poses, covs), seen_first), None
 
