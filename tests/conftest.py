@@ -23,17 +23,17 @@ gc.set_threshold(10_000, 20, 20)  # by default, looking for garbage takes a twel
 
 COUNTED = {"cli", "cli_calibrate", "cli_manners", "cli_mono", "cli_stereo", "export", "gtsam_ba", "loader_fuzz"}
 COUNTED |= {"gtsam_ba_camera_start", "model_comparison", "mono_joint", "relocalisation", "stereo_slam", "sweep"}
+NOT_COUNTED = {"accuracy", "camera_models", "compiled", "descriptors", "estimate", "grid", "kalman_limit", "layout"}
+NOT_COUNTED |= {"mono_features", "patches", "refinement", "resampling", "resection", "simulation_robots"}
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Of slow tests those that run lines which no fast test runs, for the time they take.
-
-    Counting the others would take half as much time again: they run the same lines a thousand times.
-    """
+    """Counts tests that run lines which no others run; the same lines a thousand times take half as much time again."""
     if config.pluginmanager.hasplugin("pytest_cov"):
         for item in items:
             is_slow = any(item.get_closest_marker(name) for name in ("slow", "real_data"))
-            if is_slow and item.path.stem.removeprefix("test_") not in COUNTED:
+            name = item.path.stem.removeprefix("test_")
+            if name not in COUNTED if is_slow else name in NOT_COUNTED:
                 item.add_marker("no_cover")
 
 
