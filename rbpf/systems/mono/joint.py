@@ -187,7 +187,7 @@ class HandOver:
             return None
         _, names, seen, start = found
         if self._numbers:
-            seen = replace(seen, tuning=np.linalg.inv(config.self_calibration.cov()))
+            seen = replace(seen, camera=self.camera, tuning=np.linalg.inv(config.self_calibration.cov()))
             start = replace(start, tuned=np.zeros(len(self._numbers)))
         if given is not None:
             _, at, row = np.intersect1d(names, given.names, return_indices=True)
