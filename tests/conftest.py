@@ -96,6 +96,24 @@ def paint_plainly(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
+def drawn_once(plain_pictures: None) -> Iterator[None]:
+    """Of runs that leave files of the same names the first is drawn; the others have copies of its pictures."""
+    from rbpf.runs.plots import draw_run
+
+    def draw(found: Any) -> None:
+        kind = (found.system, *sorted(path.name for path in found.folder.iterdir()))
+        if kind not in drawn:
+            drawn[kind] = {name: (found.folder / name).read_bytes() for name in draw_run(found)}
+        for name, content in drawn[kind].items():
+            (found.folder / name).write_bytes(content)
+
+    drawn: dict[tuple[str, ...], dict[str, bytes]] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rbpf.validation.finish.draw_run", draw)
+        yield
+
+
+@pytest.fixture(scope="module")
 def keypoints_once() -> Iterator[None]:
     """In an image that one of the module's tests has seen, keypoints are not looked for again."""
     from rbpf.sensors.features import Features, Sift, SiftConfig

@@ -39,7 +39,7 @@ def shelf(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=name_of)
-def test_what_a_page_shows_works(page, shelf, tmp_path, monkeypatch, plain_pictures):
+def test_what_a_page_shows_works(page, shelf, tmp_path, monkeypatch, drawn_once):
     monkeypatch.syspath_prepend(ROOT)
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(tmp_path)

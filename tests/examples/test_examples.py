@@ -20,7 +20,7 @@ PLUGGED_IN = ("grid_slam", "jump_markov", "gps_imu", "range_only_beacons", "stoc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [*EXAMPLES, *STUDIES], ids=lambda path: path.stem)
-def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path, plain_pictures):
+def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path, drawn_once):
     monkeypatch.syspath_prepend(path.parent)
     main = importlib.import_module(path.stem if path in EXAMPLES else f"examples.studies.{path.stem}").main
     draws = "quick" in inspect.signature(main).parameters

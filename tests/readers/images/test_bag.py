@@ -67,9 +67,6 @@ def test_a_chunk_that_unpacks_to_more_than_there_can_be_is_refused(tmp_path, mon
         open_images(path)
 
 
-# What becomes of the pictures.
-
-
 def test_the_same_grey_values_from_every_encoding(tmp_path):
     """A grey picture in all the ways in which a message may hold it; a Bayer pattern of one level is that level."""
     level = np.full(SIZE, 77, np.uint8)
@@ -144,9 +141,6 @@ def test_a_bag_that_is_damaged_further_on_is_read_until_there(tmp_path, caplog):
     assert "The 2 images before it are kept" in caplog.text
 
 
-# Times.
-
-
 def test_times_that_run_backwards(tmp_path):
     """The headers' times; the bag's own are in order."""
     with recorded(tmp_path / "walk_mcap") as bag:
@@ -156,9 +150,6 @@ def test_times_that_run_backwards(tmp_path):
             bag.add("/image_raw", stamp, "sensor_msgs/msg/Image", received, data=np.zeros(1, np.uint8), **fields)
     with pytest.raises(InputError, match="/image_raw: the stamp of image 2 is before the one it follows"):
         open_images(tmp_path / "walk_mcap", write_camera(tmp_path))
-
-
-# Which topics.
 
 
 def test_several_topics_of_images_have_to_be_named(tmp_path):
@@ -258,9 +249,6 @@ def test_without_a_camera_one_has_to_be_given(tmp_path):
     assert open_images(tmp_path / "walk.bag", camera).camera.fx == 22.0
 
 
-# Two cameras.
-
-
 @pytest.mark.parametrize(
     ("kind", "names"), list(zip(KINDS, [("/left", "/right"), ("/cam0", "/cam1")] * 2, strict=False))
 )
@@ -313,9 +301,6 @@ def test_a_camera_file_needs_the_baseline(tmp_path):
     with pytest.raises(InputError, match=r"camera.yaml: expected baseline_m"):
         open_stereo(path, write_camera(tmp_path))
     assert open_stereo(path, write_camera(tmp_path, baseline_m=0.2)).rig.baseline_m == 0.2
-
-
-# The truth.
 
 
 @pytest.mark.parametrize(("kind", "message"), list(zip([*KINDS, KINDS[0]], POSES, strict=True)))

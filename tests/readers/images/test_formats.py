@@ -189,9 +189,6 @@ def test_what_a_camera_file_may_say(tmp_path):
     assert open_images(tmp_path).camera.fx == 20.0
 
 
-# Folders.
-
-
 def test_images_in_a_folder_are_ordered_by_the_numbers_in_their_names(tmp_path):
     assert levels(open_images(write_plain(tmp_path / "shelf", ["2.png", "10.png", "9.png"]))) == [10, 30, 20]
     write_images(tmp_path / "images", ["a.jpg", "b.png"])
@@ -215,9 +212,6 @@ def test_stamps_and_truth_of_a_folder(tmp_path, caplog):
     assert sequence.truth.stamps_ns.tolist() == [700_000_000]
 
 
-# TUM RGB-D.
-
-
 def test_the_truth_of_tum_keeps_its_own_times_and_its_gaps(tmp_path):
     truth = open_images(write_tum(tmp_path)).truth
     assert truth.stamps_ns.tolist() == [1_500_000_000, 1_700_000_000] and truth.landmarks == {}
@@ -227,9 +221,6 @@ def test_the_truth_of_tum_keeps_its_own_times_and_its_gaps(tmp_path):
     assert np.linalg.norm(truth.poses[0, :4]) == pytest.approx(1.0, abs=1e-15)
     (tmp_path / "groundtruth.txt").unlink()
     assert open_images(tmp_path).truth is None
-
-
-# EuRoC.
 
 
 def test_lenses_and_folders_of_euroc(tmp_path):
@@ -265,9 +256,6 @@ def test_a_marker_is_not_the_body(tmp_path):
     np.testing.assert_allclose(found, SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12)
 
 
-# KITTI.
-
-
 @pytest.mark.parametrize("place", ["poses.txt", "../../poses/00.txt"])
 def test_the_truth_of_kitti_beside_the_images_or_as_distributed(tmp_path, place):
     folder = write_kitti(tmp_path / "sequences" / "00", right=False, calib=P0)
@@ -298,9 +286,6 @@ def test_a_missing_image_of_kitti_is_a_lost_frame(tmp_path):
     assert levels(open_images(tmp_path)) == [10, None, 30]
 
 
-# 7-Scenes and photos.
-
-
 @pytest.mark.parametrize("text", [None, "nan " * 16, "inf 0 0 0\n" * 4])
 def test_where_tracking_was_lost_the_truth_of_scenes_has_a_gap(tmp_path, text):
     write_small_scenes(tmp_path)
@@ -327,9 +312,6 @@ def test_poses_of_photos_in_the_order_of_their_lines(tmp_path):
     truth = open_images(write_photos(tmp_path)).truth
     assert truth.stamps_ns.tolist() == [0, 1_000_000_000]
     assert truth.poses.tolist() == [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 4, 5, 6]]
-
-
-# Videos.
 
 
 @pytest.mark.parametrize(("name", "codec"), [("000001.mp4", "mp4v"), ("walk.mkv", "MJPG")])
@@ -415,9 +397,6 @@ def test_a_turned_video_is_turned_and_a_calibration_of_what_is_stored_with_it(fi
     assert camera == read_calibration(stored).camera.turned(1 if degrees == "-90" else 3)
     shown = write_camera(path.parent / "shown", width=48, height=64)
     assert open_images(path, shown).camera == read_calibration(shown).camera
-
-
-# Parts.
 
 
 def test_part_of_a_recording(tmp_path):
