@@ -52,7 +52,6 @@ from rbpf.maps.joint.rows import (
     apart,
     diagonal_blocks,
     log_odds_of,
-    multiplied,
     plus_gram,
     spread_of,
     turned,
@@ -486,8 +485,8 @@ class JointMap(Map):
         by_state = rows.said[:, 1:].transpose(2, 0, 1)
         spread = np.einsum("n,nra->ra", weights, by_state @ prior.spread(prior.mean))
         nu = weighted_mean(rows.nu, weights)
-        apart = rows.nu - nu
-        return nu, rows.cov + spread @ spread.T + multiplied((weights[:, None] * apart).T, apart), rows.groups
+        apart = np.sqrt(weights)[:, None] * (rows.nu - nu)
+        return nu, plus_gram(rows.cov, np.concatenate([spread.T, apart])), rows.groups
 
     @property
     def ids(self) -> np.ndarray:

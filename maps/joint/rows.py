@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrsm
+from scipy.linalg.lapack import dtrtri
 from scipy.special import digamma, gammaln
 
 from rbpf import gaussian
@@ -288,10 +289,8 @@ class Reading:
             slope = np.einsum("kp,kpq->kq", along, rows.slope[own])
             carried = np.einsum("kp,kpn->kn", along, rows.carried[own])
             within = np.einsum("klq,lq->kl", carried[:, rows.at[own[:, 0]]], slope)
-            spread, reached = (
-                1.0 + information * np.diagonal(within),
-                np.take_along_axis(carried, column[:, None], 1)[:, 0],
-            )
+            spread = 1.0 + information * np.diagonal(within)
+            reached = np.take_along_axis(carried, column[:, None], 1)[:, 0]
             gain = information * reached / spread
             nu = np.einsum("kp,nkp->nk", along, rows.nu[:, own]) + (at - mean)[:, column] * slope[:, alone]
             moved = mean.copy()
@@ -363,14 +362,15 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
     scales = {at: np.ones(len(parts[at].rows)) for at in heavy}
     weights = {at: np.linalg.inv(groups[at].cov[taken[at]]) for at in heavy}
     for _ in range(ROUNDS if of_heavy.size else 0):
-        inverse, settled = gaussian.inverse(cov), True
-        solved = inverse @ nu
+        # L⁻¹ of cov = L Lᵀ, transposed: of cov⁻¹ no more is wanted than blocks on the diagonal.
+        half, settled = dtrtri(gaussian.cholesky(cov).T, overwrite_c=True)[0], True
+        solved = half @ (nu @ half)
         for at in heavy:
             # Of the noise given all measurements, mean R S⁻¹ν and covariance R − R (S⁻¹) R; then by how much it is stated.
             own, stated, dof = place[parts[at].rows], groups[at].cov[taken[at]], parts[at].likelihood.dof
             now, p = stated / scales[at][:, None, None], own.shape[1]
             mean = (now @ solved[own][..., None])[..., 0]
-            second = mean[:, :, None] * mean[:, None] + now - now @ diagonal_blocks(inverse, own) @ now
+            second = mean[:, :, None] * mean[:, None] + now - now @ (half[own] @ half[own].swapaxes(1, 2)) @ now
             ratio = (dof + p) / (dof + np.einsum("kab,kba->k", weights[at], second)) / scales[at]
             settled &= bool((np.abs(1.0 - 1.0 / ratio) <= SAME).all())
             scales[at] = scales[at] * ratio**STRIDE
