@@ -69,10 +69,11 @@ class Present:
         if (known := old.given(self.given)) is not None:
             # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
             columns = held.of_one_kind(known.ids).columns.ravel()
-            own = self.cov[np.ix_(columns, columns)]
-            gain = np.linalg.solve(own, self.cov[columns]).T
-            self.mean = self.mean + gain @ (known.points.ravel() - self.mean[columns])
-            self.cov = gaussian.symmetrise(self.cov + gain @ (known.cov - own) @ gain.T)
+            own, off = self.cov[np.ix_(columns, columns)], known.points.ravel() - self.mean[columns]
+            if off.any() or not np.array_equal(known.cov, own):  # mostly they say the same
+                gain = np.linalg.solve(own, self.cov[columns]).T
+                self.mean = self.mean + gain @ off
+                self.cov = gaussian.symmetrise(self.cov + gain @ (known.cov - own) @ gain.T)
 
     def bring_in(self, old: SubMaps, returning: np.ndarray) -> None:
         """Landmarks (K,) about the start are held again."""

@@ -437,10 +437,8 @@ class SubMaps:
         first, k = len(self.about.cov), self.about.constants.size
         turned, points = slice(first, first + d), slice(first + d, len(x) - k)
         start, end = space.retract(self.start, x[:d]), space.retract(new.end, x[turned])
-        by_start, by_end = (
-            space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d]),
-            space.right_jacobian(x[turned]),
-        )
+        by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
+        by_end = space.right_jacobian(x[turned])
         others = np.setdiff1d(np.arange(self.about.ids.size), mine)
         far = np.linalg.norm(self._seen_from_end(tied, new, others)[0], axis=1)
         kept = np.sort(np.argsort(far, kind="stable")[: max(self.most - new.ids.size, 0)])
