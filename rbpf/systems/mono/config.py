@@ -74,8 +74,12 @@ class StartConfig(Ranged):
         """Whether an adjustment comes after so many frames."""
         due = self.first_adjustment
         while due < count:
-            due = max(int(np.ceil(self.growth * due)), due + 1)
+            due = self.next_after(due)
         return due == count
+
+    def next_after(self, count: int) -> int:
+        """Frames after which the next adjustment comes, where the last one came after `count`."""
+        return max(int(np.ceil(self.growth * count)), count + 1)
 
 
 @dataclass(frozen=True)

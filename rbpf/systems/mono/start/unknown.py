@@ -70,7 +70,7 @@ class UnknownStart(Kept):
         self.over = self.over or lost
         if self.over or count < self._next or not usable:
             return None, None
-        self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
+        self._next = self.config.start.next_after(count)
         found = gathered(first, self.features, filter_.belief(), self.config.start.max_frames)
         if found is None:
             return None, None
