@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +16,6 @@ Tangents = Like[ArrayLike, "*#batch {self.dim}"]  #: Tangent vectors (..., d), a
 StateArray = Float[np.ndarray, "*batch {self.size}"]
 TangentArray = Float[np.ndarray, "*batch {self.dim}"]
 TangentMatrix = Float[np.ndarray, "*batch {self.dim} {self.dim}"]
-
-MEAN = 50, 1e-14  #: Iterations at most, and the step that ends them.
 
 
 def join(parts: Sequence[Array]) -> Array:
@@ -38,7 +36,7 @@ def of_rows(function: Callable[[Array, Array], None], x: ArrayLike, size: int, o
     return out.reshape(*x.shape[:-1], *out_shape)
 
 
-def of_two_rows(
+def of_pairs(
     function: Callable[[Array, Array, Array], None], x: ArrayLike, y: ArrayLike, sizes: tuple[int, int, int]
 ) -> Array:
     """A function of rows of two arrays whose leading axes broadcast; `sizes` are those of their rows and of the result's."""
@@ -76,6 +74,7 @@ class LieGroup(ABC):
 
     size: int  #: Numbers stored per state, E.
     dim: int  #: Dimension of the tangent space, d.
+    mean_rule: ClassVar = 50, 1e-14  #: Of `mean`: iterations at most, and the step that ends them.
 
     @abstractmethod
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
@@ -105,7 +104,7 @@ class LieGroup(ABC):
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
         """The stationary point next to a guess; a group may fuse the iteration."""
-        iterations, tolerance = MEAN
+        iterations, tolerance = self.mean_rule
         for _ in range(iterations):
             step = (weights[:, None] * self.local(mean, points)).sum(0)
             mean = self.retract(mean, step)

@@ -11,17 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rbpf.arrays import Array, Float, Like
 from rbpf.kernels import se2 as kernels
-from rbpf.lie.base import (
-    MEAN,
-    LieGroup,
-    StateArray,
-    States,
-    TangentArray,
-    TangentMatrix,
-    Tangents,
-    of_rows,
-    of_two_rows,
-)
+from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, of_pairs, of_rows
 
 Complex = NDArray[np.complex128]
 
@@ -61,14 +51,15 @@ class SE2Group(LieGroup):
         return _pack(_wrap(-a[..., 0]), -_phasor(-a[..., 0]) * _planar(a))
 
     def retract(self, x: States, xi: Tangents) -> StateArray:
-        return of_two_rows(kernels.retract, x, xi, (3, 3, 3))
+        return of_pairs(kernels.retract, x, xi, (3, 3, 3))
 
     def local(self, x: States, y: States) -> TangentArray:
-        return of_two_rows(kernels.local, x, y, (3, 3, 3))
+        return of_pairs(kernels.local, x, y, (3, 3, 3))
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
         # The angle does not depend on the place; once it is known, what is left is linear in the place.
-        mean, points, angle, (iterations, tolerance) = _contiguous(mean), _contiguous(points), float(mean[0]), MEAN
+        mean, points, angle = _contiguous(mean), _contiguous(points), float(mean[0])
+        iterations, tolerance = self.mean_rule
         for _ in range(iterations):
             half = 0.5 * _wrap(points[:, 0] - angle)
             step = 2.0 * float((weights * half).sum())

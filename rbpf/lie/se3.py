@@ -7,18 +7,7 @@ from numpy.typing import ArrayLike
 
 from rbpf.arrays import Array, Float, Like
 from rbpf.kernels import se3 as kernels
-from rbpf.lie.base import (
-    MEAN,
-    LieGroup,
-    StateArray,
-    States,
-    TangentArray,
-    TangentMatrix,
-    Tangents,
-    join,
-    of_rows,
-    of_two_rows,
-)
+from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join, of_pairs, of_rows
 
 
 @final
@@ -43,20 +32,20 @@ class SE3Group(LieGroup):
         return of_rows(kernels.log, x, 7, (6,))
 
     def compose(self, a: States, b: States) -> StateArray:
-        return of_two_rows(kernels.compose, a, b, (7, 7, 7))
+        return of_pairs(kernels.compose, a, b, (7, 7, 7))
 
     def inverse(self, a: States) -> StateArray:
         return of_rows(kernels.inverse, a, 7, (7,))
 
     def retract(self, x: States, xi: Tangents) -> StateArray:
-        return of_two_rows(kernels.retract, x, xi, (7, 6, 7))
+        return of_pairs(kernels.retract, x, xi, (7, 6, 7))
 
     def local(self, x: States, y: States) -> TangentArray:
-        return of_two_rows(kernels.local, x, y, (7, 7, 6))
+        return of_pairs(kernels.local, x, y, (7, 7, 6))
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
         mean = np.array(mean)[None]
-        kernels.mean(np.ascontiguousarray(points), np.ascontiguousarray(weights), *MEAN, mean)
+        kernels.mean(np.ascontiguousarray(points), np.ascontiguousarray(weights), *self.mean_rule, mean)
         return mean[0]
 
     def normalise(self, x: States) -> StateArray:
@@ -75,10 +64,10 @@ class SE3Group(LieGroup):
 
     def transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """World points [m] of body points, with a = world_from_body."""
-        return of_two_rows(kernels.transform, a, p, (7, 3, 3))
+        return of_pairs(kernels.transform, a, p, (7, 3, 3))
 
     def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        return of_two_rows(kernels.inverse_transform, a, p, (7, 3, 3))
+        return of_pairs(kernels.inverse_transform, a, p, (7, 3, 3))
 
     def transform_jacobian(self, p: Like[ArrayLike, "*batch 3"]) -> Float[np.ndarray, "*batch 3 6"]:
         """∂(Exp(ε) p)/∂ε at ε = 0, of points p [m]: −[p]×, then I."""
