@@ -19,12 +19,6 @@ from rbpf.core.checkpoint import integers, numbers, require
 from rbpf.errors import InputError
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted
 
-_SCHEMA = {
-    "names": integers("M"),
-    "px": numbers("M", 2),
-    "positions": numbers("M", 3),
-    "std_m": numbers("M", least=0.0),
-}
 COLUMNS, ACROSS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m"), "across_m"
 ROUNDED = 0.01  #: Numbers are rounded in a table: a variance may be too large by this fraction.
 
@@ -48,8 +42,9 @@ class KnownPixels:
 
     def __post_init__(self) -> None:
         """Checks what is given: the points may be made by hand."""
-        given = {} if self.across_m is None else {"across_m": numbers("M", least=0.0)}
-        require("the known points", vars(self), _SCHEMA | given)
+        schema = {"names": integers("M"), "px": numbers("M", 2), "positions": numbers("M", 3)}
+        stds = ("std_m",) if self.across_m is None else ("std_m", "across_m")
+        require("the known points", vars(self), schema | dict.fromkeys(stds, numbers("M", least=0.0)))
         if self.across_m is not None and (2.0 * self.across_m**2 > self.std_m**2 * (1.0 + ROUNDED)).any():
             raise InputError(
                 "the known points: across_m, along two axes, is more than the standard deviation as a whole"

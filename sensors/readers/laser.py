@@ -143,8 +143,9 @@ def _tell_mirrored(path: Path, log: LaserLog) -> None:
     """Says so where the scans before and after turns lie on each other with their angles mirrored, and not as they are."""
     if log.odometry is None:
         return  # what has no turns of its own is as consistent in a mirror
-    every, gains, first = -(-log.scanner.angles.size // 200), list[float](), 0
-    towards = np.stack([np.cos(log.scanner.angles), np.sin(log.scanner.angles)], axis=1)[::every]
+    angles, mount = log.scanner.angles, log.scanner.robot_from_sensor
+    every, gains, first = -(-angles.size // 200), list[float](), 0
+    towards = np.stack([np.cos(angles), np.sin(angles)], axis=1)[::every]
     for last in range(1, len(log.odometry)):
         moved = SE2.between(log.odometry[first], log.odometry[last])
         if np.hypot(moved[1], moved[2]) > _NEAR_M or abs(moved[0]) > 1.0:
@@ -152,13 +153,10 @@ def _tell_mirrored(path: Path, log: LaserLog) -> None:
         elif abs(moved[0]) >= _TURNED:
             pair, fits = [(r, np.isfinite(r)) for r in log.ranges[[first, last], ::every]], list[float]()
             for side in (1.0, -1.0):
-                before, after = (
-                    SE2.transform(log.scanner.robot_from_sensor, r[there, None] * towards[there] * [1.0, side])
-                    for r, there in pair
-                )
-                away = np.linalg.norm(before - SE2.transform(moved, after)[:, None], axis=-1).min(
-                    axis=1, initial=np.inf
-                )
+                points = (r[there, None] * towards[there] * [1.0, side] for r, there in pair)
+                before, after = (SE2.transform(mount, each) for each in points)
+                apart = np.linalg.norm(before - SE2.transform(moved, after)[:, None], axis=-1)
+                away = apart.min(axis=1, initial=np.inf)
                 fits.append(float(np.exp(-0.5 * (away / _WALL_M) ** 2).sum() / len(towards)))
             gains.append(fits[1] - fits[0])
             first = last

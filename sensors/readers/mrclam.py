@@ -159,15 +159,9 @@ def integrate(
     Its covariance is sum_k G_k diag(std_turn_rate^2, std_speed^2) G_k^T dt_k with G_k the derivative in the right
     chart. No piece slips sideways, so that the covariance of a single piece is singular.
 
-    Args:
-        readings_ns: (n,) times of the readings, in order; the robot stands still before the first.
-        turn_rate: (n,) [rad/s].
-        speed: (n,) forward [m/s].
-        instants_ns: (T,) times in strict order.
-
-    Returns:
-        delta (T - 1, 3), elements of SE(2), and their covariance (T - 1, 2, 3, 3) by unit noise of the turn rate
-        and by unit noise of the speed, in the right chart at delta.
+    Of readings of the turn rate (n,) [rad/s] and the forward speed (n,) [m/s] at times (n,) in order, before the first of
+    which the robot stands still, and of instants (T,) in strict order. Returns delta (T - 1, 3), elements of SE(2), and their
+    covariance (T - 1, 2, 3, 3) by unit noise of the turn rate and by unit noise of the speed, in the right chart at delta.
     """
     if len(instants_ns) == 1:
         return np.empty((0, 3)), np.empty((0, 2, 3, 3))

@@ -20,6 +20,7 @@ from rbpf.sensors.readers.text import Table
 
 UNNAMED = -1  #: In place of a landmark's name where it is not known which one was observed.
 _ROUNDING = 1e-5  #: Of a covariance's printed digits, relative.
+Numbers = NDArray[np.int64]  #: Times, steps, names of landmarks.
 
 
 @dataclass(frozen=True)
@@ -159,24 +160,12 @@ def spatial_to_chart(delta: Array, ypr: Array, cov: Array) -> Array:
 
 
 def assemble(
-    stamps_ns: NDArray[np.int64],
-    delta: Array,
-    cov_delta: Array,
-    frame: NDArray[np.int64],
-    landmarks: NDArray[np.int64],
-    z: Array,
-    cov_z: Array,
+    stamps_ns: Numbers, delta: Array, cov_delta: Array, frame: Numbers, landmarks: Numbers, z: Array, cov_z: Array
 ) -> list[Frame]:
-    """T frames in order, of which one without an observation is empty.
+    """T frames in order, at times (T,), of which one without an observation is empty.
 
-    Args:
-        stamps_ns: (T,) time of each frame.
-        delta: (T - 1, E) motion from each frame to the next.
-        cov_delta: (T - 1, d, d) its covariance.
-        frame: (S,) frame of each observation, in order.
-        landmarks: (S,) its landmark.
-        z: (S, p) its measurement.
-        cov_z: (S, p, p) its covariance.
+    From each to the next leads a motion (T - 1, E) with its covariance (T - 1, d, d). Of S observations in order each has its
+    frame (S,), its landmark (S,), its measurement (S, p) and the covariance of that (S, p, p).
     """
     bounds = np.searchsorted(frame, np.arange(len(stamps_ns) + 1))
     motions = [(None, None), *zip(delta, cov_delta, strict=True)]

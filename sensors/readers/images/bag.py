@@ -145,15 +145,14 @@ def opened(path: Path) -> Iterator[Bag]:
         reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
         reader.open()
     try:
+        types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
         if ros1:
+            types.register(get_types_from_msg(*_TRANSFORMS))
             # Packed chunks may unpack to no more than `MOST_BYTES`; the library itself takes what comes.
             for place, chunk in reader.chunks.items():
                 if chunk.datasize > MOST_BYTES:
                     raise InputError(f"{path}: a chunk claims to be larger than {MOST_BYTES >> 20} MiB.")
                 reader.chunks[place] = chunk._replace(decompressor=partial(_unpacked, chunk.decompressor))
-        types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
-        if ros1:
-            types.register(get_types_from_msg(*_TRANSFORMS))
         yield Bag(path, reader, types)
     finally:
         reader.close()

@@ -51,15 +51,7 @@ from rbpf.sensors.readers.images.calibration import NAME, Calibration, read_cali
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
 from rbpf.sensors.readers.images.poses import TUM_POSE, normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
-from rbpf.sensors.readers.text import (
-    line_error,
-    numbered_lines,
-    parse_table,
-    quoted,
-    read_stamped,
-    read_text,
-    require_seconds,
-)
+from rbpf.sensors.readers.text import numbered_lines, parse_table, quoted, read_stamped, read_text, require_seconds
 
 DEFAULT_RATE_HZ = 30.0
 SCENES_RATE_HZ = 30.0
@@ -111,7 +103,7 @@ class SevenScenes(ImageFormat):
         poses = [_scenes_pose(file.with_name(file.name.split(".")[0] + ".pose.txt")) for file in files]
         kept = [row for row, pose in enumerate(poses) if pose is not None]
         truth = Truth(stamps_ns[kept], np.array([poses[row] for row in kept])) if kept else None
-        return _sequence(path, camera, stamps_ns, files, truth)
+        return _sequence(path, camera, stamps_ns, files, truth, path)
 
 
 @final
@@ -130,11 +122,11 @@ class Photos(ImageFormat):
         if len(cameras) != 1:
             raise InputError(f"{file}: expected one line `K fx fy cx cy width height`, found {len(cameras)}.")
         if options.calibration is None:
-            line = cameras[0][0]
-            fx, fy, cx, cy, width, height = parse_table(file, _PHOTO_CAMERA, cameras).values[0].tolist()
+            table = parse_table(file, _PHOTO_CAMERA, cameras)
+            fx, fy, cx, cy, width, height = table.values[0].tolist()
             if not (min(fx, fy, width, height) > 0.0 and width % 1 == 0 and height % 1 == 0):
-                raise line_error(file, line, "expected positive fx and fy, and a whole positive width and height")
-            camera = Calibration(f"{file}, line {line}", Pinhole(int(width), int(height), fx, fy, cx, cy))
+                raise table.error(0, "expected positive fx and fy, and a whole positive width and height")
+            camera = Calibration(f"{file}, line {table.lines[0]}", Pinhole(int(width), int(height), fx, fy, cx, cy))
         else:
             camera = read_calibration(options.calibration)
         photos = [row for row in rows if row[1] != "K"]
@@ -169,7 +161,7 @@ class Folder(ImageFormat):
                 said = "%s: no times.txt and no rate_hz in %s, taken as %g Hz"
                 _log.info(said, path, camera.where, DEFAULT_RATE_HZ)
         truth = read_tum_truth(path / "groundtruth.txt", stamps_ns)
-        return _sequence(path, camera, stamps_ns, files, truth)
+        return _sequence(path, camera, stamps_ns, files, truth, path)
 
 
 def list_images(path: Path) -> list[Path]:
@@ -180,9 +172,7 @@ def list_images(path: Path) -> list[Path]:
             if found:
                 # Numbers in a name count as such.
                 parts = {file: re.split(r"(\d+)", file.name) for file in found}
-                return sorted(
-                    found, key=lambda file: ([int(p) if p.isdecimal() else p for p in parts[file]], file.name)
-                )
+                return sorted(found, key=lambda f: ([int(p) if p.isdecimal() else p for p in parts[f]], f.name))
     return []
 
 
@@ -192,16 +182,11 @@ def evenly(count: int, rate_hz: float) -> np.ndarray:
 
 
 def _sequence(
-    path: Path,
-    camera: Calibration,
-    stamps_ns: np.ndarray,
-    files: list[Path],
-    truth: Truth | None,
-    listed: Path | None = None,
+    path: Path, camera: Calibration, stamps_ns: np.ndarray, files: list[Path], truth: Truth | None, listed: Path
 ) -> ImageSequence:
-    """Images in files of one size, which are listed in a file or lie in the folder."""
-    require_seconds(listed or path, stamps_ns, "images", camera.rate_hz)
-    shape = first_shape(files, listed or path)
+    """Images in files of one size, which are `listed` in a file, or lie in the folder."""
+    require_seconds(listed, stamps_ns, "images", camera.rate_hz)
+    shape = first_shape(files, listed)
     camera.require_shape(shape, str(path))
     source = FileImages(stamps_ns, shape, files)
     return ImageSequence(path.resolve().name, camera.camera, stamps_ns, truth, None, source)

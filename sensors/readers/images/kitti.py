@@ -73,10 +73,8 @@ class Kitti(ImageFormat):
             where, theirs, first_from_right = _projection(calib, self.kind, right)
             baseline_m = float((first_from_right - first_from_camera)[4])
             if baseline_m == 0.0:
-                problem = (
-                    "it is at the place of the left camera, a baseline of zero; give the projections of two cameras"
-                )
-                raise InputError(f"{where}: {problem}.")
+                problem = "it is at the place of the left camera, a baseline of zero"
+                raise InputError(f"{where}: {problem}; give the projections of two cameras.")
             if np.abs(intrinsics - theirs).max() > ALIGNED_PX or baseline_m < 0.0:
                 problem = "expected the left camera's projection shifted to the right, as of a rectified pair"
                 raise InputError(f"{where}: {problem}.")

@@ -109,9 +109,8 @@ def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, w
     # They are a rectified pair already if both have one size and one set of intrinsics, no distortion and equal axes, and
     # the right one lies to the right of the left one along the rows.
     left, (along, *across) = sequence.camera, SE3.translation(left_from_right)
-    equal = (
-        (left.width, left.height) == (right.width, right.height) and left.lens.is_identity and right.lens.is_identity
-    )
+    plain = left.lens.is_identity and right.lens.is_identity
+    equal = plain and (left.width, left.height) == (right.width, right.height)
     aligned = np.linalg.norm(SE3.log(left_from_right)[:3]) <= ROTATED_RAD and np.linalg.norm(across) <= ASIDE * along
     if equal and aligned and along > 0.0 and np.abs(left.params - right.params).max() <= ALIKE_PX:
         return replace(sequence, baseline_m=float(along))
