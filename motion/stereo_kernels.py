@@ -234,12 +234,8 @@ def _miss(matrix, n, lanes):
     for i in range(n):
         before, now = _three(lanes, _BEFORE, i), _three(lanes, _NOW, i)
         depth = _raised(last, before)
-        miss = (
-            now[0] - _raised(across, before) / depth,
-            now[1] - _raised(down, before) / depth,
-            now[2] - _raised(other, before) / depth,
-        )
-        white = _white(lanes, _BEFORE, i, miss)
+        seen = _over((_raised(across, before), _raised(down, before), _raised(other, before)), depth)
+        white = _white(lanes, _BEFORE, i, (now[0] - seen[0], now[1] - seen[1], now[2] - seen[2]))
         lanes[_SQUARED + i] = _dot(white, white) if depth > 0.0 else np.inf
 
 

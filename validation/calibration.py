@@ -101,20 +101,18 @@ def _draw(found: BoardCalibration) -> Any:
     figure = Figure(figsize=(13.0, 8.0), layout="constrained")
     axes: Any = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
     image = axes["image"]
-    px = np.concatenate([view.px for view in found.views])
+    px, residuals = np.concatenate([view.px for view in found.views]), found.residuals.reshape(-1, 2)
     length = 0.02 * found.camera.width
     enlarged = length / max(found.rms_px, np.finfo(float).eps)
-    title = (
-        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; residuals {enlarged:.0f} times enlarged"
-    )
-    label(image, title, "u [px]", "v [px]", equal=False)
+    error = f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px"
+    label(image, f"{error}; residuals {enlarged:.0f} times enlarged", "u [px]", "v [px]", equal=False)
     image.set_aspect("equal")
     image.plot(*px.T, ".", markersize=3, color=COLOURS["truth"])
-    shift = enlarged * found.residuals.reshape(-1, 2)
-    image.quiver(*px.T, *shift.T, angles="xy", scale_units="xy", scale=1.0, width=0.001, color=COLOURS["map"])
+    image.quiver(
+        *px.T, *(enlarged * residuals).T, angles="xy", scale_units="xy", scale=1.0, width=0.001, color=COLOURS["map"]
+    )
     image.set(xlim=(-0.5, found.camera.width - 0.5), ylim=(found.camera.height - 0.5, -0.5))
     image.plot(found.camera.cx, found.camera.cy, "+", markersize=14, color=COLOURS["known"])
-    residuals = found.residuals.reshape(-1, 2)
     label(axes["residuals"], "residuals of all corners", "u [px]", "v [px]", equal=True)
     axes["residuals"].plot(*residuals.T, ".", markersize=2, color=COLOURS["filter"])
     label(axes["views"], "error of each view", "view", "root mean square [px]", equal=False)

@@ -169,13 +169,9 @@ def colours_by_sigma(std: Array) -> NDArray[np.uint8]:
 
 
 def write_ply(
-    path: Path,
-    points: Array,
-    colours: NDArray[np.uint8],
-    sigmas: Array | None = None,
-    edges: NDArray[np.int64] | None = None,
+    path: Path, points: Array, colours: np.ndarray, sigmas: Array | None = None, edges: np.ndarray | None = None
 ) -> None:
-    """Writes finite points (M, 3) [m] with colours (M, 3), and lines between them; the file appears when complete.
+    """Writes finite points (M, 3) [m] with colours (M, 3) uint8, and lines between them; the file appears when complete.
 
     `sigmas` (M,) are a further property sigma_m of each point, `edges` (L, 2) rows of the points that a line connects.
     """

@@ -84,9 +84,7 @@ class Plot(Printed):
         prepare_folder(self.out)
         one = len(found) == 1
         names = draw_run(found[0], self.out, self.format) if one else draw_beside(found, self.out, self.format)
-        entries = {
-            str(run.folder): {name: run.summary[name] for name in _BESIDE if name in run.summary} for run in found
-        }
+        entries = {str(run.folder): {n: run.summary[n] for n in _BESIDE if n in run.summary} for run in found}
         lines = [line for run, figures in entries.items() for line in (run, *table(figures, 28))]
         answer({"runs": entries, "files": names}, self.json, *lines, f"wrote {', '.join(names)} into {self.out}")
 

@@ -66,9 +66,7 @@ def motion_checks(model: models.MotionModel, space: LieGroup, rng: Generator, ex
             states = first
         n, d, m, found = states.shape[0], space.dim, 0, transition(states)
         there = [part is not None for part in (found.coupling, found.dynamics, found.drift)]
-        require(
-            all(there) or not any(there), f"{name} must give coupling, dynamics and drift together, or none of them"
-        )
+        require(len(set(there)) == 1, f"{name} must give coupling, dynamics and drift together, or none of them")
         require_shape(f"{name}: mean", found.mean, (n, space.size))
         if found.coupling is not None:
             require_shape(f"{name}: coupling", found.coupling, (n, d, None), (1, d, None))
@@ -435,10 +433,8 @@ def conditional_checks(part: models.Conditional, space: LieGroup, rng: Generator
         return called(part.correct, state, moved, groups, repeat=False, gives=[models.LogDensities])
 
     def life() -> None:
-        require(
-            isinstance(part.supplies, models.Part),
-            f"{type(part).__name__}.supplies is {part.supplies!r}, expected a Part",
-        )
+        what = f"{type(part).__name__}.supplies is {part.supplies!r}, expected a Part"
+        require(isinstance(part.supplies, models.Part), what)
         begin()
         before = held()
         prior = predicted(states)

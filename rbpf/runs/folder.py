@@ -76,7 +76,7 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
 def summarise(run: Run) -> dict[str, Any]:
     """The entries of summary.json that need no comparison."""
     log, config = run.log, run.system.config
-    evidence, milliseconds = log["log_evidence"], 1e3 * log["seconds"]
+    evidence, (median, p95) = log["log_evidence"], np.percentile(1e3 * log["seconds"], [50, 95]).round(3).tolist()
     linearised = np.isfinite(log["nis"]) & (log["nis_dof"] > 0)
     nis, dof = log["nis"][linearised], log["nis_dof"][linearised]
     return {
@@ -85,9 +85,7 @@ def summarise(run: Run) -> dict[str, Any]:
         "frames": len(log),
         "particles": config.particles,
         "seed": config.seed,
-        "ms_per_frame": dict(
-            zip(("median", "p95"), np.percentile(milliseconds, [50, 95]).round(3).tolist(), strict=True)
-        ),
+        "ms_per_frame": {"median": median, "p95": p95},
         "resamplings": int(log["resampled"].sum()),
         "ess_mean": float(log["ess"].mean()),
         "log_evidence": float(np.sum(evidence)) if np.isfinite(evidence).all() else None,

@@ -4,7 +4,7 @@ Their format stands in docs/run_folder.md.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,12 +101,7 @@ def _camera_texts(log: FeatureLog) -> dict[str, str]:
 
 
 def _text(
-    name: str,
-    recording: str,
-    header: Mapping[str, str],
-    columns: list[str],
-    integers: Sequence[np.ndarray],
-    *numbers: np.ndarray,
+    name: str, recording: str, header: dict[str, str], columns: list[str], integers: list[np.ndarray], *numbers: Array
 ) -> str:
     """A file: whole numbers (n,) each; then, where there are any, numbers (n, k) and their covariances (n, d, d)."""
     lines = [f"# {_TITLES[name]}", f"# recording: {recording}"]

@@ -14,7 +14,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
-from rbpf.lie import SE3
+from rbpf.lie import SE3, Array
 from rbpf.runs.files import GRID
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
@@ -118,12 +118,7 @@ def near_box(mean: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def draw_map(
-    title: str,
-    views: "Views",
-    at: np.ndarray,
-    landmarks: MapEstimate,
-    others: Mapping[str, tuple[str, np.ndarray]],
-    ax: Any = None,
+    title: str, views: "Views", at: Array, landmarks: MapEstimate, others: dict[str, tuple[str, Array]], ax: Any = None
 ) -> Any:
     """A path (T, 3) and a map of its world: points with 3σ ellipses, rays; others' points (K, 3), with a name in `COLOURS`."""
     figure, shown = views.axes(title, ax)

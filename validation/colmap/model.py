@@ -83,6 +83,8 @@ def build_model(
     stereo = isinstance(camera, RectifiedStereo)
     sides = (LEFT, RIGHT) if stereo else (LEFT,)
     pixels = {LEFT: table.z[:, :2], RIGHT: table.z[:, [-1, 1]]}
+    if names is None:
+        names = {(step, side): image_name(step, side) for step in range(len(world_from_camera)) for side in sides}
     rig, sensors = pycolmap.Rig(rig_id=1), {}
     for side in sides:
         model.add_camera(to_colmap_camera(camera.camera if isinstance(camera, RectifiedStereo) else camera, side))
@@ -98,13 +100,13 @@ def build_model(
         rows = np.flatnonzero(table.steps == step)
         images = [
             pycolmap.Image(
-                name=image_name(step, side) if names is None else names[step, side],
+                name=names[step, side],
                 keypoints=pixels[side][rows] + HALF_PX,
                 camera_id=side,
                 image_id=image_id(step, side, stereo),
             )
             for side in sides
-            if names is None or (step, side) in names
+            if (step, side) in names
         ]
         if not images:
             continue
@@ -124,11 +126,8 @@ def build_model(
     for step, index in zip(table.steps.tolist(), table.index.tolist(), strict=True):
         place = places.get(step, 0)
         places[step] = place + 1
-        tracks[index] += [
-            pycolmap.TrackElement(image_id(step, side, stereo), place)
-            for side in sides
-            if names is None or (step, side) in names
-        ]
+        shown = [image_id(step, side, stereo) for side in sides if (step, side) in names]
+        tracks[index] += [pycolmap.TrackElement(image, place) for image in shown]
     for index, (point, colour) in enumerate(zip(points, grey if colours is None else colours, strict=True)):
         model.add_point3D_with_id(index + 1, pycolmap.Point3D(xyz=point, color=colour))
         for element in tracks[index]:

@@ -77,9 +77,8 @@ def score_estimate(
     `others` are further paths of the run, by what the names of their errors begin with.
     """
     reference = in_space(estimate.stamps_ns[truth.rows], truth.poses)
-    entries = _merits(estimate.at(truth.rows).trajectory, reference, truth) | score_landmarks(
-        estimate, truth, anonymous
-    )
+    ours = estimate.at(truth.rows).trajectory
+    entries = _merits(ours, reference, truth) | score_landmarks(estimate, truth, anonymous)
     for prefix, path in (others or {}).items():
         entries |= score_path(path, reference, truth, prefix)
     return entries

@@ -71,10 +71,8 @@ def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = N
         dim = found.landmarks.delta.shape[-1]
         figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), dim)
         places = moved_map(theirs.landmarks, motions["batch"]).in_space()[0]
-        title, others = (
-            f"{name}: map over the batch optimum, in {world.name}",
-            {"landmarks of the batch": ("batch", places)},
-        )
+        title = f"{name}: map over the batch optimum, in {world.name}"
+        others = {"landmarks of the batch": ("batch", places)}
         ours_there = moved_map(ours.landmarks, motions["filter"])
         figures["gtsam_map.png"] = draw_map(title, views, paths["filter"].positions, ours_there, others)
     return save_figures(figures, out, plots.VECTORS)

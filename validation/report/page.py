@@ -283,12 +283,10 @@ def _some(rows: np.ndarray, most: int) -> np.ndarray:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]
 
 
-def _packed(places: np.ndarray) -> dict[str, Any]:
-    """Places (M, 3) as plotly reads them in few bytes."""
-    columns = places.T.astype("<f4")
-    return {
-        axis: {"dtype": "f4", "bdata": b64encode(c.tobytes()).decode()} for axis, c in zip("xyz", columns, strict=True)
-    }
+def _packed(rows: np.ndarray, names: str = "xyz", kind: str = "f4") -> dict[str, Any]:
+    """Places (M, 3), or rows of other three numbers, as plotly reads them in few bytes."""
+    columns = zip(names, rows.T.astype(f"<{kind}"), strict=True)
+    return {name: {"dtype": kind, "bdata": b64encode(column.tobytes()).decode()} for name, column in columns}
 
 
 def _line(places: np.ndarray, name: str, colour: str, width: int) -> dict[str, Any]:
@@ -334,8 +332,6 @@ def _ellipsoids(mean: np.ndarray, cov: np.ndarray, name: str) -> dict[str, Any]:
     ring, k = np.mgrid[: rings - 1, :around]
     here, right = around * ring + k, around * ring + (k + 1) % around
     patches = np.stack([here, right, here + around, right, right + around, here + around], axis=-1).reshape(-1, 3)
-    faces = (patches[None] + len(ball) * np.arange(len(mean))[:, None, None]).reshape(-1, 3).astype("<i4")
-    drawn = {axis: {"dtype": "i4", "bdata": b64encode(c.tobytes()).decode()}
-             for axis, c in zip("ijk", faces.T, strict=True)}  # fmt: skip
+    faces = (patches[None] + len(ball) * np.arange(len(mean))[:, None, None]).reshape(-1, 3)
     look = {"color": _COLOURS["odometry"], "opacity": 0.35, "hoverinfo": "skip", "showlegend": True}
-    return {"type": "mesh3d", "name": name, **look, **_packed(corners.reshape(-1, 3)), **drawn}
+    return {"type": "mesh3d", "name": name, **look, **_packed(corners.reshape(-1, 3)), **_packed(faces, "ijk", "i4")}

@@ -173,17 +173,12 @@ class Hypotheses:
         self.held, self._next = held, int(following[0])
 
     def _stepped(
-        self,
-        each: Hypothesis,
-        names: np.ndarray,
-        observed: Observations,
-        control: Odometry | None,
-        stamp_ns: int | None,
+        self, each: Hypothesis, names: np.ndarray, group: Observations, control: Odometry | None, stamp_ns: int | None
     ) -> StepReport:
         """A step with the landmarks named; then what was expected and not seen is less probable, or dropped."""
         used, ids = names != NULL, each.map.ids
         held = set(ids.tolist())
-        shown = FeatureFrame(stamp_ns or 0, names[used], observed.z[used], observed.cov[used])
+        shown = FeatureFrame(stamp_ns or 0, names[used], group.z[used], group.cov[used])
         each.filter.health.silent = self.held[0].filter.health.silent
         report = each.filter.step(shown, control, stamp_ns)
         if self.keep:
@@ -209,15 +204,13 @@ class Hypotheses:
         each.log_odds = log_odds
         return report
 
-    def _explained(
-        self, observed: Observations, control: Odometry | None, stamp_ns: int | None
-    ) -> Iterator[_Explanation]:
+    def _explained(self, group: Observations, control: Odometry | None, stamp_ns: int | None) -> Iterator[_Explanation]:
         """Explanations of what was observed, by all hypotheses."""
         # Points as seen from the robot are linear in the map, whatever is measured.
         seen, origin = RelativePosition(self.model.space), self.model.space.identity()[None]
-        points = self.model.initialise(origin, observed.z, observed.cov)
+        points = self.model.initialise(origin, group.z, group.cov)
         z, noise = points.mean[0], points.cov[0]
-        log_unit = 0.5 * (np.linalg.slogdet(noise)[1] - np.linalg.slogdet(observed.cov)[1])
+        log_unit = 0.5 * (np.linalg.slogdet(noise)[1] - np.linalg.slogdet(group.cov)[1])
         for each in self.held:
             # With the landmarks of old sub-maps that are near; one that is meant becomes one of the present sub-map, too.
             belief, wide = each.filter.expect(control, stamp_ns), each.map.widened()

@@ -247,11 +247,8 @@ class RangeBearingSlam(System):
         return known
 
     def arrays(self) -> dict[str, np.ndarray]:
-        kept = {
-            "odometry": self._odometry,
-            "observed_once": np.array(sorted(self.sensor.observed_once), dtype=np.int64),
-        }
-        kept |= self.calibration.arrays()
+        once = np.array(sorted(self.sensor.observed_once), dtype=np.int64)
+        kept = {"odometry": self._odometry, "observed_once": once} | self.calibration.arrays()
         return kept if self.hypotheses is None else kept | self.hypotheses.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
