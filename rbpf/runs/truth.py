@@ -77,12 +77,11 @@ def poses_at(
 
     Stamps that count steps are met exactly; between poses the geodesic is followed.
     """
-    last = true_ns.size - 1
-    after = np.searchsorted(true_ns, stamps_ns, side="left")
-    exact = np.minimum(after, last)
-    met = true_ns[exact] == stamps_ns
-    before = np.clip(np.where(met, exact, after - 1), 0, last)
-    after = np.clip(np.where(met, exact, after), 0, last)
+    if not true_ns.size:  # of a log that says where the landmarks are, and not where the robot was
+        return np.zeros(0, dtype=np.intp), poses
+    after = np.searchsorted(true_ns, stamps_ns).clip(max=true_ns.size - 1)
+    met = true_ns[after] == stamps_ns
+    before = np.where(met, after, after - 1).clip(min=0)
     gap = true_ns[after] - true_ns[before]
     inside = (true_ns[before] <= stamps_ns) & (stamps_ns <= true_ns[after])
     rows = np.flatnonzero(met | (inside & (gap <= LONGEST_GAP_NS)))
