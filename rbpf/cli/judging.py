@@ -115,8 +115,7 @@ class Export(Printed):
     def __call__(self) -> None:
         from rbpf.validation.exports import export_run
 
-        out = self.out or self.run / "export"
-        paths = [str(path) for path in export_run(self.run, self.format, out)]
+        paths = [str(path) for path in export_run(self.run, self.format, self.out or self.run / "export")]
         answer({"files": paths}, self.json, *(f"wrote {path}" for path in paths))
 
 
@@ -163,5 +162,4 @@ class Compare(Printed):
         with progress() as bar:
             found = compare_runs(a, b, self.seeds, self.workers, bar("filtering"))
         sentence = found.sentence(str(a), str(b))
-        entries = {"difference": found.difference, "error": found.error, "sentence": sentence}
-        answer(entries, self.json, sentence)
+        answer({"difference": found.difference, "error": found.error, "sentence": sentence}, self.json, sentence)

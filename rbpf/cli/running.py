@@ -306,10 +306,6 @@ def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
     return tell
 
 
-class StoppedError(KeyboardInterrupt):
-    """Someone stopped a command; the text says how to go on."""
-
-
 @contextmanager
 def patient(report: OnProgress) -> Iterator[OnProgress]:
     """What a run reports its progress to, in place of `report`: after Ctrl-C it stops the run at the next frame.
@@ -320,16 +316,15 @@ def patient(report: OnProgress) -> Iterator[OnProgress]:
 
     def ask(_number: int, _frame: FrameType | None) -> None:
         if asked.is_set():
-            raise StoppedError("stopped; the same command with --resume goes on from the last checkpoint")
+            raise KeyboardInterrupt("stopped; the same command with --resume goes on from the last checkpoint")
         asked.set()
         say("stopping after this frame; Ctrl-C again stops at once …")
 
     def listening(done: int, total: int | None, words: str = "") -> None:
         report(done, total, words)
         if asked.is_set():
-            raise StoppedError(
-                f"stopped after {done} of {total or 'an unknown number'}; the same command with --resume goes on from there"
-            )
+            of = total or "an unknown number"
+            raise KeyboardInterrupt(f"stopped after {done} of {of}; the same command with --resume goes on from there")
 
     if threading.current_thread() is not threading.main_thread():
         yield listening
@@ -387,16 +382,12 @@ def _run(
         # Not before the first frame: it takes as long to import as everything above.
         from rbpf.validation.finish import finish_run
 
-        solving = bar("batch")
-        made |= {
-            "rerun": result.rerun,
-            "on_frame": bar("drawing"),
-            "on_iteration": lambda count, _error: solving(count, None),
-        }
+        drawing, solving = bar("drawing"), bar("batch")
+        made |= {"on_frame": drawing, "on_iteration": lambda count, _error: solving(count, None)}
         try:
-            entries = finish_run(run, out, recording.sources(), **made)
+            entries = finish_run(run, out, recording.sources(), rerun=result.rerun, **made)
         except KeyboardInterrupt as error:
-            raise StoppedError(
+            raise KeyboardInterrupt(
                 "stopped while the results were written; the same command with --resume filters only what is missing"
             ) from error
     problems = entries.get("problems", ())

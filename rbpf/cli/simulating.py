@@ -107,8 +107,7 @@ class SimulateDesk(ImagesOptions):
         lies = TexturedDesk(frames=self.frames, contrast=self.contrast)
         board = given_board(self.board, self.square)
         if board is not None:
-            squares = board.columns + 1, board.rows + 1
-            lies = replace(lies, board=squares, square_m=board.square_m)
+            lies = replace(lies, board=(board.columns + 1, board.rows + 1), square_m=board.square_m)
         render(lies, self)
 
 
@@ -132,10 +131,7 @@ def render(world: "ImageWorld", options: RenderOptions) -> None:
 
     if options.fisheye is not None and any(options.distortion):
         raise InputError("a lens has either --distortion or --fisheye: leave out one of them")
-    lens: tuple[float, ...] = options.distortion
-    model = "radial-tangential"
-    if options.fisheye is not None:
-        lens, model = options.fisheye, "equidistant"
+    lens, model = options.fisheye or options.distortion, "equidistant" if options.fisheye else "radial-tangential"
     focal = options.focal_px or options.focal_fraction * options.width
     centre = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
     camera = Pinhole(options.width, options.height, focal, focal, *centre, lens, model)
