@@ -71,8 +71,7 @@ def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) 
             # The landmark that the model belongs to: it is tried on what the map holds.
             known = np.unique(group.ids[group.ids >= 0])
             landmark = example.belief.map.landmark_of(int(known[0]))
-            alike = known[example.belief.map.are(known, landmark)]
-            records = example.belief.read(alike)
+            records = example.belief.read(known[example.belief.map.are(known, landmark)])
             if records.log_weights is None:
                 tried = replace(example, state=example.belief.state, landmark=landmark, records=records)
             else:

@@ -166,8 +166,7 @@ def check_jacobians(model: models.ObservationModel, scene: Scene) -> None:
         found = getattr(analytic, block)
         if found is None:
             raise FindingError(f"{name} gives no derivative by the {block}, which the model reads")
-        constant = expected.shape[-2:]
-        require_shape(f"{name}: block {block}", found, expected.shape, constant)
+        require_shape(f"{name}: block {block}", found, expected.shape, expected.shape[-2:])
         found = np.broadcast_to(found, expected.shape)
         what = f"{name}: block {block} differs from the numeric derivative"
         require_close(what, found, expected, JACOBIAN_TOLERANCE)

@@ -112,8 +112,7 @@ class SE3Group(LieGroup):
         y = cz * sy * cx + sz * cy * sx
         z = sz * cy * cx - cz * sy * sx
         w = cz * cy * cx + sz * sy * sx
-        quat = np.stack(np.broadcast_arrays(x, y, z, w), axis=-1)
-        return join([quat, np.asarray(t, dtype=float)])
+        return join([np.stack(np.broadcast_arrays(x, y, z, w), axis=-1), np.asarray(t, dtype=float)])
 
     def ypr(
         self, a: States

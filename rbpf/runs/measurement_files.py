@@ -170,8 +170,7 @@ def _read_camera_log(folder: Path, seen: "_Table", kind: str) -> FeatureLog:
     parts = zip(stamps.tolist(), *(np.split(column, cuts) for column in columns), strict=True)
     known = None
     if (folder / KNOWN).exists():
-        table = _Table.read(folder / KNOWN)
-        names, numbers = table.body(_KNOWN_COLUMNS, 1)
+        names, numbers = _Table.read(folder / KNOWN).body(_KNOWN_COLUMNS, 1)
         known = KnownPoints(names[:, 0].copy(), numbers[:, :3].copy(), gaussian.unpack(numbers[:, 3:], 3))
     return FeatureLog(seen.text("recording"), camera, [FeatureFrame(*part) for part in parts], known)
 

@@ -173,8 +173,7 @@ def particles_figure(found: RunFolder) -> Any:
     poses, weights = found.particles
     world = World.of(found)
     path, motion = world.brought(found.trajectory), world.motion(found.trajectory)
-    title = f"{found.name}: {len(poses)} particles at the last frame"
-    figure, shown = Views.of(found.system, path).axes(title)
+    figure, shown = Views.of(found.system, path).axes(f"{found.name}: {len(poses)} particles at the last frame")
     at = motion.transform(in_space(np.zeros(len(poses), dtype=np.int64), poses).positions)
     turn = motion.scale * motion.rotation
     mean, cov = path.positions[-1], turn @ position_covariances(found.path)[-1] @ turn.T
@@ -342,8 +341,7 @@ class World:
         alignments = [truth.alignment, *(run.truth.alignment for run in others if (run.folder / TRUTH).is_file())]
         free = max(alignments, key=("none", "rigid", "similarity").index)
         how = "" if free == "none" else f", {free} alignment"
-        reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
-        return cls(f"the truth's world{how}", free, reference)
+        return cls(f"the truth's world{how}", free, in_space(found.path.stamps_ns[truth.rows], truth.poses))
 
     def motion(self, estimate: Trajectory) -> Similarity:
         """What brings an estimate here; nothing moves one that has too few frames with a true pose."""

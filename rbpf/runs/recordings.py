@@ -230,8 +230,7 @@ def open_mono(
         image, problem = ImageScreen(sequence.camera).usable(first_image(sequence))
         if known is not None and image is None:  # the known points' pixels are those in this image
             raise InputError(f"{sequence.name}: the first image is needed to start: {problem}")
-    system = MonoSlam(sequence.camera, config, known, known_map)
-    return Opened(system, sequence, sequence.stamps_ns, sequence.truth)
+    return Opened(MonoSlam(sequence.camera, config, known, known_map), sequence, sequence.stamps_ns, sequence.truth)
 
 
 def open_pairs(sequence: readers.ImageSequence, config: StereoConfig) -> Opened:
@@ -310,8 +309,7 @@ def filter_opened(
 ) -> Run:
     """Filters what is opened to its end; see `drive`, and `Run` for `inputs`. The run then knows the truth."""
     system, source, stamps_ns, truth = opened
-    expected = None if stamps_ns is None else len(stamps_ns)
-    run = Run(source, system, expected=expected, inputs=inputs or {})
+    run = Run(source, system, expected=None if stamps_ns is None else len(stamps_ns), inputs=inputs or {})
     drive(run, listeners, checkpoint, system.config.checkpoint_every, resume, stamps_ns)
     if truth is not None:
         run.truth = truth_at(system.space, truth, run.log.stamps_ns, system.gauge)

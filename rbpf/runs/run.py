@@ -84,8 +84,7 @@ class Run(Generic[SystemT]):
 
     def save(self, path: Path) -> None:
         """A checkpoint of the system and of everything gathered so far. Raises InputError: the file cannot be written."""
-        settings = decisive_settings(asdict(self.system.config))
-        begun = json.dumps({"settings": settings, "inputs": dict(self.inputs)})
+        begun = json.dumps({"settings": decisive_settings(asdict(self.system.config)), "inputs": dict(self.inputs)})
         own = {"log/messages": np.array(self.messages, dtype=np.str_), _BEGUN: np.array(begun)}
         self.system.save(path, self.log.arrays() | own)
 

@@ -17,6 +17,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.files import write_text
 from rbpf.sensors.readers.images.poses import normalised
+from rbpf.sensors.readers.images.rectification import nearest_in_time
 from rbpf.sensors.readers.text import read_columns
 
 MAX_DIFFERENCE_NS = 10_000_000
@@ -47,8 +48,7 @@ class Similarity:
 
     def transform_poses(self, world_from_body: Array) -> Array:
         """Poses (..., 7) in the estimate's world, as poses in the reference's; only for D = 3."""
-        motion = np.column_stack([self.rotation, self.translation])
-        turned = SE3.compose(SE3.from_matrix(motion), world_from_body)
+        turned = SE3.compose(SE3.from_matrix(np.column_stack([self.rotation, self.translation])), world_from_body)
         return np.concatenate([turned[..., :4], self.transform(world_from_body[..., 4:])], axis=-1)
 
 
@@ -103,11 +103,7 @@ def associate(
     """
     if not len(estimate) or not len(reference):
         raise InputError("Expected trajectories with poses to associate, found an empty one.")
-    stamps, others = estimate.stamps_ns, reference.stamps_ns
-    after = np.searchsorted(others, stamps).clip(max=len(others) - 1)
-    before = (after - 1).clip(min=0)
-    wanted = np.where(np.abs(stamps - others[before]) <= np.abs(others[after] - stamps), before, after)
-    difference = np.abs(stamps - others[wanted])
+    wanted, difference = nearest_in_time(estimate.stamps_ns, reference.stamps_ns)
     near = np.flatnonzero(difference <= max_difference_ns)
     if not len(near):
         raise InputError(

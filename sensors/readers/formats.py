@@ -47,8 +47,7 @@ def open_images(
     Raises InputError: nothing is there, it is of no known format, no image of it can be read, or another of its files
     is malformed; a topic is named that is not there.
     """
-    options = ReadOptions(None if calibration is None else Path(calibration), topics)
-    return _opened(path, options, part)
+    return _opened(path, ReadOptions(None if calibration is None else Path(calibration), topics), part)
 
 
 def open_stereo(

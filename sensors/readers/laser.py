@@ -107,8 +107,7 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
     if left := int((late_ns >= 0).sum()):
         _log.warning("%s: left out %d scans whose time is not after that of the scan before.", path, left)
         read = read.take(np.flatnonzero(np.append(True, late_ns < 0)))
-    after_s = (read.stamps_ns - read.stamps_ns[0]) * 1e-9
-    read = read.take(options.part.rows(after_s, f"{path}: no scan is left"))
+    read = read.take(options.part.rows((read.stamps_ns - read.stamps_ns[0]) * 1e-9, f"{path}: no scan is left"))
     # What a range means: too near, a wall, nothing.
     ranges = read.ranges
     longest = ranges[np.isfinite(ranges)].max(initial=0.0)

@@ -5,7 +5,7 @@ write them (upper triangles, in additive coordinates, rounded to a few digits), 
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -80,8 +80,7 @@ class LogNoise(Ranged):
 
     def given(self) -> dict[str, float]:
         """The fields that are not None."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return {name: value for name, value in values.items() if value is not None}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 def std_column(table: Table, column: str, given: float | None) -> Array:

@@ -106,8 +106,7 @@ class LaserSlam(Kept, System):
         if begun and stamp_ns < previous:
             raise InputError(f"time runs backwards: a scan has stamp {stamp_ns} ns after {previous} ns")
         beams, messages = self.scanner.beams(ranges, self.config.correlation_m), list[str]()
-        seconds = (stamp_ns - previous) * 1e-9 if begun else 0.0
-        self._move(odometry, seconds, messages)
+        self._move(odometry, (stamp_ns - previous) * 1e-9 if begun else 0.0, messages)
         self._stamp_ns = stamp_ns
 
         # Use the scan if there is something in it, and if the robot has moved.
@@ -207,8 +206,7 @@ class LaserSlam(Kept, System):
         if not self._moved.any():
             return Odometry(self._since, np.zeros((3, 3)))
         motion = self.config.motion
-        cov = motion.cov(way, turned) + (motion.cov_without(without) if without else 0.0)
-        return Odometry(self._since, cov)
+        return Odometry(self._since, motion.cov(way, turned) + (motion.cov_without(without) if without else 0.0))
 
     def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
         """A step of the filter; whether it resampled."""

@@ -78,8 +78,7 @@ class RangeBearingSlam(System):
                 "AnonymousLandmarkSensor associates in every particle"
             )
         landmark_map: JointMap | LandmarkMap
-        known_names = is_joint and not is_unnamed
-        self.calibration = calibration = RobotCalibration(config, space, self.model, known_names)
+        self.calibration = calibration = RobotCalibration(config, space, self.model, is_joint and not is_unnamed)
         if is_joint:
             unnamed = is_unnamed and config.submap is not None
             prior = calibration.prior

@@ -358,8 +358,7 @@ class RosBag(ImageFormat):
                 used = infos[0].calibration
             else:
                 infos, used = [], read_calibration(options.calibration)
-            read = [_stamps_and_first(bag, name) for name in names]
-            stamps, shapes, frames = zip(*read, strict=True)
+            stamps, shapes, frames = zip(*[_stamps_and_first(bag, name) for name in names], strict=True)
             shape, where = shapes[0], f"{path}, {' and '.join(names)}"
             sizes = [f"{width}x{height}" for height, width in shapes]
             if sizes[0] != sizes[-1]:

@@ -133,8 +133,7 @@ class Photos(ImageFormat):
         table = parse_table(file, TUM_POSE, [(line, pose) for line, _, pose in photos])
         stamps_ns = evenly(len(photos), PHOTO_RATE_HZ)
         truth = Truth(stamps_ns, normalised(np.roll(table.values, 4, axis=1), table.error))
-        files = [path / "images" / name for _, name, _ in photos]
-        return _sequence(path, camera, stamps_ns, files, truth, file)
+        return _sequence(path, camera, stamps_ns, [path / "images" / name for _, name, _ in photos], truth, file)
 
 
 @final
@@ -160,8 +159,7 @@ class Folder(ImageFormat):
             if camera.rate_hz is None:
                 said = "%s: no times.txt and no rate_hz in %s, taken as %g Hz"
                 _log.info(said, path, camera.where, DEFAULT_RATE_HZ)
-        truth = read_tum_truth(path / "groundtruth.txt", stamps_ns)
-        return _sequence(path, camera, stamps_ns, files, truth, path)
+        return _sequence(path, camera, stamps_ns, files, read_tum_truth(path / "groundtruth.txt", stamps_ns), path)
 
 
 def list_images(path: Path) -> list[Path]:

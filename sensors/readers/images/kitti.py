@@ -127,11 +127,8 @@ def _projection(path: Path, hint: str, camera: int) -> tuple[str, Array, Array]:
 
 
 def _files(folder: Path, count: int) -> list[Path]:
-    found = {
-        int(file.stem): file
-        for file in folder.iterdir()
-        if file.suffix.lower() in SUFFIXES and file.stem.isascii() and file.stem.isdigit()
-    }
+    images = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    found = {int(file.stem): file for file in images if file.stem.isascii() and file.stem.isdigit()}
     if found and max(found) >= count:
         problem = f"found image {max(found)} but {count} times in times.txt"
         raise InputError(f"{folder}: {problem}, expected one time per image; copy both from one sequence.")

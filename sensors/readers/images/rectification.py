@@ -133,8 +133,8 @@ def pair_stamps(
     Rows (P,) of the left camera's times (T,) and (P,) of the right one's (U,), both in order, and a sentence about each camera
     whose images are left out.
     """
-    nearest, gap_ns = _nearest(left_ns, right_ns)
-    back, _ = _nearest(right_ns, left_ns)
+    nearest, gap_ns = nearest_in_time(left_ns, right_ns)
+    back, _ = nearest_in_time(right_ns, left_ns)
     # Of equal times the first counts for all: go there and back by time, not by row.
     mutual = left_ns[back[nearest]] == left_ns
     left = np.flatnonzero(mutual & (gap_ns <= round(tolerance_s * 1e9)))
@@ -153,7 +153,7 @@ def pair_stamps(
     return left, right, tuple(notes)
 
 
-def _nearest(stamps_ns: np.ndarray, among_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_in_time(stamps_ns: np.ndarray, among_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Row (T,) of the nearest time, the earlier of two, and its distance (T,) in ns."""
     after = np.clip(np.searchsorted(among_ns, stamps_ns), 0, among_ns.size - 1)
     before = np.maximum(after - 1, 0)

@@ -109,8 +109,7 @@ def read_header(path: Path) -> tuple[np.ndarray, tuple[int, int], int]:
     shape, quarters = image.shape[:2], round(turned / 90.0) if np.isfinite(turned) else 0
     rate_hz = rate_hz if 0.0 < rate_hz < np.inf else DEFAULT_RATE_HZ
     own_ns = np.rint(np.nan_to_num(np.array(times_ms) - times_ms[0]) * 1e6).astype(np.int64)
-    even_ns = evenly(own_ns.size, rate_hz)
-    if (np.diff(own_ns) > 0).all() and np.abs(own_ns - even_ns).max() > _ROUNDING_NS:
+    if (np.diff(own_ns) > 0).all() and np.abs(own_ns - evenly(own_ns.size, rate_hz)).max() > _ROUNDING_NS:
         return own_ns, shape, quarters
     # A header may announce what it likes; no image takes less than a byte.
     count = int(announced) if 0 < announced <= path.stat().st_size else own_ns.size
