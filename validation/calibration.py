@@ -102,8 +102,7 @@ def _draw(found: BoardCalibration) -> Any:
     axes: Any = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
     image = axes["image"]
     px, residuals = np.concatenate([view.px for view in found.views]), found.residuals.reshape(-1, 2)
-    length = 0.02 * found.camera.width
-    enlarged = length / max(found.rms_px, np.finfo(float).eps)
+    enlarged = 0.02 * found.camera.width / max(found.rms_px, np.finfo(float).eps)
     error = f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px"
     label(image, f"{error}; residuals {enlarged:.0f} times enlarged", "u [px]", "v [px]", equal=False)
     image.set_aspect("equal")

@@ -73,8 +73,7 @@ def finish_run(
             entries["batch_problem"] = str(error)
     entries |= score_run(RunFolder.open(out))
     write_summary(out, entries)
-    found = RunFolder.open(out)
-    draw_run(found)
+    draw_run(RunFolder.open(out))
     if video and run.system.name in PICTURES:
         write_video(annotated_frames(run), run.log.stamps_ns, out / VIDEO, on_frame)
     else:

@@ -225,8 +225,7 @@ def _figures(run: Run) -> Row:
     if truth is not None:
         anonymous, others = getattr(run.system.config, "association", "") == "ml", {}
         if "odometry" in log:
-            prefix = ODOMETRY_PREFIX.get(run.system.name, "odometry_")
-            others[prefix] = in_space(log.stamps_ns, log["odometry"])
+            others[ODOMETRY_PREFIX.get(run.system.name, "odometry_")] = in_space(log.stamps_ns, log["odometry"])
         figures |= score_estimate(PathAndMap.of_run(run), truth, anonymous, others)
     if truth is not None and truth.alignment == "none":
         # Mean over the steps, of d degrees of freedom; nothing where the truth is not given in the filter's world.

@@ -104,8 +104,7 @@ class CameraProblem:
         graph = gtsam.NonlinearFactorGraph()
         for factor in self.observation_factors() if factors is None else factors:
             graph.push_back(factor)
-        names = self.table.names.tolist()
-        for name, key in zip(names, self.point_keys, strict=True):
+        for name, key in zip(self.table.names.tolist(), self.point_keys, strict=True):
             if name in self.known:
                 position, cov = self.known[name]
                 model = solvers.noise(cov) if cov.any() else gtsam.noiseModel.Constrained.All(3)
@@ -125,8 +124,7 @@ class CameraProblem:
                     f"All initial poses of {self.name} are at one place: without known points a path has to tell the scale."
                 )
             model = gtsam.noiseModel.Isotropic.Sigma(1, scale * distances[far])
-            keys = self.pose_keys[0], self.pose_keys[far]
-            graph.push_back(gtsam.RangeFactorPose3(*keys, distances[far], model))
+            graph.push_back(gtsam.RangeFactorPose3(self.pose_keys[0], self.pose_keys[far], distances[far], model))
         return graph
 
     def values(self, state: CameraState) -> Any:

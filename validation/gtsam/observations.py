@@ -134,8 +134,7 @@ def reprojection(table: ObservationTable, path: Array, points: Array) -> Residua
 def sigmas(table: ObservationTable, path: Array, points: Array) -> Array:
     """Distance (K,) of each observation from where it should be, in standard deviations."""
     residuals = reprojection(table, path, points)[0]
-    whitened = np.linalg.solve(table.cov_z, residuals[..., None])[..., 0]
-    return np.sqrt(np.einsum("ki,ki->k", residuals, whitened))
+    return np.sqrt(np.einsum("ki,ki->k", residuals, np.linalg.solve(table.cov_z, residuals[..., None])[..., 0]))
 
 
 def triangulate(table: ObservationTable, path: Array) -> Array:

@@ -47,8 +47,7 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None 
     camera, key = batch.problem.camera, int(gtsam.symbol("c", 0))
     found = adjust(*camera_problem(batch.problem, batch))
     problem, path = found.problem, batch.estimate.world_from_body
-    factors = with_camera(problem, camera, key)
-    graph = problem.graph(found.state, found.loose, path, SCALE, factors)
+    graph = problem.graph(found.state, found.loose, path, SCALE, with_camera(problem, camera, key))
     values = problem.values(found.state)
     values.insert(key, np.zeros(2))
     done = count(1)

@@ -244,8 +244,7 @@ def marginals_by_schur(
     kept = np.append(np.repeat(np.isin(keys, free), widths), False)  # the last column is the residual
     inside = kept[columns.astype(int) - 1]
     at = rows[inside].astype(int) - 1, columns[inside].astype(int) - 1
-    shape = (int(rows.max()), sum(widths))
-    jacobian = csc_array((entries[inside], at), shape=shape)[:, kept[:-1]]
+    jacobian = csc_array((entries[inside], at), shape=(int(rows.max()), sum(widths)))[:, kept[:-1]]
     is_pose = np.repeat([sizes[key] == _POSE for key in free], [sizes[key] for key in free])
     of_poses, of_points = jacobian[:, is_pose], jacobian[:, ~is_pose]
     # H_ll and its inverse by blocks, S, and S⁻¹ scaled to a diagonal of ones.

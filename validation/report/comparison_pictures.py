@@ -27,8 +27,7 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
     """Draws NEES, landmarks and map into the run's folder; returns their names behind the run's own path and error."""
     name, world = record.name, World.of(record)
     curve, dim = {"filter": _nees(record, errors)}, errors.whitened.errors.shape[1]
-    nees = consistency_figure(f"{name}: {NEES}", NEES, curve, dim, banded=True)
-    figures = {"groundtruth_nees.png": nees}
+    figures = {"groundtruth_nees.png": consistency_figure(f"{name}: {NEES}", NEES, curve, dim, banded=True)}
     if errors.landmarks is not None:
         found = errors.landmarks
         title = f"{name}: landmarks against the truth"

@@ -242,11 +242,10 @@ def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
     mean, cov = landmarks.in_space()
     values, vectors = np.linalg.eigh(cov)
     turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, mean[..., None]], axis=-1)
     return rr.Ellipsoids3D(
         centers=mean,
         half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
-        quaternions=SE3.from_matrix(poses)[:, :4],
+        quaternions=SE3.from_matrix(np.concatenate([turned, mean[..., None]], axis=-1))[:, :4],
         labels=[str(name) for name in landmarks.ids],
         show_labels=False,
     )

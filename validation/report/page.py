@@ -314,8 +314,7 @@ def _frustums(world_from_body: np.ndarray, system: str, size: float) -> np.ndarr
     a, b, c, d = corners
     top = np.zeros(3)
     outlines = np.array([top, a, b, c, d, a, top, b, top, c, top, d])
-    poses = _some(world_from_body, FRUSTUMS)
-    return _strips(SE3.transform(poses[:, None], outlines))
+    return _strips(SE3.transform(_some(world_from_body, FRUSTUMS)[:, None], outlines))
 
 
 def _ellipsoids(mean: np.ndarray, cov: np.ndarray, name: str) -> dict[str, Any]:

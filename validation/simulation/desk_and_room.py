@@ -73,8 +73,7 @@ class TexturedDesk(Ranged):
             desk.flat(np.array([*middle, (k + 1) * SHEET_M]), rng.uniform(-np.pi, np.pi), sheet, paint)
         board, taken = [], []
         if self.board is not None:
-            top = np.array([0.0, 0.0, (self.papers + 1) * SHEET_M])
-            board.append(desk.board(top, self.board, self.square_m))
+            board.append(desk.board(np.array([0.0, 0.0, (self.papers + 1) * SHEET_M]), self.board, self.square_m))
             reach = 0.5 * self.square_m * float(np.hypot(*self.board)) + BOARD_CLEAR_M
             taken.append((np.zeros(2), reach))
 
@@ -122,8 +121,7 @@ class TexturedRoom(Ranged):
         # Walked in a circle, looking outwards, with a hand that shakes.
         time = eased(np.arange(self.frames) / self.rate_hz, self.start_s)
         turn = self.speed_m_s * time / RADIUS_M
-        level = np.full_like(turn, EYE_M)
-        eye = np.stack([RADIUS_M * np.cos(turn), RADIUS_M * np.sin(turn), level], axis=-1)
+        eye = np.stack([RADIUS_M * np.cos(turn), RADIUS_M * np.sin(turn), np.full_like(turn, EYE_M)], axis=-1)
         heading = turn + 0.5 * np.pi - np.deg2rad(GAZE_DEG)
         drop = np.full_like(turn, -np.tan(np.deg2rad(DROP_DEG)))
         bound = np.array([np.deg2rad(SHAKE_DEG)] * 3 + [SHAKE_M] * 3)
@@ -152,5 +150,4 @@ class TexturedRoom(Ranged):
             size = (side, side, rng.uniform(0.3, 0.6 * ROOM_M[2]))
             foot, yaw = np.array([*middle, 0.0]), rng.uniform(-0.5, 0.5)
             furniture.box(foot, yaw, size, textures.carton, textures.carton)
-        stamps = stamps_ns(self.frames, self.rate_hz)
-        return TexturedScene("room", stamps, path, furniture.rectangles)
+        return TexturedScene("room", stamps_ns(self.frames, self.rate_hz), path, furniture.rectangles)

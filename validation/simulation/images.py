@@ -87,11 +87,9 @@ class Shutter:
         at = np.indices((camera.height, camera.width))
         square = (at[1] - camera.cx) ** 2 + (at[0] - camera.cy) ** 2
         self._vignette = (1.0 - imaging.vignetting * square / square.max()).astype(np.float32)
-        rows, columns = (
-            (np.arange(count) + 0.5) / count * size - 0.5
-            for count, size in zip(PROBES, (camera.height, camera.width), strict=True)
-        )
-        self._probe = camera.unproject(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
+        size = np.reshape([camera.height, camera.width], (2, 1, 1))
+        rows, columns = (np.indices(PROBES) + 0.5) / np.reshape(PROBES, (2, 1, 1)) * size - 0.5
+        self._probe = camera.unproject(np.stack([columns, rows], axis=-1).reshape(-1, 2))
         self._seeds = rng.integers(2**63, size=len(frames))
 
     def images(self, frame: int, baseline_m: float | None = None) -> list[np.ndarray]:
@@ -306,8 +304,7 @@ def simulate_images(
     rng = np.random.default_rng(seed)
     scene = world.build(rng)
     if wrong := [frame for frame in imaging.blackout if not 0 <= frame < len(scene.stamps_ns)]:
-        last = len(scene.stamps_ns) - 1
-        raise InputError(f"blackout names frame {wrong[0]}, but the frames are 0 to {last}")
+        raise InputError(f"blackout names frame {wrong[0]}, but the frames are 0 to {len(scene.stamps_ns) - 1}")
     left, baseline_m = (camera, baseline_m) if isinstance(camera, Pinhole) else (camera.camera, camera.baseline_m)
     if baseline_m is not None and not baseline_m > 0.0:
         raise InputError(f"the stereo baseline must be positive, got {baseline_m!r} m")
@@ -342,8 +339,7 @@ def simulate_images(
         def take(frame: int) -> None:
             stamp = int(scene.stamps_ns[frame])
             for sensor, image in zip(("cam0", "cam1"), shutter.images(frame, baseline_m), strict=False):
-                path = partial / "mav0" / sensor / "data" / f"{stamp}{suffix}"
-                write_image(path, image, imaging.jpeg)
+                write_image(partial / "mav0" / sensor / "data" / f"{stamp}{suffix}", image, imaging.jpeg)
             if imaging.depth:
                 depth, _ = renderer.depth(scene.world_from_camera[frame])
                 steps = np.rint(DEPTH_PER_M * depth)

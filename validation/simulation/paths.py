@@ -56,8 +56,7 @@ def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     forward = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     right = np.cross(forward, UP)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    columns = np.stack([right, np.cross(forward, right), forward, eye], axis=-1)
-    return SE3.from_matrix(columns)
+    return SE3.from_matrix(np.stack([right, np.cross(forward, right), forward, eye], axis=-1))
 
 
 ARM_HZ = 0.2, 0.8
@@ -98,8 +97,7 @@ class HandHeld:
         arm = Wave.random(np.array([*(0.5 * self.wander * np.array(size_m)), *turn, reach]), ARM_HZ, rng)
         start = arm(np.zeros(1))[:, :3] - [0.0, 0.0, 0.5 * size_m[2]]
         wrist = Wave.random(np.deg2rad([WRIST_DEG] * 3 + [0.0] * 3), WRIST_HZ, rng)
-        bound = [np.deg2rad(TREMOR_DEG)] * 3 + [TREMOR_M] * 3
-        tremor = Wave.random(np.array(bound), TREMOR_HZ, rng)
+        tremor = Wave.random(np.array([np.deg2rad(TREMOR_DEG)] * 3 + [TREMOR_M] * 3), TREMOR_HZ, rng)
 
         def sweep(time: np.ndarray) -> np.ndarray:
             """Faster than a hand."""

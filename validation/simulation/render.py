@@ -96,8 +96,7 @@ class Renderer:
 
     def _bounds(self, world_from_camera: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """(S, 4) least and greatest u and v of rectangles' parts before the camera; empty where there is none."""
-        corners = self._corners[seen].reshape(-1, 3)
-        local = SE3.inverse_transform(world_from_camera, corners).reshape(-1, 4, 3)
+        local = SE3.inverse_transform(world_from_camera, self._corners[seen].reshape(-1, 3)).reshape(-1, 4, 3)
         following = np.roll(local, -1, axis=1)
         with np.errstate(all="ignore"):
             fraction = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
