@@ -114,12 +114,8 @@ def _sweep(matrix, n, swept, lanes):
             _by_rows(_three(lanes, _COV_BEFORE + 3 * _LANES, i), p, q, r),
             _by_rows(_three(lanes, _COV_BEFORE + 6 * _LANES, i), p, q, r),
         )
-        apart = before[0] - pixels[0], before[1] - pixels[1], before[2] - pixels[2]
-        nu = (
-            now[0] - seen[0] - p[0] * apart[0] - p[1] * apart[1] - p[2] * apart[2],
-            now[1] - seen[1] - q[0] * apart[0] - q[1] * apart[1] - q[2] * apart[2],
-            now[2] - seen[2] - r[0] * apart[0] - r[1] * apart[1] - r[2] * apart[2],
-        )
+        off = pixels[0] - before[0], pixels[1] - before[1], pixels[2] - before[2]
+        nu = _plus(now[0] - seen[0], p, off), _plus(now[1] - seen[1], q, off), _plus(now[2] - seen[2], r, off)
         chol = _factored(_six(lanes, _COV_NOW, i), p, q, r, gain)
         solved = _solved(chol, nu)
         moved = _plus(before[0], gain[0], solved), _plus(before[1], gain[1], solved), _plus(before[2], gain[2], solved)
