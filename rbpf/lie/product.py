@@ -60,17 +60,9 @@ class Euclidean(Commutative):
     def normalise(self, x: States) -> StateArray:
         return np.array(x, dtype=float)
 
-    def rotation(self, a: States) -> TangentMatrix:
-        """I (…, D, D)."""
-        return self.adjoint(a)
-
-    def inverse_transform(self, a: States, p: States) -> StateArray:
-        """Points p seen from a: the group is that of translations."""
-        return self.local(a, p)
-
-    def transform(self, a: States, p: States) -> StateArray:
-        """The inverse of `inverse_transform`."""
-        return self.compose(a, p)
+    rotation = Commutative.adjoint  #: I (…, D, D).
+    #: World points of body points, and their inverse: the group is that of translations.
+    transform, inverse_transform = compose, local
 
     def transform_jacobian(self, p: States) -> TangentMatrix:
         """∂(Exp(ε) p)/∂ε (…, D, d) at ε = 0: I."""
