@@ -79,11 +79,8 @@ def open_stereo(
 
 
 def _opened(path: str | Path, options: ReadOptions, part: Part) -> ImageSequence:
-    if options.stereo:
-        pairs = [one for one in IMAGES if one.stereo_kind]
-        path, found = recognised(path, pairs, "a stereo sequence", "stereo_kind")
-    else:
-        path, found = recognised(path, IMAGES, "an image sequence")
+    what, kind = ("a stereo sequence", "stereo_kind") if options.stereo else ("an image sequence", "kind")
+    path, found = recognised(path, [one for one in IMAGES if getattr(one, kind)], what, kind)
     if not found.has_topics and (given := options.topics.entries()):
         name, value = next(iter(given.items()))
         problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"

@@ -16,6 +16,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog, KnownPoints
+from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Index = NDArray[np.intp]
 Residuals = tuple[Array, list[Array]]  #: Residuals (K, p), and their Jacobians (K, p, d) by each variable.
@@ -131,12 +132,6 @@ def reprojection(table: ObservationTable, path: Array, points: Array) -> Residua
     return residuals, [by_pose, slope @ SE3.rotation(path[table.steps]).mT]
 
 
-def sigmas(table: ObservationTable, path: Array, points: Array) -> Array:
-    """Distance (K,) of each observation from where it should be, in standard deviations."""
-    residuals = reprojection(table, path, points)[0]
-    return np.sqrt(np.einsum("ki,ki->k", residuals, np.linalg.solve(table.cov_z, residuals[..., None])[..., 0]))
-
-
 def triangulate(table: ObservationTable, path: Array) -> Array:
     """Huber's estimate (L, 3) from the distances to the rays, each in pixels of its image; near them without parallax."""
     # Centres and unit directions of the rays in the world, and noise as an angle; the right image of a stereo pair
@@ -229,7 +224,7 @@ def spread(table: ObservationTable, path: Array, points: Array) -> Array:
 
 def misfit(table: ObservationTable, path: Array, points: Array) -> Array:
     """Huber's loss of each landmark's observations (L,)."""
-    norm = sigmas(table, path, points)
+    norm = mahalanobis(reprojection(table, path, points)[0], table.cov_z)
     loss = np.where(norm < HUBER, 0.5 * norm**2, HUBER * (norm - 0.5 * HUBER))
     return np.bincount(table.index, weights=loss, minlength=len(points)).astype(float)
 

@@ -69,7 +69,7 @@ class RunView:
     def show(self, run: Run, t: int, tracked: Tracked, image: np.ndarray | None) -> None:
         """Frame t of a run, what the system said of it, and its image, if there is one."""
         rr, stream, system = self.rr, self.stream, run.system
-        camera = _lens(system)
+        camera, (drawn, plotted) = _lens(system), DRAWN.get(system.name, (None, {}))
         if not self._next:
             self._next, self._start_ns = 1, tracked.stamp_ns
             stream.send_blueprint(blueprint(run))
@@ -86,7 +86,7 @@ class RunView:
             known = getattr(system, "known_points", None)
             if known is not None:
                 stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
-            for name, colour in DRAWN.get(system.name, (None, {}))[1].items():
+            for name, colour in plotted.items():
                 stream.log(f"plots/tracking/{name}", rr.SeriesLines(colors=[colour], names=[name]), static=True)
         now, values = PathAndMap(np.zeros(1, dtype=np.int64), tracked.pose[None], tracked.cov[None]), tracked.values
         pose = now.trajectory.world_from_body[0]
@@ -99,7 +99,6 @@ class RunView:
             stream.log("world/camera/image", rr.Image(image).compress(jpeg_quality=JPEG_QUALITY))
         at = MapEstimate(np.zeros(1, dtype=int), pose[None, 4:], position_covariances(now))
         stream.log("world/uncertainty", ellipsoids(rr, at))
-        drawn, plotted = DRAWN.get(system.name, (None, ()))
         if drawn is not None:
             drawn(rr, stream, run, tracked.observed, pose)
         figures = {"filter/ess": values["ess"]} | {f"tracking/{name}": values[name] for name in plotted}
