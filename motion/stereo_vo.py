@@ -173,9 +173,7 @@ def _refined(
     if not found.converged:
         return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations"), squared
     rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
-    cov = found.cov
-    if config.points == "adjusted":
-        cov = _consistent_covariance(part, motion, found.factor)
+    cov = _consistent_covariance(part, motion, found.factor) if config.points == "adjusted" else found.cov
     if config.points != "exact":
         cov = trimming(config.gate) * cov
     return MotionEstimate(motion, cov, inliers, float(rms)), squared

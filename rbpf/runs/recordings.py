@@ -19,7 +19,7 @@ from rbpf.sensors.calibration import Board, MarkerBoard, find_board, find_marker
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog, Truth
 from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
-from rbpf.sensors.readers.images.video import LiveCamera, camera_number
+from rbpf.sensors.readers.images.video import LiveCamera
 from rbpf.sensors.readers.part import WHOLE
 from rbpf.sensors.readers.robot_log import UNNAMED
 from rbpf.systems.laser.config import LaserConfig
@@ -111,8 +111,9 @@ class MonoRecording:
 
     @property
     def live(self) -> int | None:
-        """The number of the camera whose images come as they are taken; None of a recording."""
-        return camera_number(self.images)
+        """The number of the camera whose images come as they are taken; None of a recording, also one of that name."""
+        is_number = str(self.images).isdecimal() and not self.images.exists()
+        return int(str(self.images)) if is_number else None
 
     def sequence(self) -> tuple[readers.ImageSequence | LiveCamera, readers.KnownPixels | None]:
         """The images, and the known points if there are any; errors as `open`."""

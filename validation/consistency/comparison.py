@@ -52,18 +52,14 @@ def read_comparisons(folder: Path) -> list[Comparison]:
     for path in sorted(folder.glob(f"{COMPARISON}*.json")):
         try:
             entries = json.loads(path.read_text(encoding="utf-8"))
-            comparison = Comparison(
-                str(entries["against"]),
-                str(entries["accuracy"]),
-                dict(entries["figures"]),
-                [Statistic.of_entries(item) for item in entries["statistics"]],
-                [Path(name).name for name in entries["pictures"]],
-            )
+            against, accuracy, figures = str(entries["against"]), str(entries["accuracy"]), dict(entries["figures"])
+            statistics = [Statistic.of_entries(item) for item in entries["statistics"]]
+            pictures = [Path(name).name for name in entries["pictures"]]
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
                 f"{path} is no comparison of this version of rbpf: delete it and validate again"
             ) from error
-        found.append(comparison)
+        found.append(Comparison(against, accuracy, figures, statistics, pictures))
     return found
 
 

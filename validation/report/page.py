@@ -238,8 +238,7 @@ def scene(found: RunFolder, world: plots.World) -> str:
     near, low, high = plots.near_box(mean, at)
     size = max(float((high - low).max()), 1e-3)
     traces = [_line(at, "path", "filter", 4)]
-    for name, label, positions in plots.other_paths(found, world):
-        traces.append(_line(positions, label, name, 2))
+    traces += [_line(positions, label, name, 2) for name, label, positions in plots.other_paths(found, world)]
     if (lost := plots.lost_frames(found)).any():
         traces.append(_points(at[lost], "lost", "map", 3))
     traces.append(_line(_frustums(path.world_from_body, found.system, _SIZE * size), "poses", "filter", 1))

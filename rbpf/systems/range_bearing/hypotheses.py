@@ -47,10 +47,6 @@ class Hypothesis:
         assert isinstance(held, JointMap)
         return held
 
-    def exist(self, ids: np.ndarray) -> np.ndarray:
-        """Whether landmarks (M,) more probably exist than not."""
-        return np.array([self.log_odds[name] > 0.0 for name in ids.tolist()], dtype=bool)
-
     def copied(self) -> "Hypothesis":
         """Another one that begins as this one is; generator, motion and sensors are theirs together."""
         shared = self.filter.rng, self.filter.motion, self.filter.space, *self.filter.sensors, *self.chosen

@@ -191,7 +191,8 @@ class RangeBearingSlam(System):
         found = estimate_map(self.filter)
         if self.hypotheses is None:
             return found
-        held = self.hypotheses.held[0].exist(found.ids)
+        # Landmarks that more probably exist than not.
+        held = np.array([self.hypotheses.held[0].log_odds[name] > 0.0 for name in found.ids.tolist()], dtype=bool)
         return MapEstimate(found.ids[held], found.mean[held], found.cov[held])
 
     def measurements(self, name: str, log: FrameLog) -> Measurements:

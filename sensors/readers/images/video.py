@@ -171,11 +171,6 @@ def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[tuple[str, G
     return len(chosen), images()
 
 
-def camera_number(path: Path) -> int | None:
-    """The number of a camera, where a recording is given as one and no file has that name."""
-    return int(str(path)) if str(path).isdecimal() and not path.exists() else None
-
-
 @final
 class LiveCamera:
     """The images of an attached camera, each the newest one when it is asked for.
