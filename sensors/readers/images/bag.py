@@ -41,7 +41,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import Grey, decode, decode_ahead, frame_of, require_shape, to_grey
-from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
+from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, truth_between
 from rbpf.sensors.readers.images.rectification import pair_stamps, rectified
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
@@ -391,14 +391,14 @@ class RosBag(ImageFormat):
             raise InputError(f"{where}: {problem}; {action}.")
         if left.is_rectified:
             return replace(sequence, baseline_m=apart_m)
+
+        def turn(info: CameraInfo) -> Array:
+            wrong = InputError(f"{info.calibration.where}: R is no rotation; calibrate the two as a pair.")
+            return pose_of_matrix(np.column_stack([info.rotation, np.zeros(3)]), lambda _: wrong)
+
         # The right camera in the frame of the left one, by way of the rectified frames.
-        aside, turns = np.array([0.0, 0.0, 0.0, 1.0, apart_m, 0.0, 0.0]), []
-        for info in infos:
-            turn = np.column_stack([info.rotation, np.zeros(3)])
-            if not np.isfinite(turn).all() or rigid_motion_error(turn):
-                raise InputError(f"{info.calibration.where}: R is no rotation; calibrate the two as a pair.")
-            turns.append(pose_of_matrix(turn))
-        left_from_right = SE3.compose(SE3.inverse(turns[0]), SE3.compose(aside, turns[1]))
+        aside = np.array([0.0, 0.0, 0.0, 1.0, apart_m, 0.0, 0.0])
+        left_from_right = SE3.compose(SE3.inverse(turn(left)), SE3.compose(aside, turn(right)))
         note = f"{path}: the two cameras are not rectified; their images are, by the two CameraInfo."
         return rectified(sequence, right.calibration.camera, left_from_right, where, note)
 

@@ -27,7 +27,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients, read_calibration
 from rbpf.sensors.readers.images.decoding import FileImages, first_shape
-from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
+from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, truth_between
 from rbpf.sensors.readers.images.rectification import pair_stamps, rectified
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import read_stamped
@@ -125,7 +125,4 @@ def _read_truth(mav: Path, body_from_camera: Array, images_ns: np.ndarray) -> Tr
 def _mount(value: YamlValue) -> Array:
     """body_from_sensor (7,) of a T_BS."""
     numbers = [item.number() for item in value.entries(["data"])["data"].items(16)]
-    matrix = np.reshape(numbers, (4, 4))
-    if (problem := rigid_motion_error(matrix)) is not None:
-        raise value.error(f"T_BS: {problem}")
-    return pose_of_matrix(matrix)
+    return pose_of_matrix(np.reshape(numbers, (4, 4)), lambda problem: value.error(f"T_BS: {problem}"))

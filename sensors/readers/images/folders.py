@@ -49,7 +49,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import NAME, Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
-from rbpf.sensors.readers.images.poses import TUM_POSE, normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
+from rbpf.sensors.readers.images.poses import TUM_POSE, normalised, pose_of_matrix, read_tum_truth
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import numbered_lines, parse_table, quoted, read_stamped, read_text, require_seconds
 
@@ -203,6 +203,4 @@ def _scenes_pose(path: Path) -> Array | None:
         raise InputError(f"{path}: expected 16 numbers, found {len(matrix)}.")
     if not np.isfinite(matrix).all():
         return None
-    if (problem := rigid_motion_error(matrix.reshape(4, 4))) is not None:
-        raise InputError(f"{path}: {problem}.")
-    return pose_of_matrix(matrix.reshape(4, 4))
+    return pose_of_matrix(matrix.reshape(4, 4), lambda problem: InputError(f"{path}: {problem}."))

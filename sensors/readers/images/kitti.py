@@ -11,6 +11,7 @@ between others is a frame without an image.
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import final
 
@@ -22,7 +23,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
-from rbpf.sensors.readers.images.poses import pose_of_matrix, rigid_motion_error
+from rbpf.sensors.readers.images.poses import pose_of_matrix
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import line_error, parse_number, read_columns, read_stamped, read_text, require_seconds
 
@@ -93,11 +94,9 @@ class Kitti(ImageFormat):
             if len(table.lines) != count:
                 problem = f"expected {count} poses, one per time in times.txt, found {len(table.lines)}"
                 raise InputError(f"{file}: {problem}; copy both from one sequence.")
-            matrices = table.values.reshape(-1, 3, 4)
-            for row, matrix in enumerate(matrices):
-                if (wrong := rigid_motion_error(matrix)) is not None:
-                    raise table.error(row, wrong)
-            truth = Truth(rows.stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
+            matrices = enumerate(table.values.reshape(-1, 3, 4))
+            poses = np.array([pose_of_matrix(matrix, partial(table.error, row)) for row, matrix in matrices])
+            truth = Truth(rows.stamps_ns, SE3.compose(poses, first_from_camera))
             break
         source = FileImages(rows.stamps_ns, shape, *files)
         return ImageSequence(folder.name, used.camera, rows.stamps_ns, truth, baseline_m, source, notes)

@@ -16,18 +16,13 @@ LONGEST = 0.01  #: How far a quaternion's length may be from 1 in a file; it is 
 TUM_POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")  #: Of a pose, m, behind its time in seconds.
 
 
-def rigid_motion_error(matrix: Array) -> str | None:
-    """What a matrix (3, 4) or (4, 4) lacks to be a rigid motion; None where it is one."""
+def pose_of_matrix(matrix: Array, error: Callable[[str], InputError]) -> Array:
+    """Pose (7,) of a rigid motion (3, 4) or (4, 4), its rotation made exact; `error` says where a matrix is that is none."""
     rotation = matrix[:3, :3]
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > SKEWED or np.linalg.det(rotation) < 0.0:
-        return "expected a rotation in the first three rows and columns, found a matrix that is none"
+    if not (np.abs(rotation.T @ rotation - np.eye(3)).max() <= SKEWED and np.linalg.det(rotation) > 0.0):
+        raise error("expected a rotation in the first three rows and columns, found a matrix that is none")
     if len(matrix) == 4 and np.any(matrix[3] != [0.0, 0.0, 0.0, 1.0]):
-        return "expected the last row of the matrix to be 0 0 0 1"
-    return None
-
-
-def pose_of_matrix(matrix: Array) -> Array:
-    """Pose (..., 7) of a rigid motion (..., 3, 4) or (..., 4, 4); its rotation is made exact."""
+        raise error("expected the last row of the matrix to be 0 0 0 1")
     return SE3.normalise(SE3.from_matrix(matrix))
 
 
