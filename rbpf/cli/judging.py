@@ -119,6 +119,11 @@ class Export(Printed):
         answer({"files": paths}, self.json, *(f"wrote {path}" for path in paths))
 
 
+def _require_workers(workers: int) -> None:
+    if workers == 0:
+        raise InputError("--workers must be at least 1, or -1 for one per core, got 0")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Printed):
     """Run particles × seeds × sequences × options in parallel, to one table; call it again to go on."""
@@ -133,8 +138,7 @@ class Sweep(Printed):
         from rbpf.validation.sweep import TABLE, read_plan
         from rbpf.validation.sweep import sweep as run_all
 
-        if self.workers == 0 or self.workers < -1:
-            raise InputError(f"--workers must be at least 1, or -1 for one per core, got {self.workers}")
+        _require_workers(self.workers)
         jobs = read_plan(self.config)
         with progress() as bar:
             rows = run_all(jobs, self.out, self.workers, self.scheduler, bar("running"))
@@ -158,6 +162,7 @@ class Compare(Printed):
     def __call__(self) -> None:
         from rbpf.validation.consistency.model_comparison import compare_runs
 
+        _require_workers(self.workers)
         a, b = self.run_a, self.run_b
         with progress() as bar:
             found = compare_runs(a, b, self.seeds, self.workers, bar("filtering"))

@@ -75,11 +75,11 @@ def test_only_a_run_that_fails_is_told_of_resume(monkeypatch, capsys):
     assert "--resume goes on" in capsys.readouterr().err
 
 
-def test_no_threads_at_all_are_refused():
-    """In a process of its own: Numba cannot even be imported with them."""
-    environment = {**os.environ, "NUMBA_NUM_THREADS": "0"}
+def test_no_threads_and_no_workers_at_all_are_refused(capsys):
+    """Threads in a process of its own: Numba cannot even be imported with none."""
+    assert main(["compare", "x", "y", "--workers", "0"]) == 2 and "--workers must be" in capsys.readouterr().err
     words = [sys.executable, "-m", "rbpf", "report", "x"]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, env={**os.environ, "NUMBA_NUM_THREADS": "0"}, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr == "rbpf: the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got '0'\n"
 
