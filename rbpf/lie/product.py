@@ -110,16 +110,12 @@ class Finite(Commutative):
 
 @final
 class Product(LieGroup):
-    """G_1 x G_2 x ...: storages and tangents follow one another in the order of the factors.
-
-    Attributes:
-        groups: The factors, at least one.
-    """
+    """G_1 x G_2 x ...: storages and tangents follow one another in the order of the factors."""
 
     def __init__(self, *groups: LieGroup) -> None:
         if not groups:
             raise InputError("Product(*groups) needs at least one group, got none.")
-        self.groups = groups
+        self.groups = groups  #: The factors, at least one.
         self.size = sum(group.size for group in groups)
         self.dim = sum(group.dim for group in groups)
         self._storage = _slices([group.size for group in groups])

@@ -26,7 +26,6 @@ from rbpf.lie import Array
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.consistency.comparison import RESIDUALS, Comparison, distance
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
 from rbpf.validation.gtsam.batch_problem import OnIteration, Optimum, Problem, fit_of, floats_in_scale, solve_problem
@@ -165,9 +164,7 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
         if residuals > 0 and not (isinstance(likelihood, dict) and likelihood.get("kind") == "outliers"):
             value = 2.0 * found.optimum.error / residuals
             statistics.insert(0, variance_ratio(RESIDUALS, value, residuals, NOISE_FACTOR))
-        batch = found.optimum.estimate
-        start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
-        draws = draw_posterior(problem, start, np.random.default_rng(0), DRAWS)
+        draws = draw_posterior(problem, found.optimum.start, np.random.default_rng(0), DRAWS)
         names = "log_evidence_batch", "log_evidence_batch_error", "posterior_draws_ess"
         values = draws.log_evidence, draws.error, draws.ess
         figures |= {name: value for name, value in zip(names, values, strict=True) if np.isfinite(value)}

@@ -29,7 +29,6 @@ from rbpf.runs.recordings import RobotRecording, filter_features, filter_opened,
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import Part, RobotLog
-from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
@@ -192,9 +191,8 @@ def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
     if not isinstance(run.system.likelihood, Gaussian):
         return []
     problem = run.system.measurements(run.name, run.log)
-    batch = solve_problem(problem, run.log.poses, marginals=False).estimate
-    start = InitialEstimate(batch.world_from_body, batch.landmarks.named())
-    draws = draw_posterior(problem, start, np.random.default_rng(0))
+    optimum = solve_problem(problem, run.log.poses, marginals=False)
+    draws = draw_posterior(problem, optimum.start, np.random.default_rng(0))
     logs = np.array_split(draws.log_ratio, parts)
     return [float(np.logaddexp.reduce(part) - np.log(part.size)) for part in logs]
 

@@ -52,6 +52,11 @@ class Optimum:
     steps: NDArray[np.intp]  #: (B,) steps of the run that took part, one per pose.
     error: float  #: half the sum of squared whitened residuals, or the sum of their robust losses.
 
+    @property
+    def start(self) -> InitialEstimate:
+        """Where a further solver starts."""
+        return InitialEstimate(self.estimate.world_from_body, self.estimate.landmarks.named())
+
 
 def floats_in_scale(problem: Problem) -> bool:
     """Whether nothing in the measurements tells the scale: one camera and no known points."""

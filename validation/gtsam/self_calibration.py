@@ -15,7 +15,6 @@ from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME, camera_text
-from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam.batch_problem import Optimum, softened, solve_problem
 from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, CameraState, adjust, begin
 from rbpf.validation.gtsam.observations import HUBER, Residuals, known_by_name, observation_table, reprojection
@@ -65,10 +64,10 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None 
 
 def camera_problem(log: FeatureLog, batch: Optimum) -> tuple[CameraProblem, CameraState]:
     """The problem of a log that is the batch's or nearly so, and the optimum there."""
-    full, path = observation_table(log), batch.estimate.world_from_body
+    full = observation_table(log)
     known = known_by_name(softened(log.known), full.names)
-    problem = CameraProblem(log.name, len(path), full.determined(known), known, HUBER)
-    return problem, begin(problem, InitialEstimate(path, batch.estimate.landmarks.named()))
+    problem = CameraProblem(log.name, len(batch.steps), full.determined(known), known, HUBER)
+    return problem, begin(problem, batch.start)
 
 
 def with_camera(problem: CameraProblem, camera: Pinhole, key: int) -> list[Any]:

@@ -28,7 +28,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
+from rbpf.sensors.readers.measurements import Measurements, initial_estimate
 from rbpf.validation.gtsam import solvers
 from rbpf.validation.gtsam.batch_problem import Optimum
 from rbpf.validation.gtsam.camera import SOFT_SCALE
@@ -139,8 +139,7 @@ def _of_robot(m: Measurements, batch: Optimum) -> list[Measured]:
     factor = solvers.together(evaluate)
     for step in range(len(m.stamps_ns)):
         problem.add_step(graph, step, True, lambda row, keys, noise: factor(row, [*keys, _KEY], noise))
-    optimum = InitialEstimate(batch.estimate.world_from_body, batch.estimate.landmarks.named())
-    values, calm = problem.values(optimum), problem.values(initial_estimate(m))
+    values, calm = problem.values(batch.start), problem.values(initial_estimate(m))
     for one in (values, calm):
         one.insert(_KEY, np.zeros(m.space.dim + 1))
     change, *stds = _moved(graph, values, problem.pose_keys[:1], max)

@@ -108,8 +108,7 @@ def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarra
 def cast(rectangles: Sequence[Rectangle], world_from_camera: Array, uv: Array) -> tuple[np.ndarray, np.ndarray]:
     """What single rays (u, v) (K, 2) meet first: the same as a whole picture's depth, for a few pixels.
 
-    Returns:
-        Depth z (K,) in the camera's frame [m], infinite where there is nothing; row (K,) of the rectangle, then -1.
+    Depth z (K,) in the camera's frame [m], infinite where there is nothing; row (K,) of the rectangle, then -1.
     """
     ray = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
     s, t, w = np.moveaxis(rays_to_sides(sides(rectangles), world_from_camera) @ ray.T, 1, 0)

@@ -80,9 +80,6 @@ class Hypotheses:
         model: how measurements arise.
         config: of association.
         keep: remember every association.
-
-    Attributes:
-        held: the hypotheses.
     """
 
     def __init__(self, filter_: Filter, model: RigidPointModel, config: AssociationConfig, keep: bool = False) -> None:

@@ -97,14 +97,8 @@ class RectifiedImages(Source):
 def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, where: str, note: str) -> ImageSequence:
     """The pairs of a sequence of the left camera rectified, and its truth; its images as they are where they are that.
 
-    Args:
-        sequence: pairs of images.
-        right: the second camera.
-        left_from_right: (7,) where it is.
-        where: its calibration, for messages.
-        note: what is said if images are rectified.
-
-    Raises InputError: the right camera is not to the right of the left one.
+    The second camera is at `left_from_right` (7,); `where` its calibration stands is for messages, and the `note` is what is
+    said if images are rectified. Raises InputError: the right camera is not to the right of the left one.
     """
     # They are a rectified pair already if both have one size and one set of intrinsics, no distortion and equal axes, and
     # the right one lies to the right of the left one along the rows.

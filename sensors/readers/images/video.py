@@ -87,13 +87,10 @@ class VideoImages(Source):
 
 
 def read_header(path: Path) -> tuple[np.ndarray, tuple[int, int], int]:
-    """What a video says of itself.
+    """What a video says of itself: times (T,) int64 ns of its images, from 0; height and width of the first; and a turn.
 
-    Returns:
-        Times (T,) int64 ns of its images, from 0; height and width of the first; quarters of a turn, clockwise, by which the
-        stored images are turned.
-
-    Raises InputError: it cannot be opened, or no image of it can be decoded.
+    By so many quarters, clockwise, the stored images are turned. Raises InputError: it cannot be opened, or no image of it
+    can be decoded.
     """
     import cv2
 
