@@ -168,7 +168,6 @@ def _checked(estimate_points: ArrayLike, reference_points: ArrayLike) -> tuple[A
 
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-NS_PER_S = 1_000_000_000
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -183,7 +182,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
     lines = ["# " + " ".join(TUM_COLUMNS)]
     for stamp_ns, pose in rows:
-        seconds, fraction = divmod(abs(stamp_ns), NS_PER_S)
+        seconds, fraction = divmod(abs(stamp_ns), 10**9)
         stamp = f"{'-' if stamp_ns < 0 else ''}{seconds}.{fraction:09d}"
         lines.append(" ".join([stamp, *map(repr, pose[4:]), *map(repr, pose[:4])]))
     write_text(path, "\n".join(lines) + "\n")
