@@ -24,6 +24,7 @@ class SE2Group(LieGroup):
 
     size = 3
     dim = 3
+    point_dim = 2  #: Coordinates of a point, D.
 
     def __repr__(self) -> str:
         return "SE2"

@@ -16,6 +16,7 @@ class SE3Group(LieGroup):
 
     size = 7
     dim = 6
+    point_dim = 3  #: Coordinates of a point, D.
 
     def __repr__(self) -> str:
         return "SE3"

@@ -19,7 +19,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.sensors.camera import LENSES, Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.readers.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
+from rbpf.sensors.readers.measurements import KINDS, Measurements, are_covariances, are_poses
 from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_lines
 
 OBSERVATIONS = "observations.csv"
@@ -130,7 +130,7 @@ def _read_robot(folder: Path, seen: "_Table") -> Measurements:
     inside = (steps >= 0) & (steps < len(stamps))
     seen.require(inside, f"a step from 0 to {len(stamps) - 1}, the last one in {ODOMETRY}")
     seen.require(stamp == stamps[steps], f"the stamp that {ODOMETRY} gives this step")
-    p = point_dim(space)
+    p = space.point_dim
     cov_z = gaussian.unpack(numbers[:, p:], p)
     seen.require(are_covariances(cov_z), _COVARIANCE)
     return Measurements(
@@ -195,7 +195,7 @@ def _read_pose(table: "_Table", key: str, space: SE2Group | SE3Group) -> Array:
 
 
 def _axes(space: SE2Group | SE3Group) -> list[str]:
-    return [f"z{i}" for i in range(point_dim(space))]
+    return [f"z{i}" for i in range(space.point_dim)]
 
 
 def _observed(measured: list[str]) -> list[str]:

@@ -59,8 +59,7 @@ def truth_at(space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray, ga
     rows, poses = poses_at(space, truth.stamps_ns, truth.poses, stamps_ns)
     if rows.size < LEAST:
         return None
-    dim = 2 if isinstance(space, SE2Group) else 3
-    landmarks = {name: np.asarray(point, dtype=float)[:dim] for name, point in truth.landmarks.items()}
+    landmarks = {name: np.asarray(point, dtype=float)[: space.point_dim] for name, point in truth.landmarks.items()}
     if gauge != "first frame":
         return RunTruth(rows, poses, landmarks, _ALIGNMENTS[gauge])
     if rows[0] != 0:

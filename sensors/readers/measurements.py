@@ -49,7 +49,8 @@ class Measurements:
         if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
             expected = f"a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1"
             raise InputError(f"Expected {expected}, found {self.measurement!r} and {self.pitch_sign!r}.")
-        dim, point, poses = self.space.dim, point_dim(self.space), partial(elements, self.space)
+        # A measurement has as many numbers as a landmark has coordinates.
+        dim, point, poses = self.space.dim, self.space.point_dim, partial(elements, self.space)
         schema = {
             "robot_from_sensor": poses(),
             "start": poses(),
@@ -90,11 +91,6 @@ def initial_estimate(m: Measurements) -> InitialEstimate:
     rows = by_step[first]
     points = model.invert(path[m.steps[rows]], m.z[rows])
     return InitialEstimate(path, dict(zip(names.tolist(), points, strict=True)))
-
-
-def point_dim(space: SE2Group | SE3Group) -> int:
-    """Coordinates of a landmark, D, which is also how many numbers one measurement has, p."""
-    return 2 if isinstance(space, SE2Group) else 3
 
 
 def are_covariances(cov: Array) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_vo import MotionPrior
 from rbpf.runs.trajectory import align
 from rbpf.sensors.readers import RobotLog, open_log
-from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measurements, initial_estimate, point_dim
+from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measurements, initial_estimate
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
 from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
@@ -146,7 +146,7 @@ def test_the_evidence_of_a_recording_does_not_hang_on_the_seed(data_dir, folder,
 
 def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
     """All measurements of a log; landmarks keep the log's names. It starts at the origin, if nothing else is given."""
-    space, point = log.space, point_dim(log.space)
+    space, point = log.space, log.space.point_dim
 
     def stacked(field: str, shape: tuple[int, ...]) -> Array:
         return np.concatenate([np.reshape(getattr(frame, field), (-1, *shape)) for frame in log.frames])

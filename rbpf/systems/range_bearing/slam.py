@@ -69,7 +69,7 @@ class RangeBearingSlam(System):
         else:
             view = np.deg2rad(unknown.half_field_of_view_deg)
             self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
-        self.point = Point(2 if isinstance(space, SE2Group) else 3)
+        self.point = Point(space.point_dim)
         self.kept_map, self.why_map = config.kept_map()
         is_joint, is_unnamed = self.kept_map == "joint", config.association == "ml"
         if is_unnamed and not is_joint:
