@@ -41,6 +41,7 @@ from rbpf.core.models import (
 )
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
+from rbpf.kernels.dense import principal
 from rbpf.kernels.landmarks import expect_group
 from rbpf.lie import Array, Euclidean, LieGroup, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
@@ -166,6 +167,7 @@ class JointMap(Map):
     def _leave_step(self) -> None:
         self._in_step = False  # from prediction to correction: what is observed is associated with what is held
         self._gain: np.ndarray | None = None
+        self._rest: np.ndarray | None = None
         self._reading: Reading | None = None  # of what is observed in this step
 
     def presume(self, prior: Constants) -> None:
@@ -218,7 +220,7 @@ class JointMap(Map):
         known = values > SINGULAR * values[-1]
         root = vectors[:, known] / np.sqrt(values[known])
         half = cross @ root
-        self._gain, self._rest = half @ root.T, plus_gram(cov, half.T, -1.0)
+        self._gain, self._rest, self._before = half @ root.T, None, (cov, half)
         factor = gaussian.psd_factor(increment)[None]
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
@@ -463,7 +465,14 @@ class JointMap(Map):
         """Means (N, n) given increments (N, d), and the covariance; a substate has been seen through the increment."""
         if self._gain is None or increment is None:
             return self.mean, self.cov
-        return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
+        return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._left()
+
+    def _left(self) -> np.ndarray:
+        """The covariance (n, n) given increments, made when it is asked for: `expected` does without."""
+        if self._rest is None:
+            cov, half = self._before
+            self._rest = plus_gram(cov.copy(), half.T, -1.0)
+        return self._rest
 
     def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> Rows:
         if self._reading is None or not self._reading.is_of(self.held, cov, groups):
@@ -529,10 +538,11 @@ class JointMap(Map):
             if not new_landmarks.landmark.anchored:
                 centre, middle = self.space.mean(state, np.full(self.n, 1.0 / self.n)), records.mean.mean(axis=0)
                 slope = np.linalg.solve(new_landmarks.landmark.seen_from(self.space, centre, middle)[1], slope)
-            columns, by_own = self.held.of_one_kind(ids).columns.ravel(), slope.reshape(-1, slope.shape[-1])
-            self.mean[:, columns] += (self.mean[:, own] - model.about) @ by_own.T
-            self.cov[columns] += by_own @ self.cov[own]
-            self.cov[:, columns] += self.cov[:, own] @ by_own.T
+            by_own = slope.reshape(-1, slope.shape[-1])
+            last = slice(len(self.cov) - len(by_own), None)  # where they are
+            self.mean[:, last] += (self.mean[:, own] - model.about) @ by_own.T
+            self.cov[last] += by_own @ self.cov[own]
+            self.cov[:, last] += self.cov[:, own] @ by_own.T
         return ids
 
     def add_records(
@@ -565,8 +575,8 @@ class JointMap(Map):
                 f"a joint map holds at most {most} landmarks: keep maps of the particles' own (map=particles)"
             )
         self.mean = np.concatenate([self.mean, places.reshape(self.n, -1), mean], axis=1)
-        cov = np.zeros((grown, grown))
-        cov[:old, :old] = self.cov
+        cov = np.empty((grown, grown))
+        cov[:old, :old], cov[old:], cov[:old, old:] = self.cov, 0.0, 0.0
         columns = self.held.add(ids, landmark, clone, origins)
         cov[columns[:, :, None], columns[:, None, :]] = records.cov.mean(axis=0)
         self.cov = cov
@@ -598,7 +608,7 @@ class JointMap(Map):
             self._keep(self.held.drop(self.held.rows_of(ids)))
 
     def _keep(self, columns: np.ndarray) -> None:
-        self.mean, self.cov = self.mean[:, columns], self.cov.take(columns, axis=0).take(columns, axis=1)
+        self.mean, self.cov = self.mean[:, columns], principal(self.cov, columns)
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
         """Turns anchored landmarks into points of the frame: with all that they are correlated with, to first order.
@@ -629,7 +639,7 @@ class JointMap(Map):
         """Landmarks (K,) may have moved by as much, covariance (K, D, D), in the frame: each by itself."""
         columns = self.held.of_one_kind(ids).columns
         self.cov = self.cov.copy()
-        for held in [self.cov] if self._gain is None else [self.cov, self._rest]:
+        for held in [self.cov] if self._gain is None else [self.cov, self._left()]:
             held[columns[:, :, None], columns[:, None, :]] += cov
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
@@ -669,7 +679,7 @@ class JointMap(Map):
         return mean, diagonal_blocks(cov, np.arange(mean.size).reshape(mean.shape))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "next": np.array([self._next_id])}
+        named = {"mean": self.mean, "cov": self.cov.copy(), "origin": self.origin, "next": np.array([self._next_id])}
         named = {f"joint/{name}": array for name, array in (named | self.held.arrays()).items()}
         if self.submap is None:
             return named

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
+from rbpf.kernels.dense import add_principal
+
 
 class Clique(NamedTuple):
     """Columns (o,) that are eliminated, later ones (s,) that hang on them, blocks that begin here, the next clique or -1."""
@@ -75,7 +77,7 @@ class Elimination:
             place[every] = np.arange(every.size)
             front = np.zeros((every.size, every.size))
             for columns, summand in [(blocks[block], summands[block]) for block in clique.blocks] + theirs:
-                front[np.ix_(place[columns], place[columns])] += summand
+                add_principal(front, place[columns], summand)
             theirs.clear()
             lower = cholesky(front[:o, :o], lower=True, check_finite=False)
             if not np.isfinite(np.diagonal(lower)).all():

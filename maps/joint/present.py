@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from rbpf import gaussian
+from rbpf.kernels.dense import principal
 from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.rows import diagonal_blocks
 from rbpf.maps.joint.solution import Given, SubMap
@@ -36,7 +37,7 @@ class Present:
             self.origin,
             points,
             self.mean[columns],
-            self.cov[np.ix_(used, used)],
+            principal(self.cov, used),
             given=old.given(given),
             constants=self.mean[d : d + k],
             known=old.known,
@@ -54,7 +55,7 @@ class Present:
         count = -(-driving // dim)
         names = -1 - np.arange(count) - count * len(old.maps)
         taken = np.append(np.arange(self.mean.size), np.arange(d, held.first))
-        self.mean, self.cov = self.mean[taken], self.cov[np.ix_(taken, taken)]
+        self.mean, self.cov = self.mean[taken], principal(self.cov, taken)
         if more := count * dim - driving:
             self.mean, self.cov = np.pad(self.mean, (0, more)), np.pad(self.cov, ((0, more), (0, more)))
             self.cov[-more:, -more:] = np.eye(more)
@@ -62,14 +63,14 @@ class Present:
         ended = self.finished(old)
         old.join(ended if seen is None else ended.seeing(seen), wanted is not None, wanted)
         columns = held.drop(held.rows_of(np.append(leaving, seams)))
-        self.mean, self.cov = self.mean[columns], self.cov.take(columns, axis=0).take(columns, axis=1)
+        self.mean, self.cov = self.mean[columns], principal(self.cov, columns)
         self.origin = held.space.identity()
         self.mean[:d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0
         self.given = held.table.ids[held.table.kind == 0]
         if (known := old.given(self.given)) is not None:
             # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
             columns = held.of_one_kind(known.ids).columns.ravel()
-            own, off = self.cov[np.ix_(columns, columns)], known.points.ravel() - self.mean[columns]
+            own, off = principal(self.cov, columns), known.points.ravel() - self.mean[columns]
             if off.any() or not np.array_equal(known.cov, own):  # mostly they say the same
                 gain = np.linalg.solve(own, self.cov[columns]).T
                 self.mean = self.mean + gain @ off

@@ -7,6 +7,7 @@ from scipy.linalg import LinAlgError, block_diag
 
 from rbpf import gaussian
 from rbpf.errors import InputError
+from rbpf.kernels.dense import principal
 from rbpf.lie import Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.elimination import Elimination, cliques_of
 
@@ -100,7 +101,7 @@ class SubMap(NamedTuple):
     def of(self, rows: np.ndarray) -> "SubMap":
         """Without its other landmarks."""
         columns = self.columns(rows)
-        return self._replace(ids=self.ids[rows], points=self.points[rows], cov=self.cov[np.ix_(columns, columns)])
+        return self._replace(ids=self.ids[rows], points=self.points[rows], cov=principal(self.cov, columns))
 
     def seeing(self, seen: Given) -> "SubMap":
         """With landmarks that are seen from its end besides."""
@@ -121,14 +122,25 @@ def inverse_of(cov: np.ndarray) -> np.ndarray:
 class Factor(NamedTuple):
     """What a sub-map says of starts and landmarks in `columns` (c,): a residual (r,), its information and slope (r, c).
 
-    `own` (r,) are the columns of the sub-map's Gaussian that it is of.
+    `own` (r,) are the columns of the sub-map's Gaussian that it is of. The slope is `by_ends` (r, 2d), then Rᵀ for each of the
+    landmarks' `rows`, and 1 for constants.
     """
 
     own: np.ndarray
     columns: np.ndarray
     info: np.ndarray
     residual: np.ndarray
-    slope: np.ndarray
+    by_ends: np.ndarray
+    rotation: np.ndarray
+    rows: slice
+
+    def through(self, left: np.ndarray) -> np.ndarray:
+        """(m, r) times the slope."""
+        out = np.concatenate([left @ self.by_ends, left[:, self.rows.start :]], axis=1)
+        turned = left[:, self.rows].reshape(len(left), -1, len(self.rotation)) @ self.rotation.T
+        first = self.by_ends.shape[1]
+        out[:, first : first + turned[0].size] = turned.reshape(len(left), -1)
+        return out
 
 
 class Solution(NamedTuple):
@@ -185,7 +197,7 @@ def solve(
         at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
         columns = np.append(columns, common)
-        cov = each.cov[np.ix_(own, own)]
+        cov = principal(each.cov, own)
         if each.given is not None:
             # A short one may know what drives the motion exactly from its start.
             cov = cov + EXACT**2 * np.eye(len(cov))
@@ -222,14 +234,14 @@ def solve(
             by_ends[:d, :d] = -back @ space.adjoint(space.inverse(between))
             by_ends[:d, d:] = back
             by_ends[d : d + seen.size, d:] = -space.transform_jacobian(seen).reshape(-1, d)
-            slope, half, product = _weighed(info, by_ends, space.rotation(end), d, k)
+            half, product = _weighed(info, by_ends, space.rotation(end), d, k)
             summands.append(product)
             gradient[columns] += half @ residual  # columns below zero fall behind the end
-            factors.append(Factor(own, columns, info, residual, slope))
+            factors.append(Factor(own, columns, info, residual, by_ends, space.rotation(end), slice(d, d + seen.size)))
         for number, points, at, columns, info in taken:
             seen = space.inverse_transform(starts[number], world[at])
             by_start = -space.transform_jacobian(seen).reshape(-1, d)
-            _, half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0, 0)
+            half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0, 0)
             summands.append(product)
             gradient[columns] += half @ (seen - points).ravel()
         summands.append(-known)
@@ -252,23 +264,20 @@ def solve(
 
 def _weighed(
     info: np.ndarray, by_poses: np.ndarray, rotation: np.ndarray, first: int, k: int
-) -> tuple[np.ndarray, ...]:
-    """A slope J, Jᵀ I and Jᵀ I J of a residual whose information is I (r, r), at the work of their entries.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jᵀ I and Jᵀ I J of a residual of slope J whose information is I (r, r), at the work of their entries.
 
     J has columns of poses (r, c), then those of landmarks, each with Rᵀ in rows of its own from the `first` on, then those
     of k constants, each with 1 in one of the last rows.
     """
-    rows, poses, dim = len(info), by_poses.shape[1], len(rotation)
+    rows, dim = len(info), len(rotation)
     last = rows - k
     count = (last - first) // dim
-    slope = np.concatenate([by_poses, np.zeros((rows, last - first + k))], axis=1)
-    slope[first:last, poses : poses + last - first] = np.kron(np.eye(count), rotation.T)
-    slope[last:, poses + last - first :] = np.eye(k)
     by_points = (rotation @ info[first:last].reshape(count, dim, rows)).reshape(count * dim, rows)
     half = np.concatenate([by_poses.T @ info, by_points, info[last:]])
     turned = half[:, first:last].reshape(len(half), count, dim) @ rotation.T
     turned = turned.reshape(len(half), count * dim)
-    return slope, half, np.concatenate([half @ by_poses, turned, half[:, last:]], axis=1)
+    return half, np.concatenate([half @ by_poses, turned, half[:, last:]], axis=1)
 
 
 def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:

@@ -20,8 +20,10 @@ from rbpf import gaussian
 from rbpf.core import checkpoint
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
+from rbpf.kernels.dense import principal
 from rbpf.lie import Array, Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
+from rbpf.maps.joint.rows import plus_gram
 from rbpf.maps.joint.solution import (
     EXACT,
     ITERATIONS,
@@ -63,11 +65,12 @@ class Beside(NamedTuple):
 
 
 class _Tied(NamedTuple):
-    """Start, landmarks about it, new end and landmarks: their mean, and covariance before they are one, less halfᵀ half after.
+    """Start, landmarks `about` it, new end and landmarks: mean, and covariance before they are one, less halfᵀ half after.
 
-    `mine` are the landmarks about the start that the new map has, too.
+    Those about the start that were given to the new map are left out: it has them. It has those by number `mine`, too.
     """
 
+    about: SubMap
     mean: np.ndarray
     cov: np.ndarray
     half: np.ndarray
@@ -167,9 +170,9 @@ class SubMaps:
         if not self.unnamed:
             return
         # The old landmarks about the end of the present sub-map, by all that is known.
-        x, cov, half, mine = tied = self._tied(present)
-        own = slice(self.space.dim * 2 + self.dim * self.about.ids.size, len(x))
-        others = np.setdiff1d(np.arange(self.about.ids.size), mine)
+        about, x, cov, half, mine = tied = self._tied(present)
+        own = slice(self.space.dim * 2 + self.dim * about.ids.size, len(x))
+        others = np.setdiff1d(np.arange(about.ids.size), mine)
         seen, of_others = self._seen_from_end(tied, present, others)
         # Rows of the joint covariance, then what of it goes with the present landmarks.
         rows, halves = of_others(cov), of_others(half.T)
@@ -178,7 +181,7 @@ class SubMaps:
         spread = cov[own, own] - half[:, own].T @ half[:, own] + EXACT**2 * np.eye(own.stop - own.start)
         slope = cross @ inverse_of(gaussian.symmetrise(spread)) if present.ids.size else cross
         rest = gaussian.symmetrise(within - slope @ cross.T)
-        self.beside = Beside(self.about.ids[others], seen, present.ids, present.points, slope, rest)
+        self.beside = Beside(about.ids[others], seen, present.ids, present.points, slope, rest)
 
     def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
         """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
@@ -248,8 +251,8 @@ class SubMaps:
             # Landmarks that one of the two alone has do not move ends.
             both = copy(self)
             both.about = self.about.of(np.flatnonzero(np.isin(self.about.ids, present.ids)))
-            x, cov, half, _ = both._tied(present.of(np.flatnonzero(np.isin(present.ids, self.about.ids))))
-            ends = np.append(np.arange(d), len(both.about.cov) + np.arange(d))
+            about, x, cov, half, _ = both._tied(present.of(np.flatnonzero(np.isin(present.ids, self.about.ids))))
+            ends = np.append(np.arange(d), len(about.cov) + np.arange(d))
             x, own = x[ends], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
         end = space.retract(present.end, x[d:])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
@@ -284,10 +287,10 @@ class SubMaps:
         held = self._factor_of_given
         if held is None or held[0] is not self.about.cov or not np.array_equal(held[1], columns):
             noise = np.diag(np.append(np.full(columns.size - k, ROUNDING), np.zeros(k)))
-            own = self.about.cov[np.ix_(columns, columns)] + noise
-            self._factor_of_given = held = self.about.cov, columns, gaussian.cholesky(own)
+            own = principal(self.about.cov, columns) + noise
+            self._factor_of_given = held = self.about.cov, columns, gaussian.cholesky(own).T
         cross = self.about.cov[np.ix_(columns, rows)]
-        gain = cho_solve((held[2], True), cross, check_finite=False).T
+        gain = cho_solve((held[2], False), cross, check_finite=False).T
         theirs = new.rows(names[its])
         seen, of_points, last = new.points[theirs], gain[:, : mine.size * dim], gain[:, mine.size * dim :]
         by_points = (of_points.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)).reshape(rows.size, -1)
@@ -319,7 +322,7 @@ class SubMaps:
         And what turns rows of the Gaussian that is tied, (n, …), into theirs (KD, …).
         """
         space, d, dim = self.space, self.space.dim, self.dim
-        turned = slice(len(self.about.cov), len(self.about.cov) + d)
+        turned = slice(len(tied.about.cov), len(tied.about.cov) + d)
         end, theirs = space.retract(new.end, tied.mean[turned]), d + dim * others[:, None] + np.arange(dim)
         seen = space.inverse_transform(end, tied.mean[theirs])
         by_end = -space.transform_jacobian(seen) @ space.right_jacobian(tied.mean[turned])
@@ -380,7 +383,7 @@ class SubMaps:
             rest = each.cov[theirs[:, :, None], theirs[:, None]]
             rest = rest - np.einsum("mik,kmj->mij", gain.reshape(mine.size, dim, -1), cross.reshape(-1, mine.size, dim))
             seen = each.points[mine] + (gain @ factor.residual).reshape(-1, dim)
-            by_all = (gain @ factor.slope).reshape(mine.size, dim, -1)
+            by_all = factor.through(gain).reshape(mine.size, dim, -1)
             by_all[:, :, d : 2 * d] += space.transform_jacobian(seen)
             by_all = by_all[:, :, factor.columns >= 0]
             half = (by_all.reshape(-1, by_all.shape[2]) @ joint[number]).reshape(by_all.shape)
@@ -393,22 +396,21 @@ class SubMaps:
 
     def _tied(self, new: SubMap) -> _Tied:
         """One Kalman update by what is shared, without noise, of the Gaussians about the last start and the new end."""
-        space, d, dim = self.space, self.space.dim, self.dim
-        _, mine, its = np.intersect1d(self.about.ids, new.ids, assume_unique=True, return_indices=True)
-        first = len(self.about.cov)
+        space, d, dim, given = self.space, self.space.dim, self.dim, () if new.given is None else new.given.ids
+        left = np.flatnonzero(~np.isin(self.about.ids, given))
+        about = self.about.of(left)
+        _, mine, its = np.intersect1d(about.ids, new.ids, assume_unique=True, return_indices=True)
+        first = len(about.cov)
         size = first + len(new.cov)
-        cov = block_diag(self.about.cov, new.cov)
-        prior = np.append(self.about.mean, new.mean)
+        cov = block_diag(about.cov, new.cov)
+        prior = np.append(about.mean, new.mean)
         of_mine = d + dim * mine[:, None] + np.arange(dim)
         of_its = first + d + dim * its[:, None] + np.arange(dim)
-        if new.given is not None or self.about.constants.size:
-            moved, by_new, rest = self._followed(new, np.arange(first))
+        if new.given is not None or about.constants.size:
+            moved, by_new, rest = self._followed(new, self.about.columns(left))
             prior[:first] += moved
             cov[:first, first:] = cross = by_new @ new.cov
             cov[first:, :first], cov[:first, :first] = cross.T, gaussian.symmetrise(rest + cross @ by_new.T)
-        if new.given is not None:
-            fresh = ~np.isin(new.ids[its], new.given.ids)
-            of_mine, of_its = of_mine[fresh], of_its[fresh]
         x, half, turned = prior, np.zeros((0, size)), slice(first, first + d)
         for _ in range(ITERATIONS if of_mine.size else 0):
             # 0 = l − E Exp(ε) l′ for each landmark l that is l′ in the new one, which ends at E Exp(ε).
@@ -428,33 +430,41 @@ class SubMaps:
             step, x = np.abs(moved - x).max(), moved
             if step < CLOSE_ENOUGH:
                 break
-        return _Tied(x, cov, half, mine)
+        return _Tied(about, x, cov, half, mine)
 
     def _take(self, new: SubMap) -> None:
         """About its end: it, its landmarks, and the old ones that it has not, as far as there is room."""
         space, d, dim = self.space, self.space.dim, self.dim
-        x, cov, half, mine = tied = self._tied(new)
-        first, k = len(self.about.cov), self.about.constants.size
+        about, x, cov, half, mine = tied = self._tied(new)
+        first, k = len(about.cov), about.constants.size
         turned, points = slice(first, first + d), slice(first + d, len(x) - k)
         start, end = space.retract(self.start, x[:d]), space.retract(new.end, x[turned])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
         by_end = space.right_jacobian(x[turned])
-        others = np.setdiff1d(np.arange(self.about.ids.size), mine)
+        others = np.setdiff1d(np.arange(about.ids.size), mine)
         far = np.linalg.norm(self._seen_from_end(tied, new, others)[0], axis=1)
         kept = np.sort(np.argsort(far, kind="stable")[: max(self.most - new.ids.size, 0)])
-        others = others[kept[self.about.ids[others[kept]] >= 0]]
+        others = others[kept[about.ids[others[kept]] >= 0]]
         seen, of_others = self._seen_from_end(tied, new, others)
 
-        def of_all(rows: np.ndarray) -> np.ndarray:
-            ends = by_start @ rows[:d] + by_end @ rows[turned]
-            return np.concatenate([ends, rows[points], of_others(rows), rows[len(x) - k :]])
+        def of_moved(rows: np.ndarray) -> np.ndarray:
+            return np.concatenate([by_start @ rows[:d] + by_end @ rows[turned], of_others(rows)])
 
+        # The new map's landmarks and the constants stay what they are: the rest moves, beside them.
+        theirs = d + dim * others[:, None] + np.arange(dim)
+        columns = np.concatenate([np.arange(first, points.stop), theirs.ravel(), np.arange(points.stop, len(x))])
+        own = np.append(np.arange(d), points.stop - first + np.arange(theirs.size))
+        cov = plus_gram(cov, half, -1.0)
+        moved, cov = of_moved(cov), principal(cov, columns)
+        cov[own] = moved[:, columns]
+        cov[:, own] = cov[own].T
+        cov[np.ix_(own, own)] = gaussian.symmetrise(of_moved(moved.T))
         self.starts[-1:] = [start, space.compose(start, end)]
         self.about = self.about._replace(
             end=self.start,
-            ids=np.append(new.ids, self.about.ids[others]),
+            ids=np.append(new.ids, about.ids[others]),
             points=np.concatenate([x[points].reshape(-1, dim), seen]),
-            cov=gaussian.symmetrise(of_all(of_all(cov - half.T @ half).T)),
+            cov=cov,
             constants=x[len(x) - k :],
         )
         self._places = None

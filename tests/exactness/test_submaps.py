@@ -158,15 +158,15 @@ def test_what_is_joined_one_by_one_is_what_all_together_say(space):
     np.testing.assert_allclose(space.local(start, maps.start), 0.0, atol=1e-7)
     mine, its = (np.argsort(ids) for ids in (near, maps.about.ids[np.isin(maps.about.ids, near)]))
     np.testing.assert_allclose(points[mine], maps.about.points[np.isin(maps.about.ids, near)][its], atol=1e-7)
-    d = space.dim
+    d, (ids, _, covs) = space.dim, maps.landmarks()
     np.testing.assert_allclose(cov[:d, :d], maps.about.cov[:d, :d], rtol=1e-3, atol=1e-4 * cov.max())
     # What is told of every landmark: that of all in one system of equations, whose inverse is dense.
-    ids, _, covs = maps.landmarks()
     at = d * len(maps.maps) + maps.dim * np.arange(ids.size)[:, None] + np.arange(maps.dim)
     solution = maps._solve(ids)
     information = np.zeros((solution.eliminated.size + d,) * 2)  # columns of the first start fall behind the end
     for factor in solution.factors:
-        information[np.ix_(factor.columns, factor.columns)] += factor.slope.T @ factor.info @ factor.slope
+        slope = factor.through(np.eye(len(factor.residual)))
+        information[np.ix_(factor.columns, factor.columns)] += slope.T @ factor.info @ slope
     dense = np.linalg.inv(information[:-d, :-d])
     np.testing.assert_allclose(covs, dense[at[:, :, None], at[:, None]], rtol=1e-4, atol=1e-6 * dense.max())
 
