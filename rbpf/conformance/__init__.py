@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from rbpf.conformance import checks
-from rbpf.conformance.trial import Example, Scene, run
+from rbpf.conformance.trial import Example, Scene
 from rbpf.core.models import Conditional, Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
@@ -42,16 +42,16 @@ def check_model(
         )
     with np.errstate(all="ignore"):
         if isinstance(model, Likelihood):
-            return run(checks.likelihood_checks(model, rng))
+            return checks.run(checks.likelihood_checks(model, rng))
         if isinstance(model, Landmark):
-            return run(checks.landmark_checks(model, space, rng, example))
+            return checks.run(checks.landmark_checks(model, space, rng, example))
         if space is None:
             raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
         if isinstance(model, Conditional):
-            return run(checks.conditional_checks(model, space, rng, example))
+            return checks.run(checks.conditional_checks(model, space, rng, example))
         if isinstance(model, MotionModel):
-            return run(checks.motion_checks(model, space, rng, example))
-        return run(checks.observation_checks(model, Scene.draw(model, space, rng, example), example.landmark))
+            return checks.run(checks.motion_checks(model, space, rng, example))
+        return checks.run(checks.observation_checks(model, Scene.draw(model, space, rng, example), example.landmark))
 
 
 def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) -> list[str]:
@@ -59,7 +59,7 @@ def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) 
     belief = example.belief
     if belief is not None and belief.landmarks != sensor.part:
         example = replace(example, belief=replace(belief, landmarks=sensor.part))
-    found = run(checks.sensor_checks(sensor, example))
+    found = checks.run(checks.sensor_checks(sensor, example))
     if found or example.belief is None:
         return found
     space, findings, groups = example.belief.prior.space, list[str](), checks.groups_of(sensor, example)
