@@ -104,6 +104,5 @@ class _Search:
 
         matches = self.matches
         score, agreeing = np.empty(len(motions)), np.empty(len(motions))
-        matrices = homography(matches.camera, motions)
-        scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
+        scores(homography(matches.camera, motions), matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
         return score, agreeing / len(matches)

@@ -128,8 +128,7 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
     by_score = np.linalg.solve(cov_nu, slope)
     # K with K I Kᵀ = cov, where the estimate is its matches' alone, and K = cov in directions in which a prior has its say.
     # What the gate costs is in the covariance, not in the gains: of noise in two estimates both cut off their part.
-    cov = motion.cov if config.points == "exact" else motion.cov / trimming(config.gate)
-    root = gaussian.psd_factor(cov)
+    root = gaussian.psd_factor(motion.cov if config.points == "exact" else motion.cov / trimming(config.gate))
     values, axes = np.linalg.eigh(root.T @ np.einsum("kpa,kpb->ab", slope, by_score) @ root)
     half = root @ axes
     later = half / np.sqrt(np.maximum(values, 1.0)) @ half.T @ by_score.mT
@@ -186,8 +185,7 @@ def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
 
 
 def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:
-    nobody = np.zeros(len(matches), dtype=bool)
-    return MotionEstimate(start, np.full((6, 6), np.nan), nobody, float("nan"), why)
+    return MotionEstimate(start, np.full((6, 6), np.nan), np.zeros(len(matches), dtype=bool), float("nan"), why)
 
 
 def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Array:

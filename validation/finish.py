@@ -157,8 +157,7 @@ def _relations(record: RunFolder, file: Path) -> Comparison:
     scores = {p: relative.relation_errors(read_tum(path), known) for p, path in paths.items() if path.is_file()}
     figures = {prefix + name: value for prefix, one in scores.items() for name, value in relative.entries(one).items()}
     write_summary(record.folder, dict(record.summary) | figures)
-    said = relative.sentence(scores.get("final_", scores[""]), len(known[0]))
-    return Comparison("relations", said, figures)
+    return Comparison("relations", relative.sentence(scores.get("final_", scores[""]), len(known[0])), figures)
 
 
 def _path(record: RunFolder, file: Path) -> Comparison:

@@ -132,8 +132,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
 
 def _sequence(given: str | Mapping[str, str], fields: tuple[str, ...], folder: Path, where: str) -> Named:
     named = {"recording": given} if isinstance(given, str) else dict(given)
-    wrong = sorted(set(named) - set(fields))
-    if wrong or "recording" not in named:
+    if set(named) - set(fields) or "recording" not in named:
         raise InputError(f"{where}: a sequence has the entries {', '.join(fields)}, got {', '.join(named)}")
     paths = {name: folder / path for name, path in named.items()}
     for path in paths.values():

@@ -272,8 +272,7 @@ def tracking_figure(found: RunFolder) -> Any:
                 axes.plot(at, values[at], lw=1.0, label=name.replace("_", " "))
             axes.set(ylabel=row, ylim=(0, None))
         elif row == "ess":
-            label_ = "effective sample size"
-            axes.plot(updated, table["ess"][updated], color=COLOURS["filter"], lw=0.8, label=label_)
+            axes.plot(updated, table["ess"][updated], color=COLOURS["filter"], lw=0.8, label="effective sample size")
             limit = found.config["resampling"]["ess_threshold"] * found.config["particles"]
             axes.axhline(limit, color=COLOURS["map"], lw=0.8, ls="--", label="resampling below")
             axes.set(ylabel="particles", ylim=(0, None))

@@ -107,8 +107,7 @@ class Mrpt(Format[LogNoise, RobotLog]):
             table.require(table["pitch_rad"] == 0, "pitch_rad", "0, as the odometry is planar")
             table.require(table["std_pitch_rad"] >= 0, "std_pitch_rad", "zero or positive")
         else:
-            right = np.abs(table["pitch_rad"]) <= np.pi / 2
-            table.require(right, "pitch_rad", "in radians, within a quarter turn")
+            table.require(np.abs(table["pitch_rad"]) <= np.pi / 2, "pitch_rad", "in radians, within a quarter turn")
             std.append(robot_log.std_column(table, "std_pitch_rad", noise.std_pitch_rad))
         z = table.block("range_m", "yaw_rad" if planar else "pitch_rad")
         frames = step[-1] + 1

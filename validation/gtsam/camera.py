@@ -85,8 +85,7 @@ class CameraProblem:
         if not self.known:
             return [self.pose_keys[0]]
         exact = {name for name, (_, cov) in self.known.items() if not cov.any()}
-        pairs = zip(self.table.names.tolist(), self.point_keys, strict=True)
-        return [key for name, key in pairs if name in exact]
+        return [key for name, key in zip(self.table.names.tolist(), self.point_keys, strict=True) if name in exact]
 
     def graph(
         self,

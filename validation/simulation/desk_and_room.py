@@ -74,8 +74,7 @@ class TexturedDesk(Ranged):
         board, taken = [], []
         if self.board is not None:
             board.append(desk.board(np.array([0.0, 0.0, (self.papers + 1) * SHEET_M]), self.board, self.square_m))
-            reach = 0.5 * self.square_m * float(np.hypot(*self.board)) + BOARD_CLEAR_M
-            taken.append((np.zeros(2), reach))
+            taken.append((np.zeros(2), 0.5 * self.square_m * float(np.hypot(*self.board)) + BOARD_CLEAR_M))
 
         def draw() -> tuple[np.ndarray, float]:
             return rng.uniform(-0.42, 0.42, 2) * self.size_m, rng.uniform(0.06, 0.16)

@@ -183,16 +183,14 @@ def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, cou
     # Of the strongest those that are farthest from any stronger one (M. Brown, R. Szeliski and S. Winder, Multi-image
     # matching using multi-scale oriented patches, 2005); the farthest first.
     px = px[: max(count, round(STRONGEST * len(px)))]
-    distance = np.linalg.norm(px[:, None] - px, axis=-1)
-    stronger = np.where(np.tri(len(px), k=-1, dtype=bool), distance, np.inf)
+    stronger = np.where(np.tri(len(px), k=-1, dtype=bool), np.linalg.norm(px[:, None] - px, axis=-1), np.inf)
     px = px[np.argsort(-stronger.min(axis=1), kind="stable")[:count]]
     extent = np.linalg.svd(px - px.mean(axis=0), compute_uv=False)
     if count > 2 and extent[1] < LEAST_SPREAD * extent[0]:
         raise InputError(f"the known points of the {scene.name} lie on a line: use another seed or more points")
     uv = camera.unproject(px)
     depth, _ = cast(rectangles, pose, uv)
-    local = depth[:, None] * np.concatenate([uv, np.ones((count, 1))], axis=1)
-    return px, SE3.transform(pose, local)
+    return px, SE3.transform(pose, depth[:, None] * np.concatenate([uv, np.ones((count, 1))], axis=1))
 
 
 DEPTH_PER_M = 5000.0  #: Of a depth image, as TUM's RGB-D recordings have it: out to 13 m.

@@ -159,8 +159,7 @@ def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
     mount, angles, walls = np.array([0.0, world.scanner_ahead_m, 0.0]), np.radians(np.arange(-90.0, 91.0)), floor_plan()
     ranges = np.stack([cast(walls, SE2.compose(pose, mount), angles) for pose in truth])
     ranges = np.maximum(ranges + world.std_range_m * rng.standard_normal(ranges.shape), 0.0)
-    lost = (ranges > world.max_range_m) | (rng.random(ranges.shape) < world.dropouts)
-    ranges[lost] = NO_RETURN_M
+    ranges[(ranges > world.max_range_m) | (rng.random(ranges.shape) < world.dropouts)] = NO_RETURN_M
     lines = ["# FLASER n [range] x y theta odom_x odom_y odom_theta time host time"]
     lines += [f"PARAM robot_frontlaser_offset {world.scanner_ahead_m}"]
     for stamp_ns, pose, scan in zip(stamps_ns.tolist(), odometry, ranges, strict=True):

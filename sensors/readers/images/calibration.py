@@ -61,8 +61,7 @@ def read_calibration(path: Path) -> Calibration:
     fx, fy = (entries[name].positive() for name in ("fx", "fy"))
     cx, cy = (entries[name].number() for name in ("cx", "cy"))
     given, none = entries.get("distortion"), (0.0,) * len(LENSES[model].coefficient_names)
-    lens = coefficients(given, model) if given else none
-    camera = Pinhole(width, height, fx, fy, cx, cy, lens, model)
+    camera = Pinhole(width, height, fx, fy, cx, cy, coefficients(given, model) if given else none, model)
     rate_hz, baseline_m = (entries[name].positive() if name in entries else None for name in ("rate_hz", "baseline_m"))
     return Calibration(str(path), camera, rate_hz, baseline_m)
 

@@ -50,5 +50,4 @@ def read_tum_truth(path: Path, images_ns: np.ndarray) -> Truth | None:
         return None
     rows = read_stamped(path, "poses")
     table = rows.table(TUM_POSE)
-    poses = normalised(np.roll(table.values, 4, axis=1), table.error)
-    return truth_between(path, rows.stamps_ns, poses, images_ns)
+    return truth_between(path, rows.stamps_ns, normalised(np.roll(table.values, 4, axis=1), table.error), images_ns)
