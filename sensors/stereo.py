@@ -15,9 +15,13 @@ the error of u_left and adds that of the disparity, σ_d. Both grow with the key
     cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]],    Mathematics (stereo-noise).
 
 Without the refinement both places have their own error, and cov = σ_p² I.
+
+So a point that is known again can be put where its first view is (`aligned`): the window around its first place, enlarged as
+its disparity has grown and turned as the keypoints have, is looked for about the keypoint (`rbpf.sensors.patches`). What
+its place means is then the same in all views, and σ_p² a 2 × 2 covariance: that of the alignment, by its residual.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, final
 
 import numpy as np
@@ -31,8 +35,14 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
+from rbpf.sensors.patches.search import search, warp
 
 LEAP = 40  #: Grey levels between a corrupted pixel and all its neighbours: several times the noise of any usable image.
+PATCH_HALF_PX, TEMPLATE_PX = 15, 15  #: Of a first view, beside its middle; and the side of what is looked for.
+KEYPOINT_PX = (
+    1.0  #: A first view is looked for as if keypoints had this standard deviation from it; mostly it is 0.3 to 0.7.
+)
+LEAST_TURN_RAD = 0.1  #: Of the image: less is lost in what keypoints' orientations err by, and harms an alignment less.
 TOLERATED_FRACTION = 0.001  #: Fraction of isolated pixels up to which an image is left as it is.
 
 
@@ -70,16 +80,36 @@ class StereoFeatures(RowByRow):
     scale: np.ndarray  #: (K,) of the keypoint, px.
     orientation: np.ndarray  #: (K,) of the keypoint, radians.
     descriptors: np.ndarray  #: (K, 36) or (K, 128) float32 of length 1.
+    #: (K, S, S) uint8, each point's first view: the left image around the pixel where it was seen first; S = 0 where
+    #: places are those of the keypoints.
+    patch: np.ndarray
+    #: (K, 4) place in that, from its middle, and the disparity, px; orientation, radians. The disparity is 0 where a point has
+    #: no first view, too near the border.
+    first: np.ndarray
 
     @classmethod
     def measured(
-        cls, rig: RectifiedStereo, z: Array, cov: Array, scale: Array, orientation: Array, descriptors: np.ndarray
+        cls,
+        rig: RectifiedStereo,
+        z: Array,
+        cov: Array,
+        scale: Array,
+        orientation: Array,
+        descriptors: np.ndarray,
+        patch: np.ndarray | None = None,
+        first: np.ndarray | None = None,
     ) -> "StereoFeatures":
-        """Features whose points and their covariances follow from the pixels."""
+        """Features whose points and their covariances follow from the pixels; by default without first views."""
         points = rig.triangulate(z)
         jac = np.linalg.inv(rig.jacobian(points))  # Mathematics (stereo-slope)
         cov_points = gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2))
-        return cls(z, cov, points, cov_points, scale, orientation, descriptors)
+        patch = np.zeros((len(z), 0, 0), np.uint8) if patch is None else patch
+        first = np.zeros((len(z), 4)) if first is None else first
+        return cls(z, cov, points, cov_points, scale, orientation, descriptors, patch, first)
+
+    def at(self, rig: RectifiedStereo, z: Array, cov: Array) -> "StereoFeatures":
+        """The same ones at other pixels (K, 3), with covariances (K, 3, 3)."""
+        return self.measured(rig, z, cov, self.scale, self.orientation, self.descriptors, self.patch, self.first)
 
 
 SWAPPED, FEWER = 20, 4  #: So many matches the wrong way round, and so many times fewer the right way, are no accident.
@@ -106,10 +136,29 @@ class PairConfig(Ranged):
     #: of the refined windows, else the match is dropped.
     least_correlation: Annotated[float, Range(ge=-1.0, le=1.0)] = 0.8
     shift_px: Positive = 2.0  #: nor may the refinement move it further than this.
+    align: bool = False  #: whether points that are known again are put where their first view is.
+    aligned_px: Positive = 0.05  #: σ_p of first views, and of an alignment …
+    aligned_residual: Positive = (
+        2.0  #: … what is added to it in quadrature, as a multiple of what its residual explains.
+    )
     place_px: Positive = 0.25  #: σ_p of a keypoint of scale 0 …
     place_per_scale: NotNegative = 0.02  #: … and what is added to it in quadrature, as a fraction of the scale.
     disparity_px: Positive = 0.1  #: σ_d of a keypoint of scale 0 …
     disparity_per_scale: NotNegative = 0.025  #: … and what is added to it in quadrature.
+
+    def noise(self, scale: np.ndarray, place: np.ndarray | None = None) -> np.ndarray:
+        """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px².
+
+        Those (K, 2, 2) of the left places are `place`, by default what a keypoint of such a scale has.
+        """
+        if place is None:
+            place = (self.place_px**2 + (self.place_per_scale * scale) ** 2)[:, None, None] * np.eye(2)
+        if not self.refine:
+            return place[:, :1, :1] * np.eye(3)
+        cov = np.concatenate([place, place[:, :1]], axis=1)
+        cov = np.concatenate([cov, cov[:, :, :1]], axis=2)
+        cov[:, 2, 2] += self.disparity_px**2 + (self.disparity_per_scale * scale) ** 2
+        return cov
 
 
 def calibration_doubt(wrong: float, matches: float) -> str:
@@ -156,6 +205,11 @@ class StereoMatcher:
         found = self.match(images, *keypoints)
         self._last = images, *keypoints, len(found)
         return found
+
+    @property
+    def images(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Left and right of the last pair, without impulse noise; None before the first."""
+        return None if self._last is None else self._last[0]
 
     @property
     def impossible(self) -> tuple[int, int]:
@@ -206,8 +260,14 @@ class StereoMatcher:
         good, z[:, 2] = self._refined(images, z[:, :2], z[:, 2])
         matches, z = matches.take(good), z[good] - [0.0, 0.0, self.offset_px]
         far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
-        chosen, noise = left.take(matches.first[far]), self.noise(left.scale[matches.first[far]])
-        return StereoFeatures.measured(self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors)
+        z, chosen = z[far], left.take(matches.first[far])
+        kept, cov = (chosen.scale, chosen.orientation, chosen.descriptors), self.config.noise(chosen.scale)
+        if not (self.config.align and self.config.refine):
+            return StereoFeatures.measured(self.rig, z, cov, *kept)
+        patch, first = first_views(images[0], z, chosen.orientation)
+        exact = self.config.noise(chosen.scale, np.tile(self.config.aligned_px**2 * np.eye(2), (len(z), 1, 1)))
+        cov = np.where(first[:, 2, None, None] > 0.0, exact, cov)
+        return StereoFeatures.measured(self.rig, z, cov, *kept, patch, first)
 
     def _refined(self, images: tuple[np.ndarray, np.ndarray], px: Array, u: Array) -> tuple[np.ndarray, np.ndarray]:
         """Which places px (K, 2) of the left image are found near columns u (K,) of the right one, and where."""
@@ -216,16 +276,6 @@ class StereoMatcher:
             return np.ones(u.size, dtype=bool), u
         found, correlation = refine(*images, px, u, config.half_px)
         return (np.abs(found - u) <= config.shift_px) & (correlation >= config.least_correlation), found
-
-    def noise(self, scale: np.ndarray) -> np.ndarray:
-        """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""
-        config = self.config
-        place = config.place_px**2 + (config.place_per_scale * scale) ** 2
-        if not config.refine:
-            return place[:, None, None] * np.eye(3)
-        disparity = config.disparity_px**2 + (config.disparity_per_scale * scale) ** 2
-        shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-        return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
 
     def _along_rows(self, left: Features, right: Features) -> DescriptorMatches:
         """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
@@ -257,6 +307,75 @@ class StereoMatcher:
             raise InputError(f"left and right image must be of one size, got {one} and {other}: give a rectified pair")
         if left.shape != (camera.height, camera.width):
             raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {one}")
+
+
+def first_views(image: np.ndarray, z: Array, orientation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`StereoFeatures.patch` and `first` of keypoints (K, 3), with orientations (K,), in the left image they are seen in."""
+    side = 2 * PATCH_HALF_PX + 1
+    patch, pixel = np.zeros((len(z), side, side), np.uint8), np.rint(z[:, :2]).astype(np.int64)
+    first = np.column_stack([z[:, :2] - pixel, z[:, 0] - z[:, 2], orientation])
+    whole = _inside(image, pixel[:, 0], pixel[:, 1], PATCH_HALF_PX)
+    first[~whole] = 0.0
+    if whole.any():
+        column, line = (pixel[whole] - PATCH_HALF_PX).T
+        patch[whole] = np.lib.stride_tricks.sliding_window_view(image, (side, side))[line, column]
+    return patch, first
+
+
+def aligned(
+    rig: RectifiedStereo,
+    config: PairConfig,
+    images: tuple[np.ndarray, np.ndarray],
+    offset_px: float,
+    features: StereoFeatures,
+    rows: np.ndarray,
+    patch: np.ndarray,
+    first: np.ndarray,
+) -> StereoFeatures:
+    """Features of which some are put where their first views are in the left image, and measured there.
+
+    A window whose correlation is too low is not found: its point stays where the keypoint is, with that one's noise, and
+    begins anew with its own view.
+
+    Args:
+        rig: the two cameras.
+        config: settings of the matching.
+        images: left and right, (H, W) uint8.
+        offset_px: by which columns of the right one are known to be too large: the features are without it.
+        features: of the pair.
+        rows: (k,) of those that are known again.
+        patch: (k, S, S) uint8 of these, as `StereoFeatures.patch`.
+        first: (k, 4), as `StereoFeatures.first`.
+    """
+    if not patch.size:
+        return features
+    px, disparity = features.z[rows, :2], features.z[rows, 0] - features.z[rows, 2]
+    has_view = (first[:, 2] > 0.0) & (disparity > 0.0)
+    # How a view has grown is told by its disparity; by how much the camera has turned about its axis by all of them, as an
+    # orientation is known to several degrees.
+    turn = first[:, 3] - features.orientation[rows]
+    turn = np.median((turn + np.pi) % (2.0 * np.pi) - np.pi)
+    turn = 0.0 if abs(turn) < LEAST_TURN_RAD * max(1.0, 3.0 / np.sqrt(rows.size)) else turn
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    growth = np.where(has_view, disparity, 1.0) / np.where(has_view, first[:, 2], 1.0)
+    offset = growth[:, None] * (first[:, :2] @ rotation)
+    templates = warp(patch, rotation / growth[:, None, None], TEMPLATE_PX)
+    cov = np.tile(KEYPOINT_PX**2 * np.eye(2), (rows.size, 1, 1))
+    match = search(images[0], templates, px - offset, cov, sigmas=3.0)
+    found = has_view & (match.score >= config.least_correlation) & np.isfinite(match.cov).all(axis=(1, 2))
+    place = np.where(found[:, None], match.px + offset, px)
+    # What lies there has its own disparity.
+    start = place[:, 0] - disparity
+    u, correlation = refine(*images, place, start + offset_px, config.half_px)
+    u -= offset_px
+    found &= (np.abs(u - start) <= config.shift_px) & (correlation >= config.least_correlation)
+    z, noise, views = features.z.copy(), features.cov.copy(), (features.patch.copy(), features.first.copy())
+    z[rows[found]] = np.column_stack([place, u])[found]
+    exact = config.aligned_px**2 * np.eye(2) + config.aligned_residual**2 * match.cov
+    scale = features.scale[rows]
+    noise[rows] = np.where(found[:, None, None], config.noise(scale, exact), config.noise(scale))
+    views[0][rows[found]], views[1][rows[found]] = patch[found], first[found]
+    return replace(features, patch=views[0], first=views[1]).at(rig, z, noise)
 
 
 ITERATIONS = 5  #: Steps; a keypoint is within a pixel of its place, from where three are enough.

@@ -8,7 +8,7 @@ filters them: a front end of its own, `CachedFrontEnd`, hands the features to th
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, final
@@ -25,11 +25,14 @@ from rbpf.sensors.features import Sift
 from rbpf.sensors.readers import ImageSequence
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.front_end import KEPT, ImageFrontEnd
+from rbpf.systems.stereo.front_end import ImageFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 
 CHUNK = 100
 """Pairs in a file."""
+
+FEATURES = "z", "cov", "scale", "orientation", "descriptors"
+"""What is kept of them: without images there are no first views."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ def cache_features(
     """
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, sequence, config)
-    total, sift = len(sequence), StereoMatcher(sequence.rig, Sift(config.sift), config.pair)
+    matching = replace(config.pair, align=False)
+    total, sift = len(sequence), StereoMatcher(sequence.rig, Sift(config.sift), matching)
     missing = [first for first in range(0, total, CHUNK) if not _file(folder, first).exists()]
     for first in missing:
         pairs = []
@@ -181,7 +185,7 @@ def _read(folder: Path, first: int, rig: RectifiedStereo, stamps_ns: np.ndarray)
         for stamp_ns, count, problem, seconds in zip(stamps_ns.tolist(), *entries, strict=False):
             features = None
             if count >= 0:
-                features = StereoFeatures.measured(rig, *(arrays[name][at : at + count] for name in KEPT))
+                features = StereoFeatures.measured(rig, *(arrays[name][at : at + count] for name in FEATURES))
                 at += count
             pairs.append(CachedPair(stamp_ns, features, problem, seconds))
     return pairs

@@ -150,9 +150,7 @@ def unnormalised_errors(
     control: object = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Per seed: log Ẑ/Z, and Ẑ/Z times the errors of first and second moments about the exact mean.
-
-    The errors have the expectation zero: Ẑ Σ W f(x) is unbiased for Z E[f | z], as Ẑ is for Z.
-    """
+    The errors have the expectation zero: Ẑ Σ W f(x) is unbiased for Z E[f | z], as Ẑ is for Z."""
     logs, first, second = [], [], []
     for seed in range(SEEDS):
         filter_ = build(np.random.default_rng([stream, seed]))

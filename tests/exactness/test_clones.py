@@ -74,10 +74,8 @@ def test_anchored_at_clones_it_is_the_kalman_filter():
 
 def test_what_is_learnt_alone_is_as_schmidt_has_it():
     """The dense filter of (position, clone, landmark, clone, landmark …), which takes what is measured in two parts.
-
     First all of it, as uncertain by second coordinates besides as they are; then what that left, by gains that are zero but
-    for a second coordinate's own row, and given the step that was sampled.
-    """
+    for a second coordinate's own row, and given the step that was sampled."""
     world, turn, at = turned(), SE2.rotation(TURNED), dict[int, int]()
     kalman = Kalman(TURNED[1:], np.zeros((2, 2)))
     for seen, z in world.measured:
@@ -183,9 +181,7 @@ def test_slopes_of_rows_are_those_of_what_is_measured(compiled):
 
 def test_the_loops_do_what_numpy_does():
     """More particles than a block of lanes has, of which the last one is not full; points, and rays at two clones.
-
-    States may lie in another order, and be locked.
-    """
+    States may lie in another order, and be locked."""
     joint, particles = rays(150)
     state = np.asfortranarray(particles.state)
     state.flags.writeable = False

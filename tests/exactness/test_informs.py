@@ -93,9 +93,7 @@ def test_one_group_for_each_is_one_group_for_both(space, proposal, compiled):
 @every_space
 def test_for_the_landmarks_alone(space, proposal, compiled):
     """Particles move and weigh as without a measurement, to the bit; landmarks as with one for both there.
-
-    With the test above this says as much of a group for the state: it moves and weighs, and leaves the landmarks.
-    """
+    With the test above this says as much of a group for the state: it moves and weighs, and leaves the landmarks."""
     world, (groups, *_) = scene(space)
     alone, (report,) = run(world, [split(*groups)[1:]], compiled, proposal)
     nothing, _ = run(world, [[]], compiled, proposal)

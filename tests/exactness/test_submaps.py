@@ -41,9 +41,7 @@ class Reading:
 
 def walk(steps: int = 14) -> tuple[list[Reading], np.ndarray, np.ndarray]:
     """Readings of a `Walk` that sees three new landmarks per step and old ones again, and what they say of all: least squares.
-
-    Names (M,) in the order of the solution; mean and covariance of the last position, then of the landmarks.
-    """
+    Names (M,) in the order of the solution; mean and covariance of the last position, then of the landmarks."""
     rng = np.random.default_rng(3)
     position, landmarks, readings = np.zeros(2), {}, []
     rows, values, infos = [], [], []
@@ -248,9 +246,7 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
 @pytest.mark.parametrize(("most", "by_image"), [(3, False), (50, False), (3, True)])
 def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, motion, start):
     """Of a velocity and landmarks out of view that come back, from near and, of the smaller, by a solution of all.
-
-    They are held before they are seen, or recognised after it.
-    """
+    They are held before they are seen, or recognised after it."""
     readings, space = walk(20)[0], Euclidean(2)
     whole, submaps = (JointMap(space, start, submap=n, passed_on=True) for n in (None, most))
     options = {"n": 10, "lag": 1, "consolidation": Consolidation(1)}

@@ -58,9 +58,7 @@ def test_rows_are_composed_ancestors(seed):
 
 def test_size_of_the_forest():
     """Every generation kept: T + C N log N nodes (P. Jacob, L. Murray, S. Rubenthaler, 2015) with C < 4.
-
-    With equal weights two lineages meet with probability 1/N per generation, so Σ 2N/age gives C of about 2.
-    """
+    With equal weights two lineages meet with probability 1/N per generation, so Σ 2N/age gives C of about 2."""
     rng, n = np.random.default_rng(5), 64
     lineage = Lineage(n)
     excess = []

@@ -137,9 +137,7 @@ RIG = RectifiedStereo(PLAIN, 0.12)
 
 def assert_twins(model, z, pose, mean, const, tolerance=1e-10):
     """Relative to the largest number of each result: differences of large numbers are no better than these.
-
-    With the pose alone as the state, and with a velocity behind it.
-    """
+    With the pose alone as the state, and with a velocity behind it."""
     for state in (pose, with_velocity(pose)):
         nu, by_state, by_landmark = compiled(model, z, state, mean, const)
         jacobians = known(model.jacobians(state, mean, const))
@@ -189,9 +187,7 @@ def test_behind_the_camera():
 
 def test_a_pair_of_cameras_starts_points():
     """A sound model, with a lens so long that no step of the check's turning camera is by chance about 2π px.
-
-    The analytic covariance against the numeric one of `invert`; the points are seen where they were measured.
-    """
+    The analytic covariance against the numeric one of `invert`; the points are seen where they were measured."""
     long = RectifiedStereo(Pinhole(6400, 4800, 4000.0, 4100.0, 3199.5, 2399.5), 0.12)
     assert check_model(StereoPoint(long), SE3) == []
     rays, model = Rays.random(4, 5), StereoPoint(RIG)

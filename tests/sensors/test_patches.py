@@ -11,10 +11,8 @@ from rbpf.sensors.patches.search import cut, search, warp
 
 class Waves:
     """A sum of plane waves; a pixel gathers its own square of it, seen through a Gaussian blur.
-
     The affine map takes pixels to the plane: p = affine @ (px - middle) + shift. A wave of frequency f is one of
-    frequency affineᵀ f in the image, where the square and the blur damp it: there is no aliasing but the image's own.
-    """
+    frequency affineᵀ f in the image, where the square and the blur damp it: there is no aliasing but the image's own."""
 
     def __init__(self, seed: int, count: int = 100, blur_px: float = 0.5, contrast: float = 45.0) -> None:
         rng = np.random.default_rng(seed)

@@ -11,7 +11,15 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.descriptors import MatchLimits, match_all
 from rbpf.sensors.features import Sift, SiftConfig
-from rbpf.sensors.stereo import PairConfig, StereoMatcher, calibration_doubt, refine
+from rbpf.sensors.stereo import (
+    PairConfig,
+    StereoFeatures,
+    StereoMatcher,
+    aligned,
+    calibration_doubt,
+    first_views,
+    refine,
+)
 from rbpf.validation.simulation.desk_and_room import TexturedRoom
 from rbpf.validation.simulation.images import Imaging, Shutter
 from rbpf.validation.simulation.render import Renderer
@@ -88,12 +96,41 @@ def test_points_and_covariances_follow_from_the_pixels():
 
 def test_a_feature_is_seen_again_where_the_motion_takes_it():
     _, _, poses = room()
-    first, second = measured(0), measured(1)
+    first, second = measured(0, align=True), measured(1, align=True)
     second_from_first = SE3.between(poses[1], poses[0])
     expected = RIG.project(SE3.transform(second_from_first, first.points))
     matches = match_all(first.descriptors, second.descriptors, MatchLimits())
     error = second.z[matches.second] - expected[matches.first]
     assert len(matches) > 80 and np.mean(np.abs(error).max(axis=1) < 1.0) > 0.9
+    # Put where its first view is, it is there to a tenth of a pixel, with the noise that is said.
+    then, rows = first.take(matches.first), matches.second
+    exact = aligned(RIG, PairConfig(), room()[0][1], 0.0, second, rows, then.patch, then.first).take(rows)
+    found, off = (exact.first == then.first).all(axis=1), np.abs(exact.z - expected[matches.first])[:, :2]
+    assert found.mean() > 0.8 and np.median(off[found]) < min(0.1, 0.7 * np.median(np.abs(error)[found, :2]))
+    assert 0.3 < 1.4826 * np.median(off[found] / np.sqrt(exact.cov[found][:, [0, 1], [0, 1]])) < 1.2
+    # Where it is not, the keypoint's place and noise are left.
+    np.testing.assert_array_equal(exact.z[~found], second.z[rows][~found])
+    np.testing.assert_array_equal(exact.cov[~found], PairConfig().noise(exact.scale[~found]))
+
+
+def test_a_first_view_is_found_in_a_turned_and_larger_image():
+    grid, middle = np.stack(np.mgrid[:240, :320][::-1], axis=-1).astype(float), np.array([160.0, 120.0])
+    turn, rng = 0.5, np.random.default_rng(2)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    places = grid - middle, (grid - middle) @ rotation / 1.3
+    then, now = (
+        np.rint(128 + 7 * texture(*np.moveaxis(place, -1, 0))).clip(0, 255).astype(np.uint8) for place in places
+    )
+    px = rng.uniform([60, 60], [260, 180], (30, 2))
+    views = first_views(then, np.column_stack([px, px[:, 0] - 10.0]), np.zeros(30))
+    true = 1.3 * (px - middle) @ rotation.T + middle
+    true = np.column_stack([true, true[:, 0] - 13.0])
+    scale, none = np.full(30, 3.0), (np.zeros((30, 31, 31), np.uint8), np.zeros((30, 4)))
+    rest = PairConfig().noise(scale), scale, np.full(30, turn), np.zeros((30, 36), np.float32)
+    features = StereoFeatures.measured(RIG, true + rng.normal(0.0, 0.5, 2)[[0, 1, 0]], *rest, *none)
+    found = aligned(RIG, PairConfig(), (now, np.roll(now, -13, axis=1)), 0.0, features, np.arange(30), *views)
+    moved = (found.first == views[1]).all(axis=1)
+    assert moved.mean() > 0.8 and np.abs(found.z - true)[moved].max() < 0.1
 
 
 def test_limits_of_the_disparity():

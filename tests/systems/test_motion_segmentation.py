@@ -55,9 +55,7 @@ def test_the_group_that_is_the_camera():
 @pytest.mark.parametrize("marks", list(product([MOVING, UNKNOWN, STATIC], repeat=3)))
 def test_the_past_against_enumeration(marks):
     """P(labels | stands still) / P(labels | moves), summed over whether the thing has changed since the pair before.
-
-    As the support of the map that makes it as likely as none at all, which has no past.
-    """
+    As the support of the map that makes it as likely as none at all, which has no past."""
     labels = np.array(marks)
 
     def likelihood(is_static: bool) -> float:

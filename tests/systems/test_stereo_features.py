@@ -90,9 +90,7 @@ def test_what_was_measured_is_told_as_it_came(log, run):
 @pytest.mark.parametrize("kind", ["truncated", "outliers"])
 def test_the_prior_proposal(log, kind):
     """The filter is better than its odometry, by a density and by S05's truncated form, which gives no evidence.
-
-    What the latter clips, a quarter of these true measurements, updates the landmarks all the same.
-    """
+    What the latter clips, a quarter of these true measurements, updates the landmarks all the same."""
     likelihood = replace(StereoConfig().likelihood, kind=kind)
     run = filtered(log, replace(CONFIG, particles=400, likelihood=likelihood, proposal=ProposalConfig("prior")))
     assert rmse(log, run.log.poses) < rmse(log, run.log["odometry"])
@@ -101,9 +99,7 @@ def test_the_prior_proposal(log, kind):
 
 def test_nees_of_the_pose():
     """Per degree of freedom, 12 recordings of 20 pairs: where each pixel counts once it is 1, in S05 1.4 and more.
-
-    With a joint map 50 particles are enough.
-    """
+    With a joint map 50 particles are enough."""
     density = replace(StereoConfig().likelihood, kind="outliers")
     twice = replace(CONFIG, likelihood=density)
     role, own = OdometryConfig(role="proposal"), MapConfig(kind="particles", weigh="all")

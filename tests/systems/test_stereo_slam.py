@@ -260,9 +260,7 @@ def test_anywhere_in_the_map(settled):
 @pytest.mark.parametrize(("fraction", "texture_seed"), [(1 / 3, 12), (0.5, 0)])
 def test_a_thing_that_moves_does_not_take_it_along(fraction, texture_seed):
     """For some pairs most matches are on the thing. Nothing on it becomes a landmark that weighs.
-
-    Where it covers half of the view, seeds 0 to 7 end 4 to 11 mm off, 7 in the median.
-    """
+    Where it covers half of the view, seeds 0 to 7 end 4 to 11 mm off, 7 in the median."""
     worst = []
     for seed in range(5):
         run = filtered(cover_view(fraction, 6, 8, seed=texture_seed)(pairs(14)), replace(CONFIG, seed=seed))

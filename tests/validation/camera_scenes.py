@@ -27,9 +27,7 @@ def scene(
     noise_px: float = 1.0,
 ) -> FeatureLog:
     """A camera moves by a tenth of a metre per frame before points three metres away, of which it sees most.
-
-    Pixels are correlated; the first landmarks are known to a centimetre, in correlated axes.
-    """
+    Pixels are correlated; the first landmarks are known to a centimetre, in correlated axes."""
     rng = np.random.default_rng(seed)
     path = _walk(frames, rng)
     low, high = [-1.2, -0.9, 2.4], [1.2, 0.9, 4.0]

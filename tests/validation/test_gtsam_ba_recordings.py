@@ -101,10 +101,8 @@ def first_observations(tracks):
 
 def test_the_reference_figures_and_the_batch_solution(tracks, solved):
     """Half the squared error 90342.1 → 7399.0, which is 0.306 px per residual.
-
     `solve_features` adds weak priors for what has no parallax, 342 landmarks here; they change the error by
-    0.11 %.
-    """
+    0.11 %."""
     log, points, guess = tracks.log, first_observations(tracks), tracks.world_from_camera
     assert (len(log.frames), sum(len(frame.z) for frame in log.frames), len(points)) == (77, 52544, 15638)
     table = observation_table(log)

@@ -156,7 +156,7 @@ def test_images_are_swept_with_their_known_points(tmp_path):
 def test_pairs_of_images_are_swept(tmp_path):
     """With and without the map: odometry that differs by its draws alone, another filter."""
     render_room(tmp_path / "room")
-    options = {"map": {}, "no map": {"map.used": False}}
+    options = {"map": {"pair.align": True}, "no map": {"map.used": False, "pair.align": True}}
     file = SweepFile("stereo", ["room"], [20], options=options)
     mapped, alone = sweep(plan(file, tmp_path), tmp_path / "out", workers=1)
     assert mapped["vo_ate_rmse_m"] == pytest.approx(alone["vo_ate_rmse_m"], rel=1e-3) and alone["vo_ate_rmse_m"] > 0.0

@@ -33,10 +33,8 @@ def world(
     winding: bool = False,
 ) -> Measurements:
     """A drive of half a metre per step among six landmarks, seen by a sensor that looks back and down.
-
     Bearings cross ±π. With `singular` one direction of motion, not along an axis, is without noise; `noise`
-    multiplies all standard deviations. It turns alike all the way unless it is `winding`.
-    """
+    multiplies all standard deviations. It turns alike all the way unless it is `winding`."""
     rng = np.random.default_rng(seed)
     m, path = _drive(dim, kind, singular, steps, noise, rng, winding)
     points = m.space.translation(path).mean(0) + rng.normal(scale=3.0, size=(len(NAMES), dim))

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, Self, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import Schema, integers, numbers, read
+from rbpf.core.checkpoint import Schema, grey, integers, numbers, read
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
@@ -22,7 +22,7 @@ from rbpf.sensors.descriptors import match_all
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
-from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
+from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, aligned
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.landmarks import DescriptorLandmarks, F, FeatureKind, Landmarks, NamedLandmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
@@ -34,6 +34,8 @@ KEPT = _PIXELS | {
     "scale": numbers("features"),
     "orientation": numbers("features"),
     "descriptors": numbers("features", "length", dtype=np.float32),
+    "patch": grey("features", "side", "side"),
+    "first": numbers("features", 4),
 }
 
 
@@ -83,6 +85,10 @@ class FrontEnd(ABC, Generic[F]):
     @abstractmethod
     def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
         """Rows (M,) of the earlier pair and (M,) of the later one that are the same point, as the odometry takes it."""
+
+    def aligned(self, before: Pair[F], now: Pair[F], rows: tuple[np.ndarray, np.ndarray]) -> Pair[F]:
+        """The later pair, such rows of it put where the earlier one's points are exactly; by default as they were measured."""
+        return now
 
     def matches(self, before: Pair[F], now: Pair[F], rows: tuple[np.ndarray, np.ndarray]) -> Matches:
         """The pixels of such rows."""
@@ -161,7 +167,8 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
             nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
             descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
             features = StereoFeatures.measured(self.rig, *nothing, descriptors)
-        return self.pair(frame.stamp_ns, features), problem
+        pair = self.pair(frame.stamp_ns, features)
+        return replace(pair, images=self.matcher.images, offset_px=self.matcher.offset_px), problem
 
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
         """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
@@ -190,14 +197,23 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         self.landmarks.model = StereoPoint(self.rig, about=about)
 
     def shifted(self, features: StereoFeatures, by_px: float) -> StereoFeatures:
-        kept = features.scale, features.orientation, features.descriptors
-        return StereoFeatures.measured(self.rig, features.z + np.array([0.0, 0.0, by_px]), features.cov, *kept)
+        return features.at(self.rig, features.z + np.array([0.0, 0.0, by_px]), features.cov)
 
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
         one, other = before.features.descriptors, now.features.descriptors
         found = match_all(one, other, self.config.odometry.limits)
         used = before.for_odometry[found.first] & now.for_odometry[found.second]
         return found.first[used], found.second[used]
+
+    def aligned(
+        self, before: Pair[StereoFeatures], now: Pair[StereoFeatures], rows: tuple[np.ndarray, np.ndarray]
+    ) -> Pair[StereoFeatures]:
+        if now.images is None:
+            return now
+        then = before.features.take(rows[0])
+        which = rows[1], then.patch, then.first
+        features = aligned(self.rig, self.config.pair, now.images, now.offset_px, now.features, *which)
+        return replace(now, features=features)
 
     def features(self, kept: dict[str, np.ndarray]) -> StereoFeatures:
         length = self.matcher.extractor.length

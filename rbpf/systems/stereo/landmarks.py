@@ -37,7 +37,7 @@ from rbpf.sensors.descriptors import gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_management import LandmarkManager
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
-from rbpf.sensors.stereo import StereoFeatures
+from rbpf.sensors.stereo import StereoFeatures, aligned
 from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.places import Places, make_room, places_of
@@ -90,6 +90,9 @@ class Pair(Generic[F]):
     #: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
     landmarks: np.ndarray | None = None
     starts: np.ndarray | None = None  #: rows of features that start landmarks; None where that is still to be found.
+    #: left and right, in which points that are known again are looked for; None for nowhere.
+    images: tuple[np.ndarray, np.ndarray] | None = None
+    offset_px: float = 0.0  #: by which columns of the right image are too large: the features are without it.
 
     def __len__(self) -> int:
         return len(self.features)
@@ -116,6 +119,10 @@ class Landmarks(Sensor, ABC, Generic[F]):
     def left_over(self, pair: Pair[F]) -> tuple[Pair[F], np.ndarray]:
         """The pair with those of its features that start landmarks, and which (K,) the map does not use; by default none."""
         return pair, np.zeros(len(pair), dtype=bool)
+
+    def told(self, pair: Pair[F]) -> F:
+        """The features of the pair that the filter took last, as it was told of them; by default as they were measured."""
+        return pair.features
 
     @abstractmethod
     def seen_again(self) -> np.ndarray:
@@ -306,13 +313,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         model: CameraModel | None = None,
         landmark: Landmark | None = None,
     ) -> None:
-        self.rig, self.config, self.likelihood = rig, config.map, config.likelihood.build()
+        self.rig, self.config, self._matching, self.likelihood = rig, config.map, config.pair, config.likelihood.build()
         self.gate = gate or MahalanobisGate(self.config.gate, self.config.slack_px)
         self.model, self.landmark = model or StereoPoint(rig), landmark or Point(3)
         self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height), length)
         self.places = Places(rig, self.config)
         self.noise = LearntNoise() if self.config.kind == "joint" else None
         self.ids, self._first_name = np.zeros(0, dtype=np.int64), 0
+        self._told: StereoFeatures
 
     def name_from(self, first: int) -> None:
         self._first_name = self.manager.next_name = first
@@ -320,8 +328,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def observe(self, frame: Pair[StereoFeatures], belief: Belief) -> Sequence[Observations]:
         """The features that are landmarks, and those that are candidates."""
         started = time.perf_counter()
-        features = frame.features
         self.ids = self.associate(frame, belief) if frame.landmarks is None else frame.landmarks
+        self._told = features = self._aligned(frame)
         known = self.ids >= 0
         weighs = known
         if self.config.weigh != "all" and self.config.kind != "joint":
@@ -387,6 +395,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         features = frame.features.take(rows)
         # The manager counts as the map does: its numbers are the map's.
         ids = self.manager.add(features.descriptors)
+        self.places.add(features.patch, features.first)
         self.places.put(self.manager.rows(ids), SE3.transform(pose, features.points), pose)
         self.ids[rows] = ids
         cov = features.cov
@@ -403,6 +412,21 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             return rows
         descriptors, px = features.descriptors[rows], features.z[:, :2]
         return rows[manager.select(px[rows], descriptors, manager.nearest(descriptors), px[known])]
+
+    def told(self, pair: Pair[StereoFeatures]) -> StereoFeatures:
+        return self._told
+
+    def _aligned(self, pair: Pair[StereoFeatures]) -> StereoFeatures:
+        """The pair's features, those of landmarks put where these were seen first."""
+        features, rows = pair.features, np.flatnonzero(self.ids >= 0)
+        if pair.images is None or not rows.size:
+            return features
+        held = self.manager.rows(self.ids[rows])
+        patch, first = self.places.patch[held], self.places.first[held]
+        # Most are there, as they were followed from pair to pair.
+        moves = (first != features.first[rows]).any(axis=1) | (patch != features.patch[rows]).any(axis=(1, 2))
+        which = rows[moves], patch[moves], first[moves]
+        return aligned(self.rig, self._matching, pair.images, pair.offset_px, features, *which)
 
     def left_over(self, pair: Pair[StereoFeatures]) -> tuple[Pair[StereoFeatures], np.ndarray]:
         assert pair.landmarks is not None

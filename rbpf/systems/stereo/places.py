@@ -1,10 +1,10 @@
-"""Where landmarks are and were seen last, by which those that a view may show are found; which a full joint map puts away."""
+"""Where landmarks are and were seen last, by which those that a view may show are found; their first views; room in a map."""
 
 from typing import ClassVar
 
 import numpy as np
 
-from rbpf.core.checkpoint import Kept, numbers
+from rbpf.core.checkpoint import Kept, grey, numbers
 from rbpf.core.models import Belief, Map
 from rbpf.lie import SE3
 from rbpf.maps.joint_map import JointMap
@@ -21,12 +21,25 @@ class Places(Kept):
     """
 
     place: np.ndarray  #: (M, 3) in the world of the heaviest particle.
-    kept: ClassVar = {"place": numbers("landmarks", 3), "_seen_from": numbers("landmarks", 3)}
+    patch: np.ndarray  #: (M, S, S) uint8, first views as `StereoFeatures` has them.
+    first: np.ndarray  #: (M, 4), likewise.
+    kept: ClassVar = {
+        "place": numbers("landmarks", 3),
+        "_seen_from": numbers("landmarks", 3),
+        "patch": grey("landmarks", "side", "side"),
+        "first": numbers("landmarks", 4),
+    }
     prefix = "places/"
 
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
         self.rig, self.config = rig, config
         self.place, self._seen_from = np.zeros((2, 0, 3))
+        self.patch, self.first = np.zeros((0, 0, 0), np.uint8), np.zeros((0, 4))
+
+    def add(self, patch: np.ndarray, first: np.ndarray) -> None:
+        """New landmarks follow, with first views (k, S, S) and (k, 4); `put` says where they are."""
+        self.patch = np.concatenate([self.patch, patch]) if len(self.patch) else patch
+        self.first = np.concatenate([self.first, first])
 
     def put(self, rows: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
         """Landmarks (k,), held or new, are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,)."""
@@ -40,7 +53,8 @@ class Places(Kept):
         self.place[rows] = place
 
     def remove(self, rows: np.ndarray) -> None:
-        self.place, self._seen_from = (np.delete(one, rows, axis=0) for one in (self.place, self._seen_from))
+        for name in self.kept:
+            setattr(self, name, np.delete(getattr(self, name), rows, axis=0))
 
     def in_view(self, world_from_camera: np.ndarray, std_direction_rad: float = 0.0) -> np.ndarray:
         """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""

@@ -216,7 +216,7 @@ class StereoSlam(System):
             raise InputError(f"time runs backwards: a pair has the stamp {stamp_ns} ns, the last one a later one")
         measured = len(pair) >= least and dt > 0.0
         if measured:
-            motion = self._motion_to(pair, dt)
+            pair, motion = self._motion_to(pair, dt)
             self._impossible = REMEMBERED * self._impossible + front_end.impossible()
             doubt = "" if self._doubted else calibration_doubt(*self._impossible)
             self._doubted |= bool(doubt)
@@ -292,6 +292,7 @@ class StereoSlam(System):
             weighed = [group.ids for group in report.groups if Part.STATE in group.updates and group.ids is not None]
             figures |= filter_values(report) | {"observed": sum(int((ids >= 0).sum()) for ids in weighed)}
         ids, kinds = front_end.landmarks_of(pair, updated)
+        told = landmarks.told(pair) if updated else pair.features
         previous = np.full(len(pair), NULL, dtype=np.int64)
         previous[motion.rows[1][motion.inliers]] = motion.rows[0][motion.inliers]
         return Tracked(
@@ -313,7 +314,7 @@ class StereoSlam(System):
                 "measured": measured,
                 "offset_px": offset_px,
             },
-            {"z": pair.features.z, "cov_z": pair.features.cov, "kind": kinds, "landmarks": ids, "previous": previous},
+            {"z": told.z, "cov_z": told.cov, "kind": kinds, "landmarks": ids, "previous": previous},
             tuple(messages),
         )
 
@@ -323,6 +324,7 @@ class StereoSlam(System):
         trial.filter.rng = np.random.default_rng((self.config.seed, self.frames))  # which a checkpoint need not hold
         offset_px = trial._calibration.tune(trial.filter)
         seen = trial.front_end.pair(pair.stamp_ns, trial.front_end.shifted(pair.features, -offset_px))
+        seen = replace(seen, images=pair.images, offset_px=offset_px)
         try:
             other = trial._take(tracked.stamp_ns, seen, problem, offset_px, started, updated)
         except InputError:  # nothing explains the pair there
@@ -441,12 +443,13 @@ class StereoSlam(System):
         else:
             self._trial = None
 
-    def _motion_to(self, pair: Pair[Any], dt: float) -> "_Motion":
-        """The motion from the last measured pair to this one, `dt` seconds later."""
+    def _motion_to(self, pair: Pair[Any], dt: float) -> tuple[Pair[Any], "_Motion"]:
+        """The pair, with those of its points that the last measured one has, aligned; the motion between, `dt` seconds."""
         before, kept, stamp_ns = self.reckoning, self._kept, pair.stamp_ns
         if kept is None:
-            return _Motion(replace(before, stamp_ns=stamp_ns))
+            return pair, _Motion(replace(before, stamp_ns=stamp_ns))
         rows = self.front_end.match(kept, pair)
+        pair = self.front_end.aligned(kept, pair, rows)
         matches, labels = self.front_end.matches(kept, pair, rows), kept.labels[rows[0]]
         found = self.visual_odometry.candidates(matches, before.velocity, dt, self.filter.rng)
 
@@ -476,7 +479,7 @@ class StereoSlam(System):
             step = self._constrained(found.prior)
             at = before.moved(stamp_ns, step, before.velocity, is_assumed=True, hidden=bool(moving.any()))
             nobody = np.zeros(len(matches), dtype=bool)
-            return _Motion(at, rows, labels, nobody, moving, f"{failure}; {what} is assumed, widely")
+            return pair, _Motion(at, rows, labels, nobody, moving, f"{failure}; {what} is assumed, widely")
         motion, notes = found.motions[chosen], list[str]()
         if motion.note:
             notes.append(motion.note)
@@ -505,7 +508,7 @@ class StereoSlam(System):
             left_over[rows[1][motion.inliers]] = before.left_over[rows[0][motion.inliers]]
         step = self._constrained(motion.odometry)
         at = before.moved(stamp_ns, step, velocity, cross=cross, noise=noise, left_over=left_over)
-        return _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
+        return pair, _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
 
     def _found_again(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
         """By what the particles are moved at a pair after a motion that was only assumed, and in words why.
