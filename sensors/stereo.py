@@ -138,9 +138,7 @@ class PairConfig(Ranged):
     shift_px: Positive = 2.0  #: nor may the refinement move it further than this.
     align: bool = False  #: whether points that are known again are put where their first view is.
     aligned_px: Positive = 0.05  #: σ_p of first views, and of an alignment …
-    aligned_residual: Positive = (
-        2.0  #: … what is added to it in quadrature, as a multiple of what its residual explains.
-    )
+    aligned_residual: Positive = 2.0  #: … in quadrature with so many times what its residual explains.
     place_px: Positive = 0.25  #: σ_p of a keypoint of scale 0 …
     place_per_scale: NotNegative = 0.02  #: … and what is added to it in quadrature, as a fraction of the scale.
     disparity_px: Positive = 0.1  #: σ_d of a keypoint of scale 0 …
