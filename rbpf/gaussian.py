@@ -17,7 +17,6 @@ from scipy.linalg.lapack import dpotri
 
 from rbpf.arrays import Array, Float, Like
 from rbpf.errors import InputError
-from rbpf.kernels.dense import mirror
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 _ASYMMETRY = 1e-9
@@ -138,9 +137,8 @@ def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n
     """Inverse of positive definite matrices, exactly symmetric. Raises InputError: one is not positive definite."""
     chol = cholesky(cov)
     if chol.ndim == 2 and len(chol) > _UNROLLED:
-        whole = np.asarray(dpotri(chol.T, overwrite_c=True)[0].T)  # of the transposed, the upper triangle
-        mirror(whole)
-        return whole
+        lower = dpotri(chol.T, overwrite_c=True)[0].T  # of the transposed, the upper triangle
+        return np.asarray(lower + np.tril(lower, -1).T)
     half = solve_lower_matrix(chol, np.eye(chol.shape[-1]))
     return gram(np.swapaxes(half, -1, -2))
 

@@ -31,7 +31,7 @@ from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.front_end import NamedFrontEnd
+from rbpf.systems.stereo.named_pixels import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
 

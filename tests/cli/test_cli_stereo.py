@@ -30,7 +30,7 @@ OWN_ENTRIES = {
 @pytest.fixture(scope="module")
 def finished(room, tmp_path_factory, keypoints_once):
     out = tmp_path_factory.mktemp("finished") / "run"
-    assert run_stereo(room, out) == 0
+    assert run_stereo(room, out, "--set", "pair.align=true") == 0
     return out
 
 
@@ -75,7 +75,7 @@ def test_it_follows_the_camera(finished):
 
 def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_path):
     """A real signal to a real process, in the middle of an update; the pair is finished first."""
-    arguments = ["run", "stereo", str(room), "--particles", "50", "--out", str(tmp_path / "cut")]
+    arguments = ["run", "stereo", str(room), "--set", "pair.align=true", "--out", str(tmp_path / "cut")]
     command = [sys.executable, "-c", _WAITING, *arguments]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = subprocess.Popen(command, text=True, **pipes)

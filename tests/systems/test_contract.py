@@ -20,7 +20,7 @@ from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.stereo.config import CalibrationConfig, MapConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.front_end import NamedFrontEnd
+from rbpf.systems.stereo.named_pixels import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import LAG, System, TrackingState
 from tests.core.worlds import content, same

@@ -10,7 +10,7 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.front_end import NamedFrontEnd
+from rbpf.systems.stereo.named_pixels import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import TrackingState
 

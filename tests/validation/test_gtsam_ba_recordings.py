@@ -13,7 +13,7 @@ from rbpf.runs.trajectory import align
 from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.sensors.readers.measurements import KINDS, InitialEstimate, Measurements, initial_estimate
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
-from rbpf.systems.stereo.front_end import NamedFrontEnd
+from rbpf.systems.stereo.named_pixels import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraProblem, CameraState, solve_features
 from rbpf.validation.gtsam.observations import observation_table

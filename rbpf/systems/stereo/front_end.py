@@ -8,7 +8,7 @@ always in the same half, whenever it is seen.
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, ClassVar, Generic, Self, final
+from typing import Any, ClassVar, Generic, Self
 
 import numpy as np
 
@@ -19,18 +19,17 @@ from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import StereoPoint
 from rbpf.sensors.descriptors import match_all
-from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, aligned
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.landmarks import DescriptorLandmarks, F, FeatureKind, Landmarks, NamedLandmarks, Pair
+from rbpf.systems.stereo.landmarks import DescriptorLandmarks, F, FeatureKind, Landmarks, Pair
 from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
 _STOOD = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
-_PIXELS = {"z": numbers("features", 3), "cov": numbers("features", 3, 3)}
+PIXELS = {"z": numbers("features", 3), "cov": numbers("features", 3, 3)}
 #: What the rest of `StereoFeatures` follows from.
-KEPT = _PIXELS | {
+KEPT = PIXELS | {
     "scale": numbers("features"),
     "orientation": numbers("features"),
     "descriptors": numbers("features", "length", dtype=np.float32),
@@ -210,8 +209,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
     ) -> Pair[StereoFeatures]:
         if now.images is None:
             return now
-        then = before.features.take(rows[0])
-        which = rows[1], then.patch, then.first
+        which = rows[1], before.features.patch[rows[0]], before.features.first[rows[0]]
         features = aligned(self.rig, self.config.pair, now.images, now.offset_px, now.features, *which)
         return replace(now, features=features)
 
@@ -225,48 +223,3 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         """Whose descriptor's first numbers outweigh its last ones."""
         side = features.descriptors.shape[1] // 3
         return features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)
-
-
-@final
-class NamedFrontEnd(FrontEnd[FeatureFrame]):
-    """Pixels of landmarks that have names.
-
-    The frames' stamps are `ns_per_stamp` nanoseconds long: 10⁹ where they count frames of unknown time.
-    """
-
-    takes = FeatureFrame
-    kept: ClassVar[Schema] = {"landmarks": integers("features", least=0), **_PIXELS}
-    names_landmarks = True
-
-    def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
-        self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
-        self.landmarks: NamedLandmarks = NamedLandmarks(rig, config)
-        self._offset_px = 0.0
-
-    def measure(self, frame: FeatureFrame) -> tuple[Pair[FeatureFrame], str]:
-        calibrated = replace(frame, z=frame.z - [0.0, 0.0, self._offset_px])
-        return self.pair(self.ns_per_stamp * frame.stamp_ns, calibrated), ""
-
-    def tune(self, about: np.ndarray) -> None:
-        self._offset_px = float(about[0])
-        self.landmarks.model = StereoPoint(self.rig, about=about)
-
-    def shifted(self, features: FeatureFrame, by_px: float) -> FeatureFrame:
-        return replace(features, z=features.z + np.array([0.0, 0.0, by_px]))
-
-    def match(self, before: Pair[FeatureFrame], now: Pair[FeatureFrame]) -> tuple[np.ndarray, np.ndarray]:
-        names = before.features.landmarks, now.features.landmarks
-        _, first, second = np.intersect1d(*names, assume_unique=True, return_indices=True)
-        used = before.for_odometry[first]
-        return first[used], second[used]
-
-    def landmarks_of(self, pair: Pair[FeatureFrame], updated: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Their names, whether the filter has taken them or not."""
-        kind = FeatureKind.LANDMARK if updated else FeatureKind.FEATURE
-        return pair.features.landmarks, np.full(len(pair), kind)
-
-    def features(self, kept: dict[str, np.ndarray]) -> FeatureFrame:
-        return FeatureFrame(0, *kept.values())
-
-    def half(self, features: FeatureFrame) -> np.ndarray:
-        return features.landmarks % 2 == 0

@@ -5,7 +5,7 @@ it there. Each feature is then one landmark's, the same for all particles, or ha
 costs all particles the same. Landmarks that have not been seen often enough are candidates: they are in the map, where
 they follow each particle's path, without a say in the particles' weights.
 
-`DescriptorLandmarks` finds landmarks by SIFT descriptors, `NamedLandmarks` by names that the recording gives.
+`DescriptorLandmarks` finds landmarks by SIFT descriptors; by names that the recording gives: `named_pixels.py`.
 """
 
 import time
@@ -14,13 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import partial
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, final
+from typing import Any, Generic, Protocol, Self, TypeVar, final
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.arrays import RowByRow
-from rbpf.core.checkpoint import Kept, integers
 from rbpf.core.models import NULL, Belief, Landmark, NewLandmarks, Observations, Sensor
 from rbpf.core.particles import Particles, Prior
 from rbpf.errors import InputError
@@ -34,9 +33,7 @@ from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
 from rbpf.sensors.descriptors import gate_pairs, match_pairs
-from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_management import LandmarkManager
-from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures, aligned
 from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.stereo.config import StereoConfig
@@ -419,7 +416,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def _aligned(self, pair: Pair[StereoFeatures]) -> StereoFeatures:
         """The pair's features, those of landmarks put where these were seen first."""
         features, rows = pair.features, np.flatnonzero(self.ids >= 0)
-        if pair.images is None or not rows.size:
+        if pair.images is None or not (rows.size and features.patch.size):
             return features
         held = self.manager.rows(self.ids[rows])
         patch, first = self.places.patch[held], self.places.first[held]
@@ -561,54 +558,3 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         matches = Matches.checked(self.rig, expected.by_heaviest, features.z, cov, features.cov)
         config = VoConfig(min_matches=self.config.min_agreeing)
         return estimate_motion(matches, rng, config=config).inliers
-
-
-@final
-class NamedLandmarks(Kept, Landmarks[FeatureFrame]):
-    """Landmarks by the names that the recording gives them."""
-
-    # (M,) landmarks of the map, ascending, how often each was seen, and for how many pairs it has not been.
-    kept: ClassVar = {
-        "_held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
-        "_observations": integers("landmarks", least=1),
-        "_unseen_for": integers("landmarks", least=0),
-    }
-    prefix = "names/"
-
-    def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
-        self.rig, self.config, self.model, self.landmark = rig, config.map, StereoPoint(rig), Point(3)
-        self.ids = np.zeros(0, dtype=np.int64)
-        self._sensor = NamedLandmarkSensor(self.model, self.landmark, config.likelihood.build())
-        self._held = np.zeros(0, dtype=np.int64)
-        self._observations, self._unseen_for = np.zeros((2, 0), dtype=np.int64)
-
-    def observe(self, frame: Pair[FeatureFrame], belief: Belief) -> Sequence[Observations]:
-        self._sensor.model = self.model
-        self.ids = np.where(frame.for_map, frame.features.landmarks, NULL)
-        return self._sensor.observe(frame.features.take(frame.for_map), belief)
-
-    def new_landmarks(
-        self, frame: Pair[FeatureFrame], belief: Belief, observed: Sequence[Observations]
-    ) -> Sequence[NewLandmarks]:
-        shown = frame.features.take(frame.for_map)
-        started = self._sensor.new_landmarks(shown, belief, observed)
-        held = np.union1d(self._held, shown.landmarks)
-        before, seen = np.searchsorted(held, self._held), np.isin(held, shown.landmarks)
-        observations, unseen_for = np.zeros((2, held.size), dtype=np.int64)
-        observations[before], unseen_for[before] = self._observations, self._unseen_for + 1
-        self._held, self._observations = held, observations + seen
-        self._unseen_for = np.where(seen, 0, unseen_for)
-        make_room(belief.map, held, self._unseen_for)
-        return started
-
-    def associate(self, pair: Pair[FeatureFrame], belief: Belief) -> np.ndarray:
-        """By their names; where the view is uncertain, only those that were observed more than once."""
-        known, names = self.seen_again() if pair.uncertain else self._held, pair.features.landmarks
-        return np.where(pair.for_map & np.isin(names, known) & belief.map.holds(names), names, NULL)
-
-    def put_away(self, pair: Pair[FeatureFrame], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
-        names = pair.features.landmarks
-        return np.where(pair.for_map & free & np.isin(names, joint.old.ids) & ~joint.holds(names), names, NULL)
-
-    def seen_again(self) -> np.ndarray:
-        return self._held[self._observations >= SEEN_AGAIN]

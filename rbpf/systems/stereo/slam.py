@@ -274,7 +274,7 @@ class StereoSlam(System):
                 left_over = np.concatenate([features.z[..., None], features.cov], axis=2)
                 left_over[landmarks.ids != NULL] = 0.0
                 self.reckoning = replace(self.reckoning, left_over=left_over)
-            self._kept = replace(pair, features=features, labels=motion.labelled(len(pair), static))
+            self._kept = replace(pair, features=features, images=None, labels=motion.labelled(len(pair), static))
         self.frames += 1
 
         # 5. Report: between updates the odometry moves the estimate.
