@@ -90,13 +90,13 @@ class JointMap(Map):
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
         substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
             frame; None has none. It may be observed together with a landmark.
-        is_constant: the substate never changes, as what a sensor or the wheels get wrong: all sub-maps have it in common.
-            They begin with nothing else: landmarks cannot be `put_away`, brought back or recognised.
+        constants: the last k numbers of the substate never change, as what a sensor or the wheels get wrong: all sub-maps
+            have them in common.
         compiled: use the models' fused kernels where they have one.
         submap: landmarks with which a sub-map ends at the latest (`LOCAL`), so that a step costs the same however large the
             map becomes; None keeps one Gaussian. Nothing may be observed in the world.
         passed_on: a sub-map ends when landmarks are `put_away`, and what stays goes over into the next one, as always with a
-            substate that changes; else that begins with nothing.
+            substate that changes; else that begins with nothing but constants.
         unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`;
             not beside constants.
 
@@ -118,26 +118,27 @@ class JointMap(Map):
         submap: int | None = None,
         passed_on: bool = False,
         unnamed: bool = False,
-        is_constant: bool = False,
+        constants: int = 0,
     ) -> None:
         self.space, self.compiled = space, compiled
         self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
         mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
-        if unnamed and is_constant and mean.size:
-            raise InputError("unnamed landmarks of old sub-maps are kept without constants: leave out is_constant")
+        if not 0 <= constants <= mean.size:
+            raise InputError(f"of a substate of {mean.size} numbers {constants} cannot be constants")
+        if unnamed and constants:
+            raise InputError("unnamed landmarks of old sub-maps are kept without constants: leave them out")
         gaussian.psd_factor(cov)
-        self._substate, self._first = (mean, cov), space.dim + mean.size
+        self._substate, self._first, self._constants = (mean, cov), space.dim + mean.size, constants
         self.held = JointColumns(space, self._first, [self.point])
         self.submap, self.unnamed = submap, unnamed
-        self.passed_on = passed_on or (mean.size > 0 and not is_constant)
+        self.passed_on = passed_on or mean.size > constants
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
         self.n, self._next_id = n, 0
-        constants = [] if self.passed_on else [Constants(*self._substate)]
-        self.old = SubMaps(self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed, *constants)
+        self._begin_old(*self._substate)
         self._given_ids = self.leaving = self._returning = np.zeros(0, dtype=np.int64)
         self._observed = self.leaving  # in a step what has been observed already, which stays until that ends
         self._begin_submap()
@@ -147,11 +148,20 @@ class JointMap(Map):
 
         Of that place, in its right chart, of the substate and of landmarks (K,) the covariance is (d + m + ΣD, …).
         """
+        own = slice(self.space.dim, self._first)
+        self._begin_old(substate, cov[own, own])
         self.origin, self.mean[:, self.space.dim : self._first] = origin, substate
         table = self.held.table
         each = [(table.first[row], self.held.kinds[table.kind[row]].dim) for row in self.held.rows_of(ids)]
         columns = np.concatenate([np.arange(self._first), *(first + np.arange(dim) for first, dim in each)])
         self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(cov)
+
+    def _begin_old(self, mean: np.ndarray, cov: np.ndarray) -> None:
+        """No finished sub-map, and a substate as it is known before: of constants each of them is told what all say."""
+        own = slice(mean.size - self._constants, None)
+        self.old = SubMaps(
+            self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed, Constants(mean[own], cov[own, own])
+        )
 
     def _begin_submap(self) -> None:
         """At the robot, with no landmark, and with what all sub-maps say of their constants."""
@@ -326,7 +336,7 @@ class JointMap(Map):
         observed = np.isin(leaving, self._observed)
         self._returning, self.leaving, leaving = leaving[:0], leaving[observed], leaving[~observed]
         far = int((~np.isin(returning, self.old.about.ids)).sum()) >= FEWEST
-        present = self._lasting()
+        present = self._present()
         if leaving.size or far:
             present.pass_on(self.old, leaving, returning if far else None)
         present.bring_in(self.old, returning[np.isin(returning, self.old.about.ids)])
@@ -340,14 +350,6 @@ class JointMap(Map):
         """The present sub-map, when a window has just ended and all particles are alike."""
         return Present(self.origin, self.held, self.mean[0], self.cov, self._given_ids)
 
-    def _lasting(self) -> Present:
-        """The present sub-map, of which something is to go over into the next one."""
-        if self.old.about.constants.size:
-            raise InputError(
-                "sub-maps that share constants exchange no landmarks: leave out is_constant, or put none away"
-            )
-        return self._present()
-
     def _take(self, present: Present) -> None:
         """All particles are as the present sub-map is."""
         self.origin, self.held, self.cov, self._given_ids = present.origin, present.held, present.cov, present.given
@@ -360,7 +362,7 @@ class JointMap(Map):
         held again. Not `tied`, what is seen is a sub-map of its own, as how the robot came here is not known: the substate
         alone is held on.
         """
-        present = self._lasting()
+        present = self._present()
         if tied:
             present.pass_on(self.old, seen.ids[:0], seen.ids, seen)
             present.bring_in(self.old, seen.ids)

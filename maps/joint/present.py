@@ -31,30 +31,33 @@ class Present:
         """As it would be if it ended here."""
         points = self.held.table.ids[self.held.table.kind == 0]
         columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
-        d, k = self.held.space.dim, old.about.constants.size
-        used = np.concatenate([np.arange(d), columns.ravel(), np.arange(d, d + k)])
+        d, constants = self.held.space.dim, self.constants(old)
+        used = np.concatenate([np.arange(d), columns.ravel(), constants])
         return SubMap(
             self.origin,
             points,
             self.mean[columns],
             principal(self.cov, used),
             given=old.given(given),
-            constants=self.mean[d : d + k],
-            known=old.known,
+            constants=self.mean[constants],
         )
+
+    def constants(self, old: SubMaps) -> np.ndarray:
+        """Columns (k,) of what is the same in all sub-maps: the last ones of the substate."""
+        return np.arange(self.held.first - old.about.constants.size, self.held.first)
 
     def pass_on(self, old: SubMaps, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:
         """Ends it, and begins the next one; what does not leave goes over as it is.
 
         All are solved for if landmarks are `wanted` from afar. What is `seen` of old landmarks besides stays behind.
         """
-        held, d = self.held, self.held.space.dim
-        point, dim, driving = held.kinds[0], held.kinds[0].dim, held.first - d
+        held, d, constants = self.held, self.held.space.dim, self.constants(old)
+        point, dim, driving = held.kinds[0], held.kinds[0].dim, held.first - d - constants.size
         seams = held.table.ids[held.table.ids < 0]
         # What drives the motion ties the two as landmarks do: as it is here it is held on, in numbers taken for places.
         count = -(-driving // dim)
         names = -1 - np.arange(count) - count * len(old.maps)
-        taken = np.append(np.arange(self.mean.size), np.arange(d, held.first))
+        taken = np.append(np.arange(self.mean.size), d + np.arange(driving))
         self.mean, self.cov = self.mean[taken], principal(self.cov, taken)
         if more := count * dim - driving:
             self.mean, self.cov = np.pad(self.mean, (0, more)), np.pad(self.cov, ((0, more), (0, more)))
@@ -69,8 +72,8 @@ class Present:
         self.given = held.table.ids[held.table.kind == 0]
         if (known := old.given(self.given)) is not None:
             # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
-            columns = held.of_one_kind(known.ids).columns.ravel()
-            own, off = principal(self.cov, columns), known.points.ravel() - self.mean[columns]
+            columns = np.append(held.of_one_kind(known.ids).columns, constants)
+            own, off = principal(self.cov, columns), np.append(known.points, known.constants) - self.mean[columns]
             if off.any() or not np.array_equal(known.cov, own):  # mostly they say the same
                 gain = np.linalg.solve(own, self.cov[columns]).T
                 self.mean = self.mean + gain @ off
@@ -82,6 +85,7 @@ class Present:
             ended = self.finished(old)
             seen, slope, rest = old.brought_back(returning, ended)
             columns = np.append(np.arange(self.held.space.dim), self.held.of_one_kind(ended.ids).columns)
+            columns = np.append(columns, self.constants(old))
             cross = slope @ self.cov[columns]
             self._hold(returning, seen)
             self.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
@@ -93,16 +97,22 @@ class Present:
         """
         space, first, none = self.held.space, self.held.first, seen.ids[:0]
         old.join(self.finished(old))
-        sighting = SubMap(space.identity(), none, seen.points[:0], np.eye(space.dim), tied=False).seeing(seen)
+        constants, given = old.known, old.given(none)
+        cov = block_diag(np.eye(space.dim), constants.cov)
+        sighting = SubMap(space.identity(), none, seen.points[:0], cov, False, given, constants.mean).seeing(seen)
         old.join(sighting, True, seen.ids)
         self.held, self.origin, self.given = JointColumns(space, first, self.held.kinds), space.identity(), none
         self.mean, self.cov = self.mean[:first].copy(), self.cov[:first, :first].copy()
         self.mean[: space.dim], self.cov[: space.dim], self.cov[:, : space.dim] = 0.0, 0.0, 0.0
-        # From where it begins, they are what all sub-maps say of them.
-        known = old.given(seen.ids)
+        # From where it begins, they are what all sub-maps say of them; what drove the motion is told by none.
+        known, columns = old.given(seen.ids), self.constants(old)
         assert known is not None
         self._hold(seen.ids, known.points)
-        self.cov = block_diag(self.cov, known.cov)
+        self.mean[columns] = known.constants
+        columns = np.append(first + np.arange(known.points.size), columns)
+        self.cov = block_diag(self.cov, np.zeros((known.points.size, known.points.size)))
+        self.cov[columns] = self.cov[:, columns] = 0.0
+        self.cov[np.ix_(columns, columns)] = known.cov
 
     def _hold(self, ids: np.ndarray, points: np.ndarray) -> None:
         self.held.add(ids, self.held.kinds[0], np.full(ids.size, -1), self.held.clones[:0])

@@ -20,11 +20,15 @@ EXACT = 1e-5
 
 
 class Given(NamedTuple):
-    """What was known of landmarks (K,) before a sub-map: at `points` (K, D) as seen from its start, with `cov` (KD, KD)."""
+    """What was known before a sub-map of landmarks (K,), at `points` (K, D) as seen from its start, and of `constants` (k,).
+
+    `cov` is that of both, (KD + k, KD + k).
+    """
 
     ids: np.ndarray
     points: np.ndarray
     cov: np.ndarray
+    constants: np.ndarray = np.zeros(0)
 
 
 class Constants(NamedTuple):
@@ -78,13 +82,17 @@ class SubMap(NamedTuple):
     tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
     given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
     constants: np.ndarray = NOTHING.mean
-    known: Constants = NOTHING  #: what was known of these before it.
 
     @property
     def mean(self) -> np.ndarray:
         """Of what `cov` is about."""
         pose = len(self.cov) - self.points.size - self.constants.size
         return np.concatenate([np.zeros(pose), self.points.ravel(), self.constants])
+
+    @property
+    def inherited(self) -> np.ndarray:
+        """Names (K,) of the landmarks that it began with."""
+        return self.ids[:0] if self.given is None else self.given.ids
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
         """Of its landmarks (K,)."""
@@ -105,7 +113,9 @@ class SubMap(NamedTuple):
 
     def seeing(self, seen: Given) -> "SubMap":
         """With landmarks that are seen from its end besides."""
-        cov = block_diag(self.cov, seen.cov)
+        last = len(self.cov) - self.constants.size
+        order = np.insert(np.arange(len(self.cov)), last, len(self.cov) + np.arange(seen.points.size))
+        cov = principal(block_diag(self.cov, seen.cov), order)
         return self._replace(ids=np.append(self.ids, seen.ids), points=np.append(self.points, seen.points, 0), cov=cov)
 
 
@@ -181,9 +191,8 @@ def solve(
     """Gauss-Newton over all starts and some landmarks (M,); the others of a sub-map are left out of its factor.
 
     It begins at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
-    `constants` (k,). What sub-maps were given is taken `off`, and what all but the first knew of constants before. It was
-    linearised elsewhere: where that leaves no minimum, a tenth of it stays; where this does not either, as when a filter
-    has diverged, all of it.
+    `constants` (k,). What sub-maps but the first were given is taken `off`. It was linearised elsewhere: where that leaves
+    no minimum, a tenth of it stays; where this does not either, as when a filter has diverged, all of it.
     """
     d, dim, k, first_guess = space.dim, world.shape[1], constants.size, (starts, world, constants)
     starts, world = starts.copy(), world.copy()
@@ -198,9 +207,9 @@ def solve(
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
         columns = np.append(columns, common)
         cov = principal(each.cov, own)
-        if each.given is not None:
+        if each.inherited.size:
             # A short one may know what drives the motion exactly from its start.
-            cov = cov + EXACT**2 * np.eye(len(cov))
+            cov = cov + EXACT**2 * np.diag(np.arange(len(cov)) < len(cov) - k)
         if each.tied:
             if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
                 cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
@@ -212,13 +221,15 @@ def solve(
     # What a sub-map was given is not its own: others say it.
     taken = []
     for number, each in enumerate(maps):
-        if each.given is not None and off:
-            at = np.array([place[landmark] for landmark in each.given.ids.tolist()], dtype=np.int64)
+        if number and each.given is not None and off:
+            at = np.array([place[landmark] for landmark in each.inherited.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
-            taken.append((number, each.given.points, at, columns, off * inverse_of(each.given.cov)))
-    before = [(each.known.mean, off * inverse_of(each.known.cov)) for each in maps[1:] if k and off]
-    known = sum((info for _, info in before), np.zeros((k, k)))
-    blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken] + [common]
+            columns = np.append(columns, common)
+            cov = each.given.cov
+            if at.size:
+                cov = cov + EXACT**2 * np.diag(np.arange(len(cov)) < len(cov) - k)
+            taken.append((number, each.given, at, columns, off * inverse_of(cov)))
+    blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
     free = [columns >= 0 for columns in blocks]  # the first start is where the world is
     blocks = [columns[own] for columns, own in zip(blocks, free, strict=True)]
     cliques = cliques_of(size, blocks)
@@ -238,19 +249,17 @@ def solve(
             summands.append(product)
             gradient[columns] += half @ residual  # columns below zero fall behind the end
             factors.append(Factor(own, columns, info, residual, by_ends, space.rotation(end), slice(d, d + seen.size)))
-        for number, points, at, columns, info in taken:
+        for number, given, at, columns, info in taken:
             seen = space.inverse_transform(starts[number], world[at])
-            by_start = -space.transform_jacobian(seen).reshape(-1, d)
-            half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0, 0)
+            by_start = np.pad(-space.transform_jacobian(seen).reshape(-1, d), ((0, k), (0, 0)))
+            half, product = _weighed(-info, by_start, space.rotation(starts[number]), 0, k)
             summands.append(product)
-            gradient[columns] += half @ (seen - points).ravel()
-        summands.append(-known)
-        gradient[common] -= sum((info @ (constants - mean) for mean, info in before), np.zeros(k))
+            gradient[columns] += half @ np.append(seen - given.points, constants - given.constants)
         summands = [part if own.all() else part[np.ix_(own, own)] for part, own in zip(summands, free, strict=True)]
         try:
             eliminated = Elimination(size, blocks, cliques, summands)
         except LinAlgError as error:
-            if taken or before:
+            if taken:
                 return solve(space, maps, ids, *first_guess, off=LESS if off == 1.0 else 0.0)
             raise InputError("the sub-maps leave a start or a landmark undetermined") from error
         step = -eliminated.solve(gradient[:size])
@@ -288,7 +297,7 @@ def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, betw
     ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
     points = np.concatenate([new.points, space.transform(between, old.points[old.rows(ids[new.ids.size :])])])
     starts = np.array([space.identity(), new.end, space.compose(new.end, between)])
-    both = [new, old._replace(tied=False, given=None)]
+    both = [new, old._replace(tied=False)]
     solution = solve(space, both, ids, starts, space.transform(new.end, points), new.constants)
     seen, cov = solution.seen_from(space, 1, np.arange(ids.size))
-    return SubMap(solution.starts[1], ids, seen, cov, constants=solution.constants, known=new.known)
+    return SubMap(solution.starts[1], ids, seen, cov, given=new.given, constants=solution.constants)

@@ -111,9 +111,7 @@ class SubMaps:
         self.maps: list[SubMap] = []
         self.starts = [space.identity()]
         cov = block_diag(np.zeros((space.dim, space.dim)), constants.cov)
-        self.about = SubMap(
-            self.start, np.zeros(0, dtype=np.int64), np.zeros((0, dim)), cov, constants=constants.mean, known=constants
-        )
+        self.about = SubMap(self.start, np.zeros(0, dtype=np.int64), np.zeros((0, dim)), cov, constants=constants.mean)
         self._places: tuple[np.ndarray, np.ndarray] | None = None
         self._factor_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
         self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
@@ -130,7 +128,7 @@ class SubMaps:
         return Constants(self.about.constants, self.about.cov[own, own])
 
     def presume(self, prior: Constants) -> None:
-        """All that is finished, had the constants had this prior before the first one."""
+        """All that is finished, had the constants had this prior before the first one; landmarks were passed on to none."""
         d, k = self.space.dim, prior.mean.size
 
         def anew(each: SubMap, before: Constants) -> SubMap:
@@ -138,11 +136,13 @@ class SubMaps:
             mean, cov = exchanged(each.mean, each.cov, slice(size, size + k), before, prior)
             end, cov = moved(self.space, each.end, mean[:d], cov)
             points = mean[d:size].reshape(each.points.shape)
-            return SubMap(end, each.ids, points, cov, each.tied, each.given, mean[size:], prior)
+            given = None if each.given is None else each.given._replace(cov=prior.cov, constants=prior.mean)
+            return SubMap(end, each.ids, points, cov, each.tied, given, mean[size:])
 
-        self.about = anew(self.about, self.maps[0].known if self.maps else self.known)
+        before = [self.known if each.given is None else Constants(each.given.constants, each.given.cov) for each in self.maps]
+        self.about = anew(self.about, before[0] if before else self.known)
         self.starts[-1] = self.about.end
-        self.maps = [anew(each, each.known) for each in self.maps]
+        self.maps = [anew(*pair) for pair in zip(self.maps, before, strict=True)]
         if self.maps:
             self.solve()
 
@@ -212,18 +212,16 @@ class SubMaps:
 
         maps, self.maps, self._last, self._places = self.maps, [], {}, None
         for each in maps:
-            given = None if each.given is None else each.given._replace(ids=renamed(each.given.ids))
+            given = None if each.given is None else each.given._replace(ids=renamed(each.inherited))
             self._hold(each._replace(ids=renamed(each.ids), given=given))
         self.about = self.about._replace(ids=renamed(self.about.ids))
         if self.beside is not None:
             self.beside = self.beside._replace(ids=renamed(self.beside.ids))
 
     def given(self, ids: np.ndarray) -> Given | None:
-        """What is known of landmarks (K,) about the start, by all that is finished."""
-        if not ids.size:
-            return None
-        own, points = self.about.of(self.about.rows(ids)), slice(self.space.dim, self.space.dim + self.dim * ids.size)
-        return Given(ids, own.points, own.cov[points, points])
+        """What is known of landmarks (K,) about the start, and of constants, by all that is finished."""
+        own, d = self.about.of(self.about.rows(ids)), self.space.dim
+        return Given(ids, own.points, own.cov[d:, d:], own.constants) if ids.size or own.constants.size else None
 
     def join(self, finished: SubMap, recall: bool = False, wanted: np.ndarray | None = None) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end.
@@ -235,13 +233,13 @@ class SubMaps:
         self._take(finished)
         if loop:
             self.solve(wanted)
-        if finished.given is None and finished.tied and min(before, default=len(self.maps)) < len(self.maps) - 2:
+        if not finished.inherited.size and finished.tied and min(before, default=len(self.maps)) < len(self.maps) - 2:
             self._fuse()
 
     def end(self, present: SubMap) -> Estimate:
         """World_from_end of the present sub-map, by it and what is known about its start."""
         space, d = self.space, self.space.dim
-        if present.given is not None and np.isin(present.ids, self.about.ids).sum() == present.given.ids.size:
+        if present.given is not None and np.isin(present.ids, self.about.ids).sum() == present.inherited.size:
             # All that both know was passed on: no more than the start has to follow.
             moved, by_new, rest = self._followed(present, np.arange(d))
             x, cross = np.append(moved, np.zeros(d)), by_new @ present.cov
@@ -279,10 +277,9 @@ class SubMaps:
         """
         space, d, dim, k = self.space, self.space.dim, self.dim, self.about.constants.size
         by_new = np.zeros((rows.size, len(new.cov)))
-        if new.given is None and not k:
+        if new.given is None:
             return np.zeros(rows.size), by_new, self.about.cov[np.ix_(rows, rows)]
-        names = self.about.ids[:0] if new.given is None else new.given.ids
-        _, mine, its = np.intersect1d(self.about.ids, names, assume_unique=True, return_indices=True)
+        _, mine, its = np.intersect1d(self.about.ids, new.inherited, assume_unique=True, return_indices=True)
         columns = self.about.columns(mine)[d:]
         held = self._factor_of_given
         if held is None or held[0] is not self.about.cov or not np.array_equal(held[1], columns):
@@ -291,7 +288,7 @@ class SubMaps:
             self._factor_of_given = held = self.about.cov, columns, gaussian.cholesky(own).T
         cross = self.about.cov[np.ix_(columns, rows)]
         gain = cho_solve((held[2], False), cross, check_finite=False).T
-        theirs = new.rows(names[its])
+        theirs = new.rows(new.inherited[its])
         seen, of_points, last = new.points[theirs], gain[:, : mine.size * dim], gain[:, mine.size * dim :]
         by_points = (of_points.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)).reshape(rows.size, -1)
         by_new[:, new.columns(theirs)[d:]] = np.concatenate([by_points, last], axis=1)
@@ -396,8 +393,8 @@ class SubMaps:
 
     def _tied(self, new: SubMap) -> _Tied:
         """One Kalman update by what is shared, without noise, of the Gaussians about the last start and the new end."""
-        space, d, dim, given = self.space, self.space.dim, self.dim, () if new.given is None else new.given.ids
-        left = np.flatnonzero(~np.isin(self.about.ids, given))
+        space, d, dim = self.space, self.space.dim, self.dim
+        left = np.flatnonzero(~np.isin(self.about.ids, new.inherited))
         about = self.about.of(left)
         _, mine, its = np.intersect1d(about.ids, new.ids, assume_unique=True, return_indices=True)
         first = len(about.cov)
@@ -406,7 +403,7 @@ class SubMaps:
         prior = np.append(about.mean, new.mean)
         of_mine = d + dim * mine[:, None] + np.arange(dim)
         of_its = first + d + dim * its[:, None] + np.arange(dim)
-        if new.given is not None or about.constants.size:
+        if new.given is not None:
             moved, by_new, rest = self._followed(new, self.about.columns(left))
             prior[:first] += moved
             cov[:first, first:] = cross = by_new @ new.cov
@@ -572,10 +569,9 @@ class SubMaps:
         """All of it, for a checkpoint."""
         named, none = {"submaps/starts": np.array(self.starts)}, np.zeros(0, dtype=np.int64)
         for number, each in enumerate([self.about, *self.maps]):
-            own, given = each._asdict(), each.given or Given(none, each.points[none], np.zeros((0, 0)))
+            own, given = each._asdict(), each.given or Given(none, each.points[none], np.zeros((0, 0)), NOTHING.mean)
             own |= {"tied": np.array(each.tied)} | {f"given_{name}": array for name, array in given._asdict().items()}
             del own["given"]
-            own |= {f"known_{name}": array for name, array in own.pop("known")._asdict().items()}
             named |= {f"submaps/{number}/{name}": array for name, array in own.items()}
         if self.frame is not None:
             named |= {"joint/frame": self.frame.mean, "joint/frame_cov": self.frame.cov}
@@ -597,15 +593,14 @@ class SubMaps:
                 "tied": checkpoint.truths(), "constants": checkpoint.numbers(k),
                 "given_ids": checkpoint.integers("given", refers=f"submaps/{number}/ids"),
                 "given_points": checkpoint.numbers("given", dim), "given_cov": checkpoint.numbers("entries", "entries"),
-                "known_mean": checkpoint.numbers(k), "known_cov": checkpoint.covariances(k, k),
+                "given_constants": checkpoint.numbers(k if number else 0),
             }  # fmt: skip
-            end, ids, points, cov, tied, constants, *given, mean, known = checkpoint.read(
-                arrays, schema, f"submaps/{number}/"
-            ).values()
-            if len(cov) != d + points.size + k or len(given[2]) != given[1].size:
+            found = checkpoint.read(arrays, schema, f"submaps/{number}/")
+            end, ids, points, cov, tied, constants, *given = found.values()
+            if len(cov) != d + points.size + k or len(given[2]) != given[1].size + given[3].size:
                 raise InputError(f"the arrays submaps/{number}/cov and given_cov do not fit the landmarks")
-            own = Given(*given) if given[0].size else None
-            maps.append(SubMap(end, ids, points, cov, bool(tied), own, constants, Constants(mean, known)))
+            own = Given(*given) if len(given[2]) else None
+            maps.append(SubMap(end, ids, points, cov, bool(tied), own, constants))
         self.about, self.maps, self._last = maps[0], [], {}
         for each in maps[1:]:
             self._hold(each)

@@ -165,7 +165,7 @@ def test_what_does_not_fit_together_is_said():
     with pytest.raises(InputError, match="two parts of the filter are named 'landmark'"):
         Filter(OdometryMotion(SE2), Scripted(), [LandmarkMap(SE2), JointMap(SE2)])
     with pytest.raises(InputError, match="unnamed landmarks of old sub-maps are kept without constants"):
-        JointMap(SE2, (np.zeros(1), np.eye(1)), submap=10, unnamed=True, is_constant=True)
+        JointMap(SE2, (np.zeros(1), np.eye(1)), submap=10, unnamed=True, constants=1)
 
 
 GROUPS = Example(groups=[Observations.raw(0.4, MODE)])

@@ -87,8 +87,9 @@ def test_joined_they_say_what_one_gaussian_says(submap, window, motion, start, f
     """Also where constants had another prior at `first`, which is exchanged."""
     readings, mean, cov = walk()
     n, tolerance = (10, 1e-6) if window == 1 else (4000, 0.05)  # a window's samples tell no more
-    whole = JointMap(Euclidean(2), start, is_constant=True)
-    joint = JointMap(Euclidean(2), first or start, submap=submap, is_constant=True)
+    constants = 0 if start is None else 2
+    whole = JointMap(Euclidean(2), start, constants=constants)
+    joint = JointMap(Euclidean(2), first or start, submap=submap, constants=constants)
     options = {"n": n, "rng": np.random.default_rng(0), "consolidation": Consolidation(window)}
     filters = [Filter(motion, NamedLandmarkSensor(Relative(), Point(2)), held, **options) for held in (whole, joint)]
     for t, reading in enumerate(readings):
@@ -110,8 +111,6 @@ def test_joined_they_say_what_one_gaussian_says(submap, window, motion, start, f
     np.testing.assert_array_equal(ids[order], np.arange(ids.size))
     if start is not None:
         names, *expected = whole.landmarks(filters[0].particles)
-        with pytest.raises(InputError, match="sub-maps that share constants exchange no landmarks"):
-            joint.recognise(Given(ids[:0], places[:0], np.zeros((0, 0))))
         mean[2:], cov[2:, 2:] = expected[0][np.argsort(names)].ravel(), block_diag(*expected[1][np.argsort(names)])
     np.testing.assert_allclose(places[order].ravel(), mean[2:], rtol=1e-6, atol=tolerance)
     for row, own in enumerate(covs[order]):
@@ -181,13 +180,14 @@ def test_with_a_landmark_come_back_those_that_were_seen_with_it():
     assert back.size == 4 and asked[0] in back and np.isin(back, finished[0].ids).all()
 
 
-def turning(space, each: SubMap, known: Constants, by: np.ndarray) -> SubMap:
+def turning(maps: SubMaps, each: SubMap, by: np.ndarray) -> SubMap:
     """What a robot makes of it whose turns are too large by as much in every sub-map, of which it knows something."""
+    space, known, given = maps.space, maps.known, maps.given(each.ids[:0])
     first, nothing = 0 if space is SE2 else 2, np.zeros(known.cov.shape)
     end = space.retract(each.end, np.eye(space.dim)[first] * (by - known.mean).sum())
     slope = np.vstack([-np.eye(len(each.cov))[:, [first] * by.size], np.eye(by.size)])
     cov = block_diag(each.cov, nothing) + slope @ known.cov @ slope.T
-    return each._replace(end=end, cov=cov, constants=known.mean, known=known)
+    return each._replace(end=end, cov=cov, constants=known.mean, given=given)
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_the_place_after_loops_is_as_uncertain_as_told(space, count, most, by):
         maps, closed = SubMaps(space, landmarks.shape[1], most, False, prior), 0
         for each in finished:
             closed += bool(maps.returned(each.ids).any())
-            maps.join(turning(space, each, maps.known, wrong))
+            maps.join(turning(maps, each, wrong))
         assert closed and len(maps.maps) <= 14
         error, d = space.local(maps.start, ends[-1]), space.dim
         pose.append(error @ np.linalg.solve(maps.about.cov[:d, :d], error) / d)
@@ -242,13 +242,13 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
     assert np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov), error).mean() < 6.0
 
 
-@pytest.mark.parametrize(("motion", "start"), [(DRIFTING, START), (Walk(), None)])
+@pytest.mark.parametrize(("motion", "start", "constants"), [(DRIFTING, START, 0), (STEADY, DRIFT, 2), (Walk(), None, 0)])
 @pytest.mark.parametrize(("most", "by_image"), [(3, False), (50, False), (3, True)])
-def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, motion, start):
-    """Of a velocity and landmarks out of view that come back, from near and, of the smaller, by a solution of all.
+def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, motion, start, constants):
+    """Of a velocity that changes or does not and landmarks out of view that come back, from near and, of the smaller, by a solution of all.
     They are held before they are seen, or recognised after it."""
     readings, space = walk(20)[0], Euclidean(2)
-    whole, submaps = (JointMap(space, start, submap=n, passed_on=True) for n in (None, most))
+    whole, submaps = (JointMap(space, start, submap=n, passed_on=True, constants=constants) for n in (None, most))
     options = {"n": 10, "lag": 1, "consolidation": Consolidation(1)}
     filters = [
         Filter(motion, NamedLandmarkSensor(Relative(), Point(2)), each, rng=np.random.default_rng(0), **options)
@@ -303,15 +303,15 @@ def test_a_checkpoint_holds_them_and_a_damaged_one_is_refused():
     finished, *_ = ring(SE2, 1)
     maps, again = (SubMaps(SE2, 2, 10, False, Constants(np.zeros(1), 0.01 * np.eye(1))) for _ in range(2))
     for each in finished:
-        maps.join(turning(SE2, each, maps.known, np.array([0.1])))
-    maps.look_from(turning(SE2, finished[0], maps.known, np.array([0.1])))
+        maps.join(turning(maps, each, np.array([0.1])))
+    maps.look_from(turning(maps, finished[0], np.array([0.1])))
     again.restore(maps.arrays())
     for mine, theirs in zip((*again.known, *again.landmarks()), (*maps.known, *maps.landmarks()), strict=True):
         np.testing.assert_array_equal(mine, theirs)
     for name, wrong in {
         "5/end": lambda a: a[1:], "starts": lambda a: a[1:], "0/ids": lambda a: a + 1000, "5/ids": lambda a: np.zeros_like(a),
-        "5/cov": lambda a: a[1:, 1:], "0/cov": lambda a: a[1:], "5/tied": lambda a: a + 2, "5/known_cov": lambda a: -a,
-        "5/given_ids": lambda a: np.append(a, -7), "5/constants": lambda a: a[1:], "5/known_mean": lambda a: a[:0],
+        "5/cov": lambda a: a[1:, 1:], "0/cov": lambda a: a[1:], "5/tied": lambda a: a + 2, "5/given_cov": lambda a: a[1:],
+        "5/given_ids": lambda a: np.append(a, -7), "5/constants": lambda a: a[1:], "5/given_constants": lambda a: a[:0],
     }.items():  # fmt: skip
         damaged = {key: wrong(array) if key.endswith("/" + name) else array for key, array in maps.arrays().items()}
         with pytest.raises(InputError, match="submaps/"):

@@ -255,7 +255,8 @@ class HandOver:
         config = self.config
         constants = len(self._numbers)
         variances = np.pad(config.velocity.start_std() ** 2, (0, constants))
-        joint = JointMap(SE3, (np.zeros(variances.size), np.diag(variances)), config.compiled, config.submap)
+        before = np.zeros(variances.size), np.diag(variances)
+        joint = JointMap(SE3, before, config.compiled, config.submap, constants=constants)
         joint.register(rays.landmark)
         consolidation = Consolidation(config.window, config.resampling.ess_threshold)
         motion = MarginalVelocity(config.velocity.walk_std(), constants)

@@ -82,7 +82,9 @@ class RangeBearingSlam(System):
         if is_joint:
             unnamed = is_unnamed and config.submap is not None
             prior = calibration.prior
-            landmark_map = JointMap(space, prior, config.compiled, config.submap, unnamed=unnamed, is_constant=True)
+            landmark_map = JointMap(
+                space, prior, config.compiled, config.submap, unnamed=unnamed, constants=calibration.learnt.size
+            )
         else:
             landmark_map = LandmarkMap(space, compiled=config.compiled)
             landmark_map.register(self.point)

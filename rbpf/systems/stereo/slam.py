@@ -144,7 +144,7 @@ class StereoSlam(System):
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
                     "none: set likelihood.kind=student, or map.kind=particles"
                 )
-            joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True)
+            joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True, constants=int(self._calibration.is_online))
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
