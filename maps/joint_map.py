@@ -58,7 +58,7 @@ from rbpf.maps.joint.rows import (
     turned,
     with_tails,
 )
-from rbpf.maps.joint.solution import Constants, Given, SubMap, exchanged, moved
+from rbpf.maps.joint.solution import Constants, Given, SubMap, exchanged, gain_of, moved
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
 from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations
@@ -134,6 +134,7 @@ class JointMap(Map):
         self.held = JointColumns(space, self._first, [self.point])
         self.submap, self.unnamed = submap, unnamed
         self.passed_on = passed_on or mean.size > constants
+        self._own = slice(self._first - constants, self._first)  # columns of the constants
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -181,13 +182,23 @@ class JointMap(Map):
         self._reading: Reading | None = None  # of what is observed in this step
 
     def presume(self, prior: Constants) -> None:
-        """When a window has ended: all that was observed, had a constant substate had this prior."""
-        before, d = self.old.known, self.space.dim
+        """When a window has ended: all that was observed, had the constants had this prior."""
+        before, d = self.old.prior, self.space.dim
         self.old.presume(prior)
-        mean, cov = exchanged(self.mean, self.cov, slice(d, self._first), before, self.old.known)
+        mean, cov = exchanged(self.mean, self.cov, self._own, before, prior)
         self.origin, turn = moved(self.space, self.origin, mean[0, :d], cov)
         mean[:, :d] = 0.0
         self.mean, self.cov = mean, turn
+        if self.old.maps:
+            if not self.passed_on:  # else about the start is what this one was given
+                self.old.solve()
+            self.old.look_from(self.finished())
+
+    def gain(self, particles: Particles, prior: Constants) -> float:
+        """By how many nats all that was observed is more probable if the constants have this prior, Mathematics (exchange)."""
+        own = self.mean[:, self._own]
+        mean, cov = gaussian.mixture_moments(particles.weights, own, self.cov[self._own, self._own][None])
+        return gain_of(Constants(mean, cov), self.old.prior, prior)
 
     def driving(self) -> np.ndarray | None:
         return self.mean[:, self.space.dim : self._first] if self._first > self.space.dim else None

@@ -61,6 +61,18 @@ def exchanged(
     return mean + slope @ (found - centre - before.mean), np.asarray(cov)
 
 
+def gain_of(found: Constants, before: Constants, after: Constants) -> float:
+    """By how many nats what led from the prior `before` to what is `found` is more probable with the prior `after`."""
+    info, infos = inverse_of(found.cov), [inverse_of(prior.cov) for prior in (before, after)]
+    told, by_told = info - infos[0], info @ found.mean - infos[0] @ before.mean
+    nats = []
+    for prior, own in zip((before, after), infos, strict=True):
+        pulled = by_told + own @ prior.mean
+        exponent = pulled @ np.linalg.solve(told + own, pulled) - prior.mean @ own @ prior.mean
+        nats.append(0.5 * (exponent + np.linalg.slogdet(own)[1] - np.linalg.slogdet(told + own)[1]))
+    return float(nats[1] - nats[0])
+
+
 def moved(
     space: SE2Group | SE3Group | Euclidean, pose: np.ndarray, by: np.ndarray, cov: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

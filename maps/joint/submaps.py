@@ -105,7 +105,7 @@ class SubMaps:
         unnamed: bool = False,
         constants: Constants = NOTHING,
     ) -> None:
-        self.space, self.dim, self.most, self.unnamed = space, dim, most, unnamed
+        self.space, self.dim, self.most, self.unnamed, self.prior = space, dim, most, unnamed, constants
         self.frame: Estimate | None = None
         self.beside: Beside | None = None
         self.maps: list[SubMap] = []
@@ -128,23 +128,23 @@ class SubMaps:
         return Constants(self.about.constants, self.about.cov[own, own])
 
     def presume(self, prior: Constants) -> None:
-        """All that is finished, had the constants had this prior before the first one; landmarks were passed on to none."""
-        d, k = self.space.dim, prior.mean.size
+        """All that is finished, had the constants had this prior before the first one."""
+        (before, self.prior), d, k = (self.prior, prior), self.space.dim, prior.mean.size
 
-        def anew(each: SubMap, before: Constants) -> SubMap:
-            size = len(each.cov) - k
-            mean, cov = exchanged(each.mean, each.cov, slice(size, size + k), before, prior)
-            end, cov = moved(self.space, each.end, mean[:d], cov)
-            points = mean[d:size].reshape(each.points.shape)
-            given = None if each.given is None else each.given._replace(cov=prior.cov, constants=prior.mean)
-            return SubMap(end, each.ids, points, cov, each.tied, given, mean[size:])
+        def anew(given: Given, first: int = 0) -> tuple[np.ndarray, Given]:
+            own = slice(len(given.cov) - k, len(given.cov))
+            mean = np.concatenate([np.zeros(first), given.points.ravel(), given.constants])
+            mean, cov = exchanged(mean, given.cov, own, before, prior)
+            return mean[:first], Given(given.ids, mean[first : own.start].reshape(given.points.shape), cov, mean[own])
 
-        before = [self.known if each.given is None else Constants(each.given.constants, each.given.cov) for each in self.maps]
-        self.about = anew(self.about, before[0] if before else self.known)
-        self.starts[-1] = self.about.end
-        self.maps = [anew(*pair) for pair in zip(self.maps, before, strict=True)]
-        if self.maps:
-            self.solve()
+        def of(each: SubMap) -> SubMap:
+            by, found = anew(Given(each.ids, each.points, each.cov, each.constants), d)
+            end, cov = moved(self.space, each.end, by, found.cov)
+            given = None if each.given is None else anew(each.given)[1]
+            return SubMap(end, each.ids, found.points, cov, each.tied, given, found.constants)
+
+        self.about, self.maps = of(self.about), [of(each) for each in self.maps]
+        self.starts[-1], self._places = self.about.end, None
 
     def returned(self, ids: np.ndarray) -> np.ndarray:
         """Which landmarks (K,) are of old sub-maps, and not among those about the start."""

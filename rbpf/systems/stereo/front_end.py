@@ -5,10 +5,9 @@ the order of its calls. Where `odometry.split` is not "none", odometry and map u
 always in the same half, whenever it is seen.
 """
 
-import copy
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, ClassVar, Generic, Self
+from typing import Any, ClassVar, Generic
 
 import numpy as np
 
@@ -68,10 +67,6 @@ class FrontEnd(ABC, Generic[F]):
     def is_tunable(self) -> bool:
         """Whether cameras that calibrate themselves can be measured."""
         return type(self).tune is not FrontEnd.tune and isinstance(self.landmarks.model, StereoPoint)
-
-    def copied(self) -> Self:
-        """Another one that begins as this one is."""
-        return copy.deepcopy(self)
 
     def tune(self, about: np.ndarray) -> None:
         """Columns of the right image are too large by `about` (1,) px: from here on they are measured without that."""
@@ -155,10 +150,6 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         extractor = extractor or Sift(config.sift)
         self.matcher = StereoMatcher(rig, extractor, config.pair)
         self.landmarks = landmarks or DescriptorLandmarks(rig, config, extractor.length)
-
-    def copied(self) -> Self:
-        """What finds and describes keypoints is theirs together."""
-        return copy.deepcopy(self, {id(self.matcher.extractor): self.matcher.extractor})
 
     def measure(self, frame: Any) -> tuple[Pair[StereoFeatures], str]:
         features, problem = self.features_of(frame)

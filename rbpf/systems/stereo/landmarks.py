@@ -137,9 +137,6 @@ class Landmarks(Sensor, ABC, Generic[F]):
         """Rows of features of that pair that are where the map has them: they stand still. By default none is known."""
         return np.zeros(0, dtype=np.intp)
 
-    def name_from(self, first: int) -> None:
-        """Before anything is seen: new landmarks are numbered from here on, unless the recording names them."""
-
     def columns(self, ids: np.ndarray) -> dict[str, np.ndarray]:
         """What is known of landmarks (M,) besides where they are, (M,) by name."""
         return {}
@@ -316,11 +313,8 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.manager = LandmarkManager(config.new_landmarks, (rig.camera.width, rig.camera.height), length)
         self.places = Places(rig, self.config)
         self.noise = LearntNoise() if self.config.kind == "joint" else None
-        self.ids, self._first_name = np.zeros(0, dtype=np.int64), 0
+        self.ids = np.zeros(0, dtype=np.int64)
         self._told: StereoFeatures
-
-    def name_from(self, first: int) -> None:
-        self._first_name = self.manager.next_name = first
 
     def observe(self, frame: Pair[StereoFeatures], belief: Belief) -> Sequence[Observations]:
         """The features that are landmarks, and those that are candidates."""
@@ -523,10 +517,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def counts(self, held: int) -> dict[str, float | int]:
         """All particles hold the same, as all associate alike."""
         landmarks = float(self.manager.confirmed.sum())
-        return {
-            "sift_features": int(self.manager.next_name) - self._first_name,
-            "landmarks_mean_per_particle": landmarks,
-        }
+        return {"sift_features": int(self.manager.next_name), "landmarks_mean_per_particle": landmarks}
 
     def confirmed_static(self) -> np.ndarray:
         return np.flatnonzero(np.isin(self.kinds(), (FeatureKind.LANDMARK, FeatureKind.CANDIDATE)))

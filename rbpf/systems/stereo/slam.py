@@ -9,12 +9,11 @@
 
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import integers, load_arrays, numbers, poses, read, truths
+from rbpf.core.checkpoint import integers, numbers, poses, read, truths
 from rbpf.core.models import NULL, Landmark, Part, Proposal
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
@@ -32,7 +31,7 @@ from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
-from rbpf.systems.stereo.calibration import UPDATES, Comparison, SelfCalibration
+from rbpf.systems.stereo.calibration import SelfCalibration
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd
@@ -43,7 +42,6 @@ from rbpf.systems.system import (
     DIAGNOSTICS,
     ESS,
     LOG_EVIDENCE,
-    MAP_IDS,
     NIS,
     NIS_DOF,
     RESAMPLED,
@@ -144,7 +142,10 @@ class StereoSlam(System):
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
                     "none: set likelihood.kind=student, or map.kind=particles"
                 )
-            joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True, constants=int(self._calibration.is_online))
+            joint = JointMap(
+                SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True,
+                constants=int(self._calibration.is_held),
+            )  # fmt: skip
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
@@ -155,7 +156,7 @@ class StereoSlam(System):
             )
         own = LandmarkMap(SE3, compiled=config.compiled)
         own.register(front_end.landmarks.landmark)
-        odometry = OdometryMotion(SE3, added, free, constants=int(self._calibration.is_online))
+        odometry = OdometryMotion(SE3, added, free, constants=int(self._calibration.is_held))
         parts = [joint or own]
         self.filter = self.new_filter(odometry, front_end.landmarks, parts, self._proposal.build(), config.map.window)
         self.frames = 0  #: pairs taken so far.
@@ -167,13 +168,6 @@ class StereoSlam(System):
         self._kept: Pair[Any] | None = None
         # Matches that no point in space has, and all, of the last pairs; whether that was said.
         self._impossible, self._doubted = np.zeros(2), False
-        # A run that calibrates the pair, beside this one as long as it is not decided which of them is right.
-        self._trial: StereoSlam | None = None
-        self._comparison = Comparison()
-        if config.calibrate == "auto" and self._calibration.is_possible:
-            self._trial = StereoSlam(rig, replace(config, calibrate="online"), front_end=front_end.copied())
-            # Both name landmarks, and a name is of one thing in the whole run.
-            self._trial.front_end.landmarks.name_from(UPDATES * config.new_landmarks.max_per_frame)
 
     def track(self, left: np.ndarray | None, right: np.ndarray | None, stamp_ns: int) -> Tracked:
         """A pair of rectified images (H, W) uint8, taken at one time.
@@ -200,14 +194,7 @@ class StereoSlam(System):
 
         # 1. Measure the pair: features that both cameras see.
         pair, problem = front_end.measure(frame)
-        tracked = self._take(frame.stamp_ns, pair, problem, offset_px, started)
-        return tracked if self._trial is None else self._compare(self._trial, tracked, pair, problem)
-
-    def _take(
-        self, stamp_ns: int, pair: Pair[Any], problem: str, offset_px: float, started: float, due: bool | None = None
-    ) -> Tracked:
-        """`take` with a pair that has been measured; `due` is whether the filter is updated, None to decide it here."""
-        messages, front_end, config, landmarks = list[str](), self.front_end, self.config, self.front_end.landmarks
+        stamp_ns, messages, config, landmarks = frame.stamp_ns, list[str](), self.config, front_end.landmarks
         seconds_features = time.perf_counter() - started
 
         # 2. How the camera has moved since the last pair that was measured; where this one tells too little, as before.
@@ -241,8 +228,7 @@ class StereoSlam(System):
         # 3. Update the filter if the camera has moved enough, and, where its motion was only assumed, if the map says where
         # it has come: until then no particle moves.
         report, seconds_filter = None, 0.0
-        if due is None:
-            due = self.filter.steps == 0 or config.trigger.reached(at.since_update, self.frames - self._last_update)
+        due = self.filter.steps == 0 or config.trigger.reached(at.since_update, self.frames - self._last_update)
         if measured:
             self.reckoning = at
         if measured and due:
@@ -261,6 +247,7 @@ class StereoSlam(System):
                     view, control, proposal = self._proposed(view, control, at.left_over, offset_px)
                 report = self.filter.step(view, control if self.filter.steps else None, pair.stamp_ns, proposal)
                 self.reckoning, self._last_update = at.updated(), self.frames
+                messages += filter(None, (self._calibration.watch(self.filter),))
                 found = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
                 self.at_update = Estimate(found.mean, found.cov)
                 seconds_filter = time.perf_counter() - begun - landmarks.seconds
@@ -318,43 +305,6 @@ class StereoSlam(System):
             tuple(messages),
         )
 
-    def _compare(self, trial: "StereoSlam", tracked: Tracked, pair: Pair[Any], problem: str) -> Tracked:
-        """The same pair in a run that calibrates it, which goes on in place of this one where it explains more."""
-        started, updated = time.perf_counter(), bool(tracked.values["updated"])
-        trial.filter.rng = np.random.default_rng((self.config.seed, self.frames))  # which a checkpoint need not hold
-        offset_px = trial._calibration.tune(trial.filter)
-        seen = trial.front_end.pair(pair.stamp_ns, trial.front_end.shifted(pair.features, -offset_px))
-        seen = replace(seen, images=pair.images, offset_px=offset_px)
-        try:
-            other = trial._take(tracked.stamp_ns, seen, problem, offset_px, started, updated)
-        except InputError:  # nothing explains the pair there
-            self._trial = None
-            return tracked
-        is_right = self._comparison.add(tracked, other)
-        if is_right:
-            self._go_on_as(trial)
-            offset_px, std_px = self.calibration()
-            size = f"{abs(offset_px):.2f} ± {std_px:.2f} px too {'small' if offset_px > 0.0 else 'large'}"
-            found = f"all disparities are {size}: the pair calibrates itself from here on"
-            return self._comparison.told(tracked, other, found)
-        if is_right is False:
-            self._trial = None
-        seconds = tracked.values["seconds_filter"] + time.perf_counter() - started
-        return replace(tracked, values={**tracked.values, "seconds_filter": seconds})
-
-    def _go_on_as(self, trial: "StereoSlam") -> None:
-        """The pairs so far are as they were in the trial, but for odometry alone, whose path is not told anew."""
-        self.filter, self.front_end, self._calibration = trial.filter, trial.front_end, trial._calibration
-        self.reckoning = replace(trial.reckoning, world_from_camera=self.reckoning.world_from_camera)
-        self.at_update, self.since_update = trial.at_update, trial.since_update
-        self._kept, self._last_update, self._trial = trial._kept, trial._last_update, None
-
-    def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        # A trial that has won has another map.
-        if self._trial and load_arrays(Path(path), "extra/stereo/calibrated").get("extra/stereo/calibrated"):
-            self._go_on_as(self._trial)
-        return super().load(path)
-
     def map(self) -> MapEstimate:
         """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
         found = estimate_map(self.filter)
@@ -407,14 +357,10 @@ class StereoSlam(System):
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The last measured pair, the landmarks' descriptors or names, the odometry, and the trial."""
-        kept, trial = {} if self._kept is None else self.front_end.arrays(self._kept), self._trial
-        if trial is not None:
-            kept |= {f"trial/{name}": array for name, array in (trial.filter.arrays() | trial.arrays()).items()}
-            kept |= self._comparison.arrays()
+        """The last measured pair, the landmarks' descriptors or names, and the odometry."""
         return {
-            **kept,
-            "stereo/calibrated": np.array(self._calibration.is_online),
+            **({} if self._kept is None else self.front_end.arrays(self._kept)),
+            **self._calibration.arrays(),
             **self.front_end.landmarks.arrays(),
             **self.reckoning.arrays(),
             "stereo/frames": np.array([self.frames, self._last_update]),
@@ -434,14 +380,7 @@ class StereoSlam(System):
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
-        own = {name.removeprefix("trial/"): array for name, array in arrays.items() if name.startswith("trial/")}
-        if self._trial and own:
-            self._comparison.restore(arrays)
-            self._trial.filter.restore(own)
-            assert self._trial.joint is not None
-            self._trial.restore(own | {MAP_IDS: self._trial.joint.all_ids})
-        else:
-            self._trial = None
+        self._calibration.restore(arrays)
 
     def _motion_to(self, pair: Pair[Any], dt: float) -> tuple[Pair[Any], "_Motion"]:
         """The pair, with those of its points that the last measured one has, aligned; the motion between, `dt` seconds."""
@@ -596,7 +535,7 @@ class StereoSlam(System):
         if not found.found:
             return prior
         measured = Odometry(found.previous_camera_from_camera, found.cov)
-        if not self._calibration.is_online:
+        if not self._calibration.is_held:
             return product(measured, prior)[0]
         # The pixels are free of the disparities' error as it was known when the pair was measured, before old landmarks were
         # brought back, which says more of it. The motion moves with what it is besides.
