@@ -194,6 +194,15 @@ class JointMap(Map):
                 self.old.solve()
             self.old.look_from(self.finished())
 
+    def pose_by_constants(self, particles: Particles) -> np.ndarray:
+        """How the robot's pose in the world moves with the constants, in the chart at its mean (d, k)."""
+        present, d = self._consolidated(particles), self.space.dim
+        ends = np.append(np.arange(d), present.constants(self.old))
+        cov = principal(present.cov, ends)
+        if self.old.maps:
+            cov = self.old.end_and_constants(present.finished(self.old))[1]
+        return np.linalg.solve(cov[d:, d:], cov[d:, :d]).T
+
     def gain(self, particles: Particles, prior: Constants) -> float:
         """By how many nats all that was observed is more probable if the constants have this prior, Mathematics (exchange)."""
         own = self.mean[:, self._own]

@@ -238,25 +238,32 @@ class SubMaps:
 
     def end(self, present: SubMap) -> Estimate:
         """World_from_end of the present sub-map, by it and what is known about its start."""
-        space, d = self.space, self.space.dim
+        mean, cov = self.end_and_constants(present)
+        return Estimate(mean, cov[: self.space.dim, : self.space.dim])
+
+    def end_and_constants(self, present: SubMap) -> tuple[np.ndarray, np.ndarray]:
+        """Its mean (E,), and the covariance (d + k, d + k) of it and the constants."""
+        space, d, k = self.space, self.space.dim, self.about.constants.size
         if present.given is not None and np.isin(present.ids, self.about.ids).sum() == present.inherited.size:
             # All that both know was passed on: no more than the start has to follow.
             moved, by_new, rest = self._followed(present, np.arange(d))
             x, cross = np.append(moved, np.zeros(d)), by_new @ present.cov
             spread = rest + cross @ by_new.T
-            own = np.block([[spread, cross[:, :d]], [cross[:, :d].T, present.cov[:d, :d]]])
+            theirs = np.append(np.arange(d), np.arange(len(present.cov) - k, len(present.cov)))
+            cross = cross[:, theirs]
+            own = np.block([[spread, cross], [cross.T, principal(present.cov, theirs)]])
         else:
             # Landmarks that one of the two alone has do not move ends.
             both = copy(self)
             both.about = self.about.of(np.flatnonzero(np.isin(self.about.ids, present.ids)))
             about, x, cov, half, _ = both._tied(present.of(np.flatnonzero(np.isin(present.ids, self.about.ids))))
-            ends = np.append(np.arange(d), len(about.cov) + np.arange(d))
-            x, own = x[ends], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
+            ends = np.concatenate([np.arange(d), len(about.cov) + np.arange(d), np.arange(len(x) - k, len(x))])
+            x, own = x[ends[: 2 * d]], cov[np.ix_(ends, ends)] - half[:, ends].T @ half[:, ends]
         end = space.retract(present.end, x[d:])
         by_start = space.adjoint(space.inverse(end)) @ space.right_jacobian(x[:d])
-        turn = np.concatenate([by_start, space.right_jacobian(x[d:])], axis=1)
+        turn = block_diag(np.concatenate([by_start, space.right_jacobian(x[d:])], axis=1), np.eye(k))
         mean = space.compose(space.retract(self.start, x[:d]), end)
-        return Estimate(mean, gaussian.symmetrise(turn @ own @ turn.T))
+        return mean, gaussian.symmetrise(turn @ own @ turn.T)
 
     def relative(self, number: int, present: SubMap) -> Estimate:
         """Where the end of the present sub-map is as seen from that of an older one, by all that is known."""

@@ -242,7 +242,9 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
     assert np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov), error).mean() < 6.0
 
 
-@pytest.mark.parametrize(("motion", "start", "constants"), [(DRIFTING, START, 0), (STEADY, DRIFT, 2), (Walk(), None, 0)])
+@pytest.mark.parametrize(
+    ("motion", "start", "constants"), [(DRIFTING, START, 0), (STEADY, DRIFT, 2), (Walk(), None, 0)]
+)
 @pytest.mark.parametrize(("most", "by_image"), [(3, False), (50, False), (3, True)])
 def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, motion, start, constants):
     """Of a velocity that changes or does not and landmarks out of view that come back, from near and, of the smaller, by a solution of all.

@@ -1,27 +1,32 @@
 """A pair that calibrates itself: an error common to all disparities is a constant of the joint map, learnt with all else.
 
-Whether there is one is decided by evidence (`calibrate=auto`): until all pairs so far are far more probable with it than without,
-the constant is as good as known to be 0, which costs nothing and learns by how much more probable they are.
+Whether there is one is decided by evidence (`calibrate=auto`): until all pairs so far are far more probable with it than
+without, the constant is as good as known to be 0. How the map hangs on it tells by how much more probable they are, and how all
+poses move once it is learnt.
 """
 
 from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import Kept, truths
+from rbpf.core.checkpoint import Kept, integers, numbers, poses, truths
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
 from rbpf.errors import InputError
+from rbpf.lie import SE3
 from rbpf.maps.joint.solution import Constants
 from rbpf.maps.joint_map import JointMap
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd
 from rbpf.systems.stereo.landmarks import F
+from rbpf.systems.system import Revision
 
 DECISIVE = 18.0
 """Nats by which one of the two explains the pairs better when that is no chance any more: as much as six sigma."""
 AS_GOOD_AS_KNOWN = 1e-3
 """How uncertain the constant is before, as a fraction of what it is then."""
+REVISED = 1000
+"""Pairs before the decision whose poses are told anew, at most."""
 
 
 @final
@@ -31,7 +36,14 @@ class SelfCalibration(Kept):
     Raises InputError: it is asked for, and has no place in the map.
     """
 
-    kept: ClassVar = {"is_estimated": truths()}
+    kept: ClassVar = {
+        "is_estimated": truths(),
+        "_slope": numbers(6),
+        "stamps_ns": integers("pairs"),
+        "poses": poses("pairs"),
+        "covs": numbers("pairs", 6, 6),
+        "slopes": numbers("pairs", 6),
+    }
     prefix = "calibration/"
 
     def __init__(self, config: StereoConfig, front_end: FrontEnd[Any]) -> None:
@@ -48,21 +60,44 @@ class SelfCalibration(Kept):
         scale = 1.0 if self.is_estimated else AS_GOOD_AS_KNOWN
         #: Mean (1,) and covariance (1, 1) before anything is seen, for the joint map; None where it has no place.
         self.prior = (np.zeros(1), scale**2 * self._prior.cov) if self.is_held else None
+        # How the last update's pose moves with it; and, told before it was decided, poses, covariances and how they move.
+        self._slope, self.slopes = np.zeros(6), np.zeros((0, 6))
+        self.stamps_ns, self.poses, self.covs = np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.zeros((0, 6, 6))
 
     def watch(self, filter_: Filter) -> str:
         """After an update: in words, that from here on it is estimated, and was not before."""
-        if (
-            self.is_estimated
-            or not self.is_held
-            or self._joint(filter_).gain(filter_.particles, self._prior) <= DECISIVE
-        ):
+        if self.is_estimated or not self.is_held:
+            return ""
+        joint, particles = self._joint(filter_), filter_.particles
+        self._slope = joint.pose_by_constants(particles)[:, 0]
+        if joint.gain(particles, self._prior) <= DECISIVE:
             return ""
         self.is_estimated = True
         filter_.consolidate()
-        self._joint(filter_).presume(self._prior)
+        joint.presume(self._prior)
         offset_px, std_px = self.estimate(filter_)
         size = f"{abs(offset_px):.2f} ± {std_px:.2f} px too {'small' if offset_px > 0.0 else 'large'}"
         return f"all disparities are {size}: the pair calibrates itself from here on"
+
+    def told(
+        self, filter_: Filter, stamp_ns: int, pose: np.ndarray, cov: np.ndarray, since_update: np.ndarray
+    ) -> Revision | None:
+        """All poses so far, anew, where it was decided by this pair, which has moved so since the last update."""
+        if not self.is_held or (self.is_estimated and not self.stamps_ns.size):
+            return None
+        offset_px, std_px = self.estimate(filter_)
+        earlier = SE3.retract(self.poses, offset_px * self.slopes)
+        spread = std_px**2 * self.slopes[:, :, None] * self.slopes[:, None, :]
+        slope = SE3.adjoint(SE3.inverse(since_update)) @ self._slope
+        self.stamps_ns = np.append(self.stamps_ns, stamp_ns)
+        self.poses = np.append(earlier, pose[None], axis=0)
+        self.covs = np.append(self.covs + spread, cov[None], axis=0)
+        self.slopes = np.append(self.slopes, slope[None], axis=0)
+        revision = Revision(self.stamps_ns, self.poses, self.covs) if self.is_estimated else None
+        kept = slice(0, 0) if self.is_estimated else slice(-REVISED, None)
+        self.stamps_ns, self.poses = self.stamps_ns[kept], self.poses[kept]
+        self.covs, self.slopes = self.covs[kept], self.slopes[kept]
+        return revision
 
     def estimate(self, filter_: Filter) -> tuple[float, float]:
         """As it is known by now, with its standard deviation, px."""

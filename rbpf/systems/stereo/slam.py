@@ -303,6 +303,7 @@ class StereoSlam(System):
             },
             {"z": told.z, "cov_z": told.cov, "kind": kinds, "landmarks": ids, "previous": previous},
             tuple(messages),
+            self._calibration.told(self.filter, stamp_ns, pose, cov, self.since_update),
         )
 
     def map(self) -> MapEstimate:
