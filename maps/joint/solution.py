@@ -13,10 +13,15 @@ from rbpf.maps.joint.elimination import Elimination, cliques_of
 
 ENOUGH, ITERATIONS = 0.1, 20
 """Length of the last step to a solution, in standard deviations of all of it together, and how many there are at most."""
-LESS = 0.9
-"""Of what sub-maps were given, the fraction that is taken off where all of it is more than they say."""
-EXACT = 1e-5
-"""Standard deviation [m, rad] of an end that is known exactly, as that of a robot which has not moved."""
+LESS = {1.0: 0.99, 0.99: 0.9, 0.9: 0.0}
+"""Of what sub-maps were given, the fraction that is taken off where that before is more than they say."""
+FORGOTTEN = -(2**40)
+"""Below it are names of what is no landmark any more."""
+EXACT, AT_REST = 1e-5, 1e-7
+"""Standard deviations [m, rad] of what drives the motion where it is known exactly, and of an end as that of a robot at rest.
+
+Landmarks are known to some micrometres from each other: what is taken for exact must not matter beside that.
+"""
 
 
 class Given(NamedTuple):
@@ -36,6 +41,11 @@ class Constants(NamedTuple):
 
     mean: np.ndarray
     cov: np.ndarray
+
+
+def are_seams(ids: np.ndarray) -> np.ndarray:
+    """Which of these (K,) are no landmarks, but numbers of what drives the motion where one sub-map ends and another begins."""
+    return (ids < 0) & (ids > FORGOTTEN)
 
 
 NOTHING = Constants(np.zeros(0), np.zeros((0, 0)))
@@ -204,7 +214,7 @@ def solve(
 
     It begins at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
     `constants` (k,). What sub-maps but the first were given is taken `off`. It was linearised elsewhere: where that leaves
-    no minimum, a tenth of it stays; where this does not either, as when a filter has diverged, all of it.
+    no minimum, a little of it stays; where a tenth does not help, as when a filter has diverged, all of it.
     """
     d, dim, k, first_guess = space.dim, world.shape[1], constants.size, (starts, world, constants)
     starts, world = starts.copy(), world.copy()
@@ -219,12 +229,11 @@ def solve(
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
         columns = np.append(columns, common)
         cov = principal(each.cov, own)
-        if each.inherited.size:
-            # A short one may know what drives the motion exactly from its start.
-            cov = cov + EXACT**2 * np.diag(np.arange(len(cov)) < len(cov) - k)
+        # A short one may know what drives the motion exactly from its start.
+        cov = cov + np.diag(np.pad(EXACT**2 * np.repeat(are_seams(each.ids[rows]), dim), (d, k)))
         if each.tied:
-            if np.diagonal(cov)[:d].min(initial=np.inf) < EXACT**2:
-                cov = cov + np.diag(np.where(np.arange(len(cov)) < d, EXACT**2, 0.0))
+            if np.diagonal(cov)[:d].min(initial=np.inf) < AT_REST**2:
+                cov = cov + np.diag(np.where(np.arange(len(cov)) < d, AT_REST**2, 0.0))
             info = inverse_of(cov)
         else:
             info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
@@ -237,9 +246,7 @@ def solve(
             at = np.array([place[landmark] for landmark in each.inherited.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
             columns = np.append(columns, common)
-            cov = each.given.cov
-            if at.size:
-                cov = cov + EXACT**2 * np.diag(np.arange(len(cov)) < len(cov) - k)
+            cov = each.given.cov + np.diag(np.pad(EXACT**2 * np.repeat(are_seams(each.inherited), dim), (0, k)))
             taken.append((number, each.given, at, columns, off * inverse_of(cov)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
     free = [columns >= 0 for columns in blocks]  # the first start is where the world is
@@ -272,7 +279,7 @@ def solve(
             eliminated = Elimination(size, blocks, cliques, summands)
         except LinAlgError as error:
             if taken:
-                return solve(space, maps, ids, *first_guess, off=LESS if off == 1.0 else 0.0)
+                return solve(space, maps, ids, *first_guess, off=LESS[off])
             raise InputError("the sub-maps leave a start or a landmark undetermined") from error
         step = -eliminated.solve(gradient[:size])
         starts[1:] = space.retract(starts[1:], step[:first].reshape(-1, d))

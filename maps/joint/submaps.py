@@ -26,6 +26,7 @@ from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.rows import plus_gram
 from rbpf.maps.joint.solution import (
     EXACT,
+    FORGOTTEN,
     ITERATIONS,
     NOTHING,
     Constants,
@@ -41,10 +42,8 @@ from rbpf.maps.joint.solution import (
 
 CLOSE_ENOUGH = 1e-6
 """Largest step [m, rad] at which two Gaussians are tied."""
-ROUNDING = 1e-12
+ROUNDING = 1e-15
 """Variance [m²] below which nothing is told apart."""
-FORGOTTEN = -(2**40)
-"""Below it are names of what is no landmark any more."""
 FIRM = 6
 """Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
 
