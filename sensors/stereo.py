@@ -134,7 +134,7 @@ class PairConfig(Ranged):
     #: of the refined windows, else the match is dropped.
     least_correlation: Annotated[float, Range(ge=-1.0, le=1.0)] = 0.8
     shift_px: Positive = 2.0  #: nor may the refinement move it further than this.
-    align: bool = False  #: whether points that are known again are put where their first view is; needs `refine`.
+    align: bool = True  #: whether points that are known again are put where their first view is, with `refine`.
     aligned_px: Positive = 0.05  #: σ_p of first views, and of an alignment …
     aligned_residual: Positive = 2.0  #: … in quadrature with so many times what its residual explains.
     place_px: Positive = 0.25  #: σ_p of a keypoint of scale 0 …
@@ -183,8 +183,6 @@ class StereoMatcher:
         self.rig = rig
         self.extractor = extractor or Sift()
         self.config = config or PairConfig()
-        if self.config.align and not self.config.refine:
-            raise InputError("pair.align measures disparities where first views are: it needs pair.refine=true")
         self.impulse_fraction = 0.0  #: Fraction of the pixels that were replaced in the last pair.
         self.rows_px = 0.0  #: By how many rows the last pair is not rectified.
         #: By which columns of the right image are known to be too large: they are measured without it.
@@ -262,7 +260,7 @@ class StereoMatcher:
         far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
         z, chosen = z[far], left.take(matches.first[far])
         kept, cov = (chosen.scale, chosen.orientation, chosen.descriptors), self.config.noise(chosen.scale)
-        if not self.config.align:
+        if not (self.config.align and self.config.refine):
             return StereoFeatures.measured(self.rig, z, cov, *kept)
         patch, first = first_views(images[0], z, chosen.orientation)
         exact = self.config.noise(chosen.scale, np.tile(self.config.aligned_px**2 * np.eye(2), (len(z), 1, 1)))

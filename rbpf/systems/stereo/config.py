@@ -1,7 +1,7 @@
 """Every setting of stereo SLAM, with its default, its unit and what it does."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -142,7 +142,7 @@ class StereoConfig(RunConfig):
     #: which features become landmarks, and how long they stay.
     new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
     #: of a joint map: the pair calibrates itself, an error common to all disparities being estimated with everything else
-    #: (online); by default if that explains the pairs better, which a second run beside this one tells (auto).
+    #: (online); by default from when on that explains all pairs so far far better (auto).
     calibrate: Literal["auto", "off", "online"] = "auto"
     #: what is known of a pair that calibrates itself.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
@@ -156,9 +156,10 @@ class StereoConfig(RunConfig):
 
     @classmethod
     def s05(cls) -> Self:
-        """The defaults that go with maps of the particles' own: 400 of them, and S05's truncated likelihood."""
+        """The defaults that go with maps of the particles' own: 400 of them, S05's truncated likelihood, keypoints' places."""
         return cls(
             particles=400,
+            pair=PairConfig(align=False),
             map=MapConfig(kind="particles"),
             likelihood=LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3),
         )
@@ -167,5 +168,8 @@ class StereoConfig(RunConfig):
     def defaults(cls, given: Mapping[str, Any]) -> Self:
         """The defaults that go with settings that are given, by name."""
         group = given.get("map")
-        asked = isinstance(group, dict) and (group.get("kind") == "particles" or group.get("used") is False)
-        return cls.s05() if asked else cls()
+        if isinstance(group, dict) and group.get("kind") == "particles":
+            return cls.s05()
+        # Visual odometry alone has no use for a joint map, and its points may be aligned as well.
+        is_used = not isinstance(group, dict) or group.get("used") is not False
+        return cls() if is_used else replace(cls.s05(), pair=PairConfig())
