@@ -172,6 +172,7 @@ class JointMap(Map):
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate if self.passed_on else self.old.known
         self.held = JointColumns(self.space, self._first, self.held.kinds)
+        self._walked = dict[int, np.ndarray]()  # what it has been loosened by, as seen from where it began
         self._reach = 0.0  # distance from the frame at which its landmarks were begun, at most
         self._leave_step()
 
@@ -368,11 +369,12 @@ class JointMap(Map):
 
     def _present(self) -> Present:
         """The present sub-map, when a window has just ended and all particles are alike."""
-        return Present(self.origin, self.held, self.mean[0], self.cov, self._given_ids)
+        return Present(self.origin, self.held, self.mean[0], self.cov, self._given_ids, self._walked)
 
     def _take(self, present: Present) -> None:
         """All particles are as the present sub-map is."""
         self.origin, self.held, self.cov, self._given_ids = present.origin, present.held, present.cov, present.given
+        self._walked = present.walked
         self.mean = np.repeat(present.mean[None], self.n, axis=0)
 
     def recognise(self, seen: Given, tied: bool = True) -> None:
@@ -475,7 +477,7 @@ class JointMap(Map):
             blocks.append((at, space.right_jacobian_inverse(mean[at]) @ space.right_jacobian(before[at])))
         mean[:d] = 0.0  # the mean of all worlds is the origin
         cov = plus_gram(turned(self.cov, blocks), apart(moved, weights))
-        return Present(origin, held, mean, cov, self._given_ids)
+        return Present(origin, held, mean, cov, self._given_ids, self._walked)
 
     def _turn(self, particles: Particles) -> np.ndarray:
         """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
@@ -663,6 +665,12 @@ class JointMap(Map):
         self.cov = self.cov.copy()
         for held in [self.cov] if self._gain is None else [self.cov, self._left()]:
             held[columns[:, :, None], columns[:, None, :]] += cov
+        turn, none = (
+            self.space.rotation(self._from_start(self.space.identity(), np.zeros(1, int))[0]),
+            np.zeros(cov.shape[1:]),
+        )
+        by_all = zip(ids.tolist(), turn @ cov @ turn.T, strict=True)
+        self._walked = self._walked | {name: self._walked.get(name, none) + by for name, by in by_all}
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         return np.zeros((self.n, ids.size))
@@ -706,6 +714,8 @@ class JointMap(Map):
         if self.submap is None:
             return named
         waiting = {"given": self._given_ids, "leaving": self.leaving, "returning": self._returning}
+        named["joint/walked_ids"] = np.array(list(self._walked), dtype=np.int64)
+        named["joint/walked"] = np.array(list(self._walked.values())).reshape(-1, self.point.dim, self.point.dim)
         if not self.passed_on:
             named["joint/reach"] = np.array([self._reach])
         return named | {f"joint/{name}": array for name, array in waiting.items()} | self.old.arrays()
@@ -730,6 +740,10 @@ class JointMap(Map):
             schema = {name: checkpoint.integers(f"{name} ids") for name in ("given", "leaving", "returning")}
             found = checkpoint.read(arrays, schema, "joint/")
             self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
+            dim = self.point.dim
+            schema = {"walked_ids": checkpoint.integers("walked"), "walked": checkpoint.numbers("walked", dim, dim)}
+            found = checkpoint.read(arrays, schema, "joint/")
+            self._walked = dict(zip(found["walked_ids"].tolist(), found["walked"], strict=True))
             if not self.passed_on:
                 self._reach = float(checkpoint.read_one(arrays, "joint/reach", checkpoint.numbers(1))[0])
             if not np.isin(self._given_ids, self.old.about.ids).all():

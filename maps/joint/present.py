@@ -26,19 +26,23 @@ class Present:
     mean: np.ndarray  #: (n,).
     cov: np.ndarray  #: (n, n).
     given: np.ndarray  #: (K,) landmarks of which finished sub-maps have told it something.
+    walked: dict[int, np.ndarray]  #: by which covariance (D, D) landmarks have walked in it, as seen from its start.
 
     def finished(self, old: SubMaps) -> SubMap:
         """As it would be if it ended here."""
         points = self.held.table.ids[self.held.table.kind == 0]
         columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
-        d, constants = self.held.space.dim, self.constants(old)
+        d, constants, told = self.held.space.dim, self.constants(old), old.given(given)
+        if told is not None and self.walked:
+            walked = [self.walked.get(name, still) for name, still in zip(given.tolist(), told.walked, strict=True)]
+            told = told._replace(walked=np.array(walked).reshape(told.walked.shape))
         used = np.concatenate([np.arange(d), columns.ravel(), constants])
         return SubMap(
             self.origin,
             points,
             self.mean[columns],
             principal(self.cov, used),
-            given=old.given(given),
+            given=told,
             constants=self.mean[constants],
         )
 
@@ -67,7 +71,7 @@ class Present:
         old.join(ended if seen is None else ended.seeing(seen), wanted is not None, wanted)
         columns = held.drop(held.rows_of(np.append(leaving, seams)))
         self.mean, self.cov = self.mean[columns], principal(self.cov, columns)
-        self.origin = held.space.identity()
+        self.origin, self.walked = held.space.identity(), {}
         self.mean[:d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0
         self.given = held.table.ids[held.table.kind == 0]
         if (known := old.given(self.given)) is not None:
@@ -102,6 +106,7 @@ class Present:
         sighting = SubMap(space.identity(), none, seen.points[:0], cov, False, given, constants.mean).seeing(seen)
         old.join(sighting, True, seen.ids)
         self.held, self.origin, self.given = JointColumns(space, first, self.held.kinds), space.identity(), none
+        self.walked = {}
         self.mean, self.cov = self.mean[:first].copy(), self.cov[:first, :first].copy()
         self.mean[: space.dim], self.cov[: space.dim], self.cov[:, : space.dim] = 0.0, 0.0, 0.0
         # From where it begins, they are what all sub-maps say of them; what drove the motion is told by none.

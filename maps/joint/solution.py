@@ -27,13 +27,14 @@ Landmarks are known to some micrometres from each other: what is taken for exact
 class Given(NamedTuple):
     """What was known before a sub-map of landmarks (K,), at `points` (K, D) as seen from its start, and of `constants` (k,).
 
-    `cov` is that of both, (KD + k, KD + k).
+    `cov` is that of both, (KD + k, KD + k); landmarks have `walked` since, by a covariance (K, D, D).
     """
 
     ids: np.ndarray
     points: np.ndarray
     cov: np.ndarray
     constants: np.ndarray = np.zeros(0)
+    walked: np.ndarray = np.zeros((0, 0, 0))
 
 
 class Constants(NamedTuple):
@@ -44,7 +45,7 @@ class Constants(NamedTuple):
 
 
 def are_seams(ids: np.ndarray) -> np.ndarray:
-    """Which of these (K,) are no landmarks, but numbers of what drives the motion where one sub-map ends and another begins."""
+    """Which of these (K,) are no landmarks, but what drove the motion where one sub-map ended and another began."""
     return (ids < 0) & (ids > FORGOTTEN)
 
 
@@ -221,16 +222,14 @@ def solve(
     place = {landmark: row for row, landmark in enumerate(ids.tolist())}
     first = d * len(maps)
     size = first + dim * ids.size + k
-    common, parts = np.arange(size - k, size), []
+    common, parts, loose = np.arange(size - k, size), [], _looser(space, maps, starts)
     for number, each in enumerate(maps):
         rows = np.array([row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64)
         own = each.columns(rows)
         at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
         columns = np.append(columns, common)
-        cov = principal(each.cov, own)
-        # A short one may know what drives the motion exactly from its start.
-        cov = cov + np.diag(np.pad(EXACT**2 * np.repeat(are_seams(each.ids[rows]), dim), (d, k)))
+        cov = _loosened(principal(each.cov, own), d, loose[number][0][rows])
         if each.tied:
             if np.diagonal(cov)[:d].min(initial=np.inf) < AT_REST**2:
                 cov = cov + np.diag(np.where(np.arange(len(cov)) < d, AT_REST**2, 0.0))
@@ -246,7 +245,7 @@ def solve(
             at = np.array([place[landmark] for landmark in each.inherited.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
             columns = np.append(columns, common)
-            cov = each.given.cov + np.diag(np.pad(EXACT**2 * np.repeat(are_seams(each.inherited), dim), (0, k)))
+            cov = _loosened(each.given.cov, 0, loose[number][1])
             taken.append((number, each.given, at, columns, off * inverse_of(cov)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
     free = [columns >= 0 for columns in blocks]  # the first start is where the world is
@@ -288,6 +287,35 @@ def solve(
         if -step @ gradient[:size] < ENOUGH**2:
             break
     return Solution(ids, world, starts, constants, factors, eliminated, is_whole=off > 0.0)
+
+
+def _looser(
+    space: SE2Group | SE3Group | Euclidean, maps: list[SubMap], starts: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """By how much less is known of each sub-map's landmarks (M, D, D), and of those it was given (K, D, D), than when it ended.
+
+    They have walked since, in it and in later ones that were given them; and what drives the motion is never taken for exact.
+    """
+    dim, since, found = maps[0].points.shape[1], dict[int, np.ndarray](), []
+    none = np.zeros((dim, dim))
+    for each, start, end in zip(reversed(maps), starts[-2::-1], starts[:0:-1], strict=True):
+        both = list[np.ndarray]()
+        for ids, turn in ((each.ids, space.rotation(end)), (each.inherited, space.rotation(start))):
+            if both and each.given is not None and each.given.walked.size:
+                walked = turn @ each.given.walked @ turn.T
+                since |= {name: since.get(name, none) + by for name, by in zip(ids.tolist(), walked, strict=True)}
+            by_all = np.array([since.get(name, none) for name in ids.tolist()]).reshape(-1, dim, dim)
+            both.append(turn.T @ by_all @ turn + EXACT**2 * are_seams(ids)[:, None, None] * np.eye(dim))
+        found.append((both[0], both[1]))
+    return found[::-1]
+
+
+def _loosened(cov: np.ndarray, first: int, by: np.ndarray) -> np.ndarray:
+    """A covariance of which points, in columns from the `first` on, are known less, by (M, D, D)."""
+    at = first + np.arange(by.shape[0] * by.shape[1]).reshape(by.shape[:2])
+    cov = cov.copy()
+    cov[at[:, :, None], at[:, None, :]] += by
+    return cov
 
 
 def _weighed(

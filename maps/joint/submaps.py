@@ -134,7 +134,8 @@ class SubMaps:
             own = slice(len(given.cov) - k, len(given.cov))
             mean = np.concatenate([np.zeros(first), given.points.ravel(), given.constants])
             mean, cov = exchanged(mean, given.cov, own, before, prior)
-            return mean[:first], Given(given.ids, mean[first : own.start].reshape(given.points.shape), cov, mean[own])
+            points = mean[first : own.start].reshape(given.points.shape)
+            return mean[:first], given._replace(points=points, cov=cov, constants=mean[own])
 
         def of(each: SubMap) -> SubMap:
             by, found = anew(Given(each.ids, each.points, each.cov, each.constants), d)
@@ -220,7 +221,9 @@ class SubMaps:
     def given(self, ids: np.ndarray) -> Given | None:
         """What is known of landmarks (K,) about the start, and of constants, by all that is finished."""
         own, d = self.about.of(self.about.rows(ids)), self.space.dim
-        return Given(ids, own.points, own.cov[d:, d:], own.constants) if ids.size or own.constants.size else None
+        if not (ids.size or own.constants.size):
+            return None
+        return Given(ids, own.points, own.cov[d:, d:], own.constants, np.zeros((ids.size, self.dim, self.dim)))
 
     def join(self, finished: SubMap, recall: bool = False, wanted: np.ndarray | None = None) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end.
@@ -575,7 +578,11 @@ class SubMaps:
         """All of it, for a checkpoint."""
         named, none = {"submaps/starts": np.array(self.starts)}, np.zeros(0, dtype=np.int64)
         for number, each in enumerate([self.about, *self.maps]):
-            own, given = each._asdict(), each.given or Given(none, each.points[none], np.zeros((0, 0)), NOTHING.mean)
+            own, given = (
+                each._asdict(),
+                each.given
+                or Given(none, each.points[none], np.zeros((0, 0)), walked=np.zeros((0, self.dim, self.dim))),
+            )
             own |= {"tied": np.array(each.tied)} | {f"given_{name}": array for name, array in given._asdict().items()}
             del own["given"]
             named |= {f"submaps/{number}/{name}": array for name, array in own.items()}
@@ -600,6 +607,7 @@ class SubMaps:
                 "given_ids": checkpoint.integers("given", refers=f"submaps/{number}/ids"),
                 "given_points": checkpoint.numbers("given", dim), "given_cov": checkpoint.numbers("entries", "entries"),
                 "given_constants": checkpoint.numbers(k if number else 0),
+                "given_walked": checkpoint.numbers("given", dim, dim),
             }  # fmt: skip
             found = checkpoint.read(arrays, schema, f"submaps/{number}/")
             end, ids, points, cov, tied, constants, *given = found.values()

@@ -248,8 +248,8 @@ def test_a_step_holds_no_more_than_a_sub_map_and_the_pose_stays_true(tmp_path):
 )
 @pytest.mark.parametrize(("most", "by_image"), [(3, False), (50, False), (3, True)])
 def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, motion, start, first):
-    """Of landmarks out of view that come back, from near and, of the smaller, by a solution of all, held before they are seen or
-    recognised after it; of a velocity that changes or is constant, with another prior at `first`, which is exchanged."""
+    """Of landmarks out of view that come back, from near and, of the smaller, by a solution of all, held before they are seen
+    or recognised after it; of a velocity that changes or is constant, with another prior at `first`, which is exchanged."""
     readings, space = walk(20)[0], Euclidean(2)
     options = {"passed_on": True, "constants": 2 * (motion is STEADY)}
     whole, submaps = JointMap(space, start, **options), JointMap(space, first, submap=most, **options)

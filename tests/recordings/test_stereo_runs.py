@@ -40,7 +40,7 @@ def test_the_road(data_dir):
     found = scores(filter_opened(open_pairs(open_stereo(data_dir / "stereo_kitti_seq1"), StereoConfig())))
     assert found["ate_sim3_rmse_m"] <= min(0.035, found["vo_ate_sim3_rmse_m"])
     assert found["ate_rmse_m"] <= 0.096
-    assert found["vo_rpe_translation_rmse_m"] <= 0.018  # no jump where the run goes on as its trial
+    assert found["vo_rpe_translation_rmse_m"] <= 0.018  # no jump where it begins to calibrate itself
 
 
 def test_there_and_back_again(data_dir):

@@ -167,7 +167,7 @@ def test_an_error_of_all_disparities_is_found():
 
 
 def test_a_pair_calibrates_itself_where_that_explains_it_better(log):
-    """Then it is as if it had done so from the start; else as if its calibration were certain, to the last byte."""
+    """Then it is as if it had done so from the start, but for the evidence until then; else as if its calibration were certain."""
     config = StereoConfig(trigger=CONFIG.trigger, self_calibration=CalibrationConfig(disparity_px=2.0))
     wrong = replace(log, frames=[replace(frame, z=frame.z + np.array([0.0, 0.0, 2.0])) for frame in log.frames])
     tried, online, off = (filtered(wrong, replace(config, calibrate=each)) for each in ("auto", "online", "off"))
@@ -175,9 +175,10 @@ def test_a_pair_calibrates_itself_where_that_explains_it_better(log):
     assert abs(found - right) < std and not tried.log["offset_px"][:5].any()
     assert [message.split(": ")[-1] for message in tried.messages] == ["the pair calibrates itself from here on"]
     apart = [np.abs(SE3.translation(run.log.poses) - SE3.translation(online.log.poses)).max() for run in (tried, off)]
-    assert apart[0] < 0.2 * apart[1] and abs((tried.log["log_evidence"] - online.log["log_evidence"]).sum()) < 3.0
+    assert apart[0] < 0.25 * apart[1] and 18.0 < (online.log["log_evidence"] - tried.log["log_evidence"]).sum() < 40.0
     tried, off = (filtered(log, replace(config, calibrate=each)) for each in ("auto", "off"))
-    assert tried.log.poses.tobytes() == off.log.poses.tobytes() and "calibration" not in tried.system.summary(tried.log)
+    np.testing.assert_allclose(tried.log.poses, off.log.poses, atol=1e-4)
+    assert "calibration" not in tried.system.summary(tried.log)
 
 
 def test_settings_that_do_not_go_together_are_refused(log):

@@ -1,8 +1,8 @@
 """A pair that calibrates itself: an error common to all disparities is a constant of the joint map, learnt with all else.
 
 Whether there is one is decided by evidence (`calibrate=auto`): until all pairs so far are far more probable with it than
-without, the constant is as good as known to be 0. How the map hangs on it tells by how much more probable they are, and how all
-poses move once it is learnt.
+without, the constant is as good as known to be 0. How the map hangs on it tells by how much more probable they are, and how
+all poses move once it is learnt.
 """
 
 from typing import Any, ClassVar, final
