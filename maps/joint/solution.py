@@ -292,7 +292,7 @@ def solve(
 def _looser(
     space: SE2Group | SE3Group | Euclidean, maps: list[SubMap], starts: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """By how much less is known of each sub-map's landmarks (M, D, D), and of those it was given (K, D, D), than when it ended.
+    """By how much less is known of each sub-map's landmarks (M, D, D), and of those it was given (K, D, D), than it was.
 
     They have walked since, in it and in later ones that were given them; and what drives the motion is never taken for exact.
     """

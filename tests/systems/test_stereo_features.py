@@ -167,7 +167,7 @@ def test_an_error_of_all_disparities_is_found():
 
 
 def test_a_pair_calibrates_itself_where_that_explains_it_better(log):
-    """Then it is as if it had done so from the start, but for the evidence until then; else as if its calibration were certain."""
+    """Then it is as if it had done so from the start, but for the evidence until then; else as if it were certain."""
     config = StereoConfig(trigger=CONFIG.trigger, self_calibration=CalibrationConfig(disparity_px=2.0))
     wrong = replace(log, frames=[replace(frame, z=frame.z + np.array([0.0, 0.0, 2.0])) for frame in log.frames])
     tried, online, off = (filtered(wrong, replace(config, calibrate=each)) for each in ("auto", "online", "off"))
