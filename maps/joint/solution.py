@@ -229,7 +229,7 @@ def solve(
         at = np.array([place[landmark] for landmark in each.ids[rows].tolist()], dtype=np.int64)
         columns = np.append(d * number + np.arange(-d, d), first + dim * at[:, None] + np.arange(dim))
         columns = np.append(columns, common)
-        cov = _loosened(principal(each.cov, own), d, loose[number][0][rows])
+        cov = loosened(principal(each.cov, own), d, loose[number][0][rows])
         if each.tied:
             if np.diagonal(cov)[:d].min(initial=np.inf) < AT_REST**2:
                 cov = cov + np.diag(np.where(np.arange(len(cov)) < d, AT_REST**2, 0.0))
@@ -245,7 +245,7 @@ def solve(
             at = np.array([place[landmark] for landmark in each.inherited.tolist()], dtype=np.int64)
             columns = np.append(d * number + np.arange(-d, 0), first + dim * at[:, None] + np.arange(dim))
             columns = np.append(columns, common)
-            cov = _loosened(each.given.cov, 0, loose[number][1])
+            cov = loosened(each.given.cov, 0, loose[number][1])
             taken.append((number, each.given, at, columns, off * inverse_of(cov)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
     free = [columns >= 0 for columns in blocks]  # the first start is where the world is
@@ -310,7 +310,7 @@ def _looser(
     return found[::-1]
 
 
-def _loosened(cov: np.ndarray, first: int, by: np.ndarray) -> np.ndarray:
+def loosened(cov: np.ndarray, first: int, by: np.ndarray) -> np.ndarray:
     """A covariance of which points, in columns from the `first` on, are known less, by (M, D, D)."""
     at = first + np.arange(by.shape[0] * by.shape[1]).reshape(by.shape[:2])
     cov = cov.copy()

@@ -36,6 +36,7 @@ from rbpf.maps.joint.solution import (
     exchanged,
     fused,
     inverse_of,
+    loosened,
     moved,
     solve,
 )
@@ -112,7 +113,7 @@ class SubMaps:
         cov = block_diag(np.zeros((space.dim, space.dim)), constants.cov)
         self.about = SubMap(self.start, np.zeros(0, dtype=np.int64), np.zeros((0, dim)), cov, constants=constants.mean)
         self._places: tuple[np.ndarray, np.ndarray] | None = None
-        self._factor_of_given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # with what it is of
+        self._factor_of_given: tuple[np.ndarray, ...] | None = None  # behind what it is of
         self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
 
     @property
@@ -284,19 +285,18 @@ class SubMaps:
         (passed-on). Returns how far the rows move (R,), by what slope with the new sub-map (R, d + MD), and what is left
         of their covariance given it.
         """
-        space, d, dim, k = self.space, self.space.dim, self.dim, self.about.constants.size
+        space, d, dim = self.space, self.space.dim, self.dim
         by_new = np.zeros((rows.size, len(new.cov)))
         if new.given is None:
             return np.zeros(rows.size), by_new, self.about.cov[np.ix_(rows, rows)]
         _, mine, its = np.intersect1d(self.about.ids, new.inherited, assume_unique=True, return_indices=True)
         columns = self.about.columns(mine)[d:]
-        held = self._factor_of_given
-        if held is None or held[0] is not self.about.cov or not np.array_equal(held[1], columns):
-            noise = np.diag(np.append(np.full(columns.size - k, ROUNDING), np.zeros(k)))
-            own = principal(self.about.cov, columns) + noise
-            self._factor_of_given = held = self.about.cov, columns, gaussian.cholesky(own).T
+        held, walked = self._factor_of_given, new.given.walked[its] + ROUNDING * np.eye(dim)
+        if held is None or held[0] is not self.about.cov or not all(map(np.array_equal, held[1:3], (columns, walked))):
+            own = loosened(principal(self.about.cov, columns), 0, walked)
+            self._factor_of_given = held = self.about.cov, columns, walked, gaussian.cholesky(own).T
         cross = self.about.cov[np.ix_(columns, rows)]
-        gain = cho_solve((held[2], False), cross, check_finite=False).T
+        gain = cho_solve((held[3], False), cross, check_finite=False).T
         theirs = new.rows(new.inherited[its])
         seen, of_points, last = new.points[theirs], gain[:, : mine.size * dim], gain[:, mine.size * dim :]
         by_points = (of_points.reshape(rows.size, mine.size, dim) @ space.rotation(new.end)).reshape(rows.size, -1)

@@ -30,7 +30,7 @@ OWN_ENTRIES = {
 @pytest.fixture(scope="module")
 def finished(room, tmp_path_factory, keypoints_once):
     out = tmp_path_factory.mktemp("finished") / "run"
-    assert run_stereo(room, out, "--set", "pair.align=true") == 0
+    assert run_stereo(room, out) == 0
     return out
 
 
@@ -46,6 +46,9 @@ def test_what_it_leaves(finished):
     assert np.isfinite(entries["log_evidence"])
     assert "problems" not in entries and "failure" not in entries
     assert 0 < entries["landmarks_mean_per_particle"] < entries["sift_features"]
+    assert (
+        entries["distance_m"] > 0.3 and max(entries["ate_rmse_m"], entries["vo_ate_rmse_m"]) < 0.01
+    )  # of about a metre
 
 
 def test_the_files_agree(finished):
@@ -66,16 +69,9 @@ def test_the_files_agree(finished):
     np.testing.assert_array_equal(np.load(finished / "map.npz")["id"], landmarks["id"])
 
 
-def test_it_follows_the_camera(finished):
-    """The camera goes about a metre."""
-    entries = untimed_summary(finished)
-    assert entries["distance_m"] > 0.3
-    assert entries["ate_rmse_m"] < 0.01 and entries["vo_ate_rmse_m"] < 0.01
-
-
 def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_path):
     """A real signal to a real process, in the middle of an update; the pair is finished first."""
-    arguments = ["run", "stereo", str(room), "--set", "pair.align=true", "--out", str(tmp_path / "cut")]
+    arguments = ["run", "stereo", str(room), "--out", str(tmp_path / "cut")]
     command = [sys.executable, "-c", _WAITING, *arguments]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = subprocess.Popen(command, text=True, **pipes)
