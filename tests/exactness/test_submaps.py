@@ -258,7 +258,7 @@ def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, walks, motio
         Filter(motion, NamedLandmarkSensor(Relative(), Point(2)), each, rng=np.random.default_rng(0), **options)
         for each in (whole, submaps)
     ]
-    evidence = np.zeros(2)
+    evidence, told = np.zeros(2), []
     for t, reading in enumerate(readings):
         following = readings[min(t + 1, len(readings) - 1)].landmarks
         if t % 3 == 2:
@@ -275,7 +275,6 @@ def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, walks, motio
             assert by_image and again.sum() == 4
             submaps.recognise(Given(reading.landmarks[again], reading.z[again], np.kron(np.eye(again.sum()), NOISE)))
         if t == 12 and first is FIRST:
-            filters[1].consolidate()
             particles, prior = filters[1].particles, Constants(*start)
             slope, gain = submaps.pose_by_constants(particles), submaps.gain(particles, prior)
             (before, _), (pose, _) = submaps.moments(particles, Part.SUBSTATE), submaps.moments(particles, Part.STATE)
@@ -283,7 +282,6 @@ def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, walks, motio
             by = slope @ (submaps.moments(particles, Part.SUBSTATE)[0] - before)
             np.testing.assert_allclose(submaps.moments(particles, Part.STATE)[0] - pose, by, atol=1e-6)
             np.testing.assert_allclose(gain, evidence[0] - evidence[1], rtol=1e-5)
-    told = []
     for filter_ in filters:
         belief = filter_.belief()
         ids, places, covs = belief.map.landmarks(filter_.particles)
