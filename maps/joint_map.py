@@ -205,7 +205,7 @@ class JointMap(Map):
         return np.linalg.solve(cov[d:, d:], cov[d:, :d]).T
 
     def gain(self, particles: Particles, prior: Constants) -> float:
-        """By how many nats all that was observed is more probable if the constants have this prior, Mathematics (exchange)."""
+        """By how many nats all that was observed is more probable if the constants have this prior."""
         own = self.mean[:, self._own]
         mean, cov = gaussian.mixture_moments(particles.weights, own, self.cov[self._own, self._own][None])
         return gain_of(Constants(mean, cov), self.old.prior, prior)

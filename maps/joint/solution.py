@@ -73,7 +73,7 @@ def exchanged(
 
 
 def gain_of(found: Constants, before: Constants, after: Constants) -> float:
-    """By how many nats what led from the prior `before` to what is `found` is more probable with the prior `after`."""
+    """By how many nats what led from a prior `before` to what is `found` is likelier `after`, Mathematics (exchange-gain)."""
     info, infos = inverse_of(found.cov), [inverse_of(prior.cov) for prior in (before, after)]
     told, by_told = info - infos[0], info @ found.mean - infos[0] @ before.mean
     nats = []
@@ -294,7 +294,7 @@ def _looser(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """By how much less is known of each sub-map's landmarks (M, D, D), and of those it was given (K, D, D), than it was.
 
-    They have walked since, in it and in later ones that were given them; and what drives the motion is never taken for exact.
+    They have walked since, Mathematics (passed-on-walk); and what drives the motion is never taken for exact.
     """
     dim, since, found = maps[0].points.shape[1], dict[int, np.ndarray](), []
     none = np.zeros((dim, dim))
