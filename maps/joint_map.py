@@ -665,12 +665,9 @@ class JointMap(Map):
         self.cov = self.cov.copy()
         for held in [self.cov] if self._gain is None else [self.cov, self._left()]:
             held[columns[:, :, None], columns[:, None, :]] += cov
-        turn, none = (
-            self.space.rotation(self._from_start(self.space.identity(), np.zeros(1, int))[0]),
-            np.zeros(cov.shape[1:]),
-        )
-        by_all = zip(ids.tolist(), turn @ cov @ turn.T, strict=True)
-        self._walked = self._walked | {name: self._walked.get(name, none) + by for name, by in by_all}
+        turn = self.space.rotation(self._from_start(self.space.identity(), np.arange(1))[0])
+        walked = zip(ids.tolist(), turn @ cov @ turn.T, strict=True)
+        self._walked = self._walked | {name: self._walked.get(name, 0.0) + by for name, by in walked}
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         return np.zeros((self.n, ids.size))

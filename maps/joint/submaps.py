@@ -576,13 +576,10 @@ class SubMaps:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All of it, for a checkpoint."""
-        named, none = {"submaps/starts": np.array(self.starts)}, np.zeros(0, dtype=np.int64)
+        named, walked = {"submaps/starts": np.array(self.starts)}, np.zeros((0, self.dim, self.dim))
+        nothing = Given(np.zeros(0, dtype=np.int64), walked[:, 0], np.zeros((0, 0)), walked=walked)
         for number, each in enumerate([self.about, *self.maps]):
-            own, given = (
-                each._asdict(),
-                each.given
-                or Given(none, each.points[none], np.zeros((0, 0)), walked=np.zeros((0, self.dim, self.dim))),
-            )
+            own, given = each._asdict(), each.given or nothing
             own |= {"tied": np.array(each.tied)} | {f"given_{name}": array for name, array in given._asdict().items()}
             del own["given"]
             named |= {f"submaps/{number}/{name}": array for name, array in own.items()}
