@@ -666,7 +666,7 @@ class JointMap(Map):
         for held in [self.cov] if self._gain is None else [self.cov, self._left()]:
             held[columns[:, :, None], columns[:, None, :]] += cov
         turn = self.space.rotation(self._from_start(self.space.identity(), np.arange(1))[0])
-        walked = zip(ids.tolist(), turn @ cov @ turn.T, strict=True)
+        walked = zip(ids.tolist(), np.broadcast_to(turn @ cov @ turn.T, (ids.size, *turn.shape)), strict=True)
         self._walked = self._walked | {name: self._walked.get(name, 0.0) + by for name, by in walked}
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:

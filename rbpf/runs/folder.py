@@ -116,7 +116,7 @@ def remarks(run: Run) -> list[str]:
         return in_image
     depth = ", from which no depth can be measured" if run.system.gauge == "similarity" else ""
     return [
-        f"It stood still, or nearly: the path stays within {100 * reach / distance:.2g} % of the landmarks' median "
+        f"It stood still, or nearly: the path stays within {round(100.0 * reach / distance, 2):g} % of the landmarks' median "
         f"distance from where it begins{depth}."
     ]
 
