@@ -204,11 +204,12 @@ class JointMap(Map):
             cov = self.old.end_and_constants(present.finished(self.old))[1]
         return np.linalg.solve(cov[d:, d:], cov[d:, :d]).T
 
-    def gain(self, particles: Particles, prior: Constants) -> float:
-        """By how many nats all that was observed is more probable if the constants have this prior."""
+    def presumed(self, particles: Particles, prior: Constants) -> tuple[Constants, float]:
+        """What would be known of the constants if they had this prior, and by how many nats more probable all would be."""
         own = self.mean[:, self._own]
         mean, cov = gaussian.mixture_moments(particles.weights, own, self.cov[self._own, self._own][None])
-        return gain_of(Constants(mean, cov), self.old.prior, prior)
+        found = exchanged(mean, cov, slice(0, mean.size), self.old.prior, prior)
+        return Constants(*found), gain_of(Constants(mean, cov), self.old.prior, prior)
 
     def driving(self) -> np.ndarray | None:
         return self.mean[:, self.space.dim : self._first] if self._first > self.space.dim else None

@@ -276,7 +276,7 @@ def test_what_goes_over_is_known_as_in_one_gaussian(most, by_image, walks, motio
             submaps.recognise(Given(reading.landmarks[again], reading.z[again], np.kron(np.eye(again.sum()), NOISE)))
         if t == 12 and first is FIRST:
             particles, prior = filters[1].particles, Constants(*start)
-            slope, gain = submaps.pose_by_constants(particles), submaps.gain(particles, prior)
+            slope, (_, gain) = submaps.pose_by_constants(particles), submaps.presumed(particles, prior)
             (before, _), (pose, _) = submaps.moments(particles, Part.SUBSTATE), submaps.moments(particles, Part.STATE)
             submaps.presume(prior)
             by = slope @ (submaps.moments(particles, Part.SUBSTATE)[0] - before)

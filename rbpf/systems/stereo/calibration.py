@@ -25,6 +25,8 @@ DECISIVE = 18.0
 """Nats by which one of the two explains the pairs better when that is no chance any more: as much as six sigma."""
 AS_GOOD_AS_KNOWN = 1e-3
 """How uncertain the constant is before, as a fraction of what it is then."""
+KNOWN = 0.25
+"""To which fraction of that it must be known to be decided: of less, the draws of paths may seem to tell as much."""
 REVISED = 1000
 """Pairs before the decision whose poses are told anew, at most."""
 
@@ -70,7 +72,8 @@ class SelfCalibration(Kept):
             return ""
         joint, particles = self._joint(filter_), filter_.particles
         self._slope = joint.pose_by_constants(particles)[:, 0]
-        if joint.gain(particles, self._prior) <= DECISIVE:
+        found, gain = joint.presumed(particles, self._prior)
+        if gain <= DECISIVE or found.cov[0, 0] > KNOWN**2 * self._prior.cov[0, 0]:
             return ""
         self.is_estimated = True
         filter_.consolidate()
