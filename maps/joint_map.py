@@ -130,7 +130,7 @@ class JointMap(Map):
         if unnamed and constants:
             raise InputError("unnamed landmarks of old sub-maps are kept without constants: leave them out")
         gaussian.psd_factor(cov)
-        self._substate, self._first, self._constants = (mean, cov), space.dim + mean.size, constants
+        self._substate, self._first = (mean, cov), space.dim + mean.size
         self.held = JointColumns(space, self._first, [self.point])
         self.submap, self.unnamed = submap, unnamed
         self.passed_on = passed_on or mean.size > constants
@@ -159,7 +159,7 @@ class JointMap(Map):
 
     def _begin_old(self, mean: np.ndarray, cov: np.ndarray) -> None:
         """No finished sub-map, and a substate as it is known before: of constants each of them is told what all say."""
-        own = slice(mean.size - self._constants, None)
+        own = slice(self._own.start - self.space.dim, None)
         self.old = SubMaps(
             self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed, Constants(mean[own], cov[own, own])
         )
@@ -198,10 +198,10 @@ class JointMap(Map):
     def pose_by_constants(self, particles: Particles) -> np.ndarray:
         """How the robot's pose in the world moves with the constants, in the chart at its mean (d, k)."""
         present, d = self._consolidated(particles), self.space.dim
-        ends = np.append(np.arange(d), present.constants(self.old))
-        cov = principal(present.cov, ends)
         if self.old.maps:
             cov = self.old.end_and_constants(present.finished(self.old))[1]
+        else:
+            cov = principal(present.cov, np.append(np.arange(d), present.constants(self.old)))
         return np.linalg.solve(cov[d:, d:], cov[d:, :d]).T
 
     def presumed(self, particles: Particles, prior: Constants) -> tuple[Constants, float]:
@@ -399,7 +399,8 @@ class JointMap(Map):
     def widened(self) -> "JointMap":
         """With the landmarks of old sub-maps that are next to the frame: what may be expected, and nothing is done with it."""
         wide = copy(self)
-        wide.held, wide.mean, wide.cov = self.old.widened(self.held, self.mean, self.cov)
+        if self.old.beside is not None:
+            wide.held, wide.mean, wide.cov = self.old.beside.widened(self.held, self.mean, self.cov)
         return wide
 
     @property

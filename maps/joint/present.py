@@ -32,17 +32,14 @@ class Present:
         """As it would be if it ended here."""
         points = self.held.table.ids[self.held.table.kind == 0]
         columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
-        d, constants, told = self.held.space.dim, self.constants(old), old.given(given)
-        if told is not None and self.walked:
-            walked = [self.walked.get(name, still) for name, still in zip(given.tolist(), told.walked, strict=True)]
-            told = told._replace(walked=np.array(walked).reshape(told.walked.shape))
+        d, constants = self.held.space.dim, self.constants(old)
         used = np.concatenate([np.arange(d), columns.ravel(), constants])
         return SubMap(
             self.origin,
             points,
             self.mean[columns],
             principal(self.cov, used),
-            given=told,
+            given=old.given(given, self.walked),
             constants=self.mean[constants],
         )
 

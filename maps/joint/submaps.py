@@ -9,8 +9,9 @@ Gaussian, to which a finished sub-map is joined at a cost that does not grow (J.
 Sub-maps of the same place become one, so that there are as many as the ground takes, and not the time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
+from types import MappingProxyType
 from typing import NamedTuple, final
 
 import numpy as np
@@ -22,7 +23,7 @@ from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.kernels.dense import principal
 from rbpf.lie import Array, Euclidean, SE2Group, SE3Group
-from rbpf.maps.joint.columns import JointColumns
+from rbpf.maps.joint.beside import Beside
 from rbpf.maps.joint.rows import plus_gram
 from rbpf.maps.joint.solution import (
     EXACT,
@@ -47,21 +48,6 @@ ROUNDING = 1e-15
 """Variance [m²] below which nothing is told apart."""
 FIRM = 6
 """Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
-
-
-class Beside(NamedTuple):
-    """Old landmarks (K,) at `points` (K, D) as seen from the end of the present sub-map, which does not have them.
-
-    Its own landmarks (M,) are at `theirs` (M, D): as these move, so do the others, by `slope` (KD, MD); `rest` (KD, KD) is
-    what is then uncertain about them.
-    """
-
-    ids: np.ndarray
-    points: np.ndarray
-    own: np.ndarray
-    theirs: np.ndarray
-    slope: np.ndarray
-    rest: np.ndarray
 
 
 class _Tied(NamedTuple):
@@ -184,20 +170,6 @@ class SubMaps:
         rest = gaussian.symmetrise(within - slope @ cross.T)
         self.beside = Beside(about.ids[others], seen, present.ids, present.points, slope, rest)
 
-    def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
-        """What is held, of means (N, n) and covariance (n, n), and `beside` it what is not."""
-        if (found := self.beside) is None:
-            return held, mean, cov
-        own, new = held.holds(found.own), ~held.holds(found.ids) & (found.ids >= 0)
-        columns = held.of_one_kind(found.own[own]).columns.ravel()
-        at, rows = np.repeat(own, self.dim), np.repeat(new, self.dim)
-        slope, rest = found.slope[np.ix_(rows, at)], found.rest[np.ix_(rows, rows)]
-        moved, cross = mean[:, columns] - found.theirs[own].ravel(), slope @ cov[columns]
-        wide = copy(held)
-        wide.add(found.ids[new], held.kinds[0], np.full(int(new.sum()), -1), held.clones[:0])
-        mean = np.concatenate([mean, found.points[new].ravel() + moved @ slope.T], axis=1)
-        return wide, mean, np.block([[cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
-
     def forget(self, ids: np.ndarray) -> None:
         """Landmarks (K,) that are held no more: what was said of them ties the rest, and no one is told or asked for it."""
         gone = np.array([name for name in ids.tolist() if name in self._last], dtype=np.int64)
@@ -219,12 +191,14 @@ class SubMaps:
         if self.beside is not None:
             self.beside = self.beside._replace(ids=renamed(self.beside.ids))
 
-    def given(self, ids: np.ndarray) -> Given | None:
-        """What is known of landmarks (K,) about the start, and of constants, by all that is finished."""
+    def given(self, ids: np.ndarray, walked: Mapping[int, Array] = MappingProxyType({})) -> Given | None:
+        """What is known of landmarks (K,) about the start, which may have `walked`, and of constants, by what is finished."""
         own, d = self.about.of(self.about.rows(ids)), self.space.dim
         if not (ids.size or own.constants.size):
             return None
-        return Given(ids, own.points, own.cov[d:, d:], own.constants, np.zeros((ids.size, self.dim, self.dim)))
+        still = np.zeros((self.dim, self.dim))
+        by = np.array([walked.get(name, still) for name in ids.tolist()]).reshape(-1, *still.shape)
+        return Given(ids, own.points, own.cov[d:, d:], own.constants, by)
 
     def join(self, finished: SubMap, recall: bool = False, wanted: np.ndarray | None = None) -> None:
         """Takes a sub-map that begins at the last start; the next one begins at its end.
@@ -623,11 +597,4 @@ class SubMaps:
         found = checkpoint.read(arrays, schema, "joint/")
         self.frame = Estimate(found["frame"], found["frame_cov"])
         if self.unnamed:
-            schema = {
-                "ids": checkpoint.integers("others", least=0), "points": checkpoint.numbers("others", dim),
-                "own": checkpoint.integers("own", least=0), "theirs": checkpoint.numbers("own", dim),
-                "slope": checkpoint.numbers("rows", "columns"), "rest": checkpoint.numbers("rows", "rows"),
-            }  # fmt: skip
-            self.beside = Beside(**checkpoint.read(arrays, schema, "joint/beside/"))
-            if self.beside.slope.shape != (self.beside.points.size, self.beside.theirs.size):
-                raise InputError("the array joint/beside/slope does not fit the landmarks beside it")
+            self.beside = Beside.restored(arrays, self.dim)

@@ -58,10 +58,10 @@ class SelfCalibration(Kept):
             )
         #: Whether the map and the front end have a place for it, and it is not refused.
         self.is_held = is_possible and config.calibrate != "off"
-        self._prior = Constants(np.zeros(1), np.full((1, 1), config.self_calibration.disparity_px**2))
+        self._free = Constants(np.zeros(1), np.full((1, 1), config.self_calibration.disparity_px**2))
         scale = 1.0 if self.is_estimated else AS_GOOD_AS_KNOWN
         #: Mean (1,) and covariance (1, 1) before anything is seen, for the joint map; None where it has no place.
-        self.prior = (np.zeros(1), scale**2 * self._prior.cov) if self.is_held else None
+        self.prior = (np.zeros(1), scale**2 * self._free.cov) if self.is_held else None
         # How the last update's pose moves with it; and, told before it was decided, poses, covariances and how they move.
         self._slope, self.slopes = np.zeros(6), np.zeros((0, 6))
         self.stamps_ns, self.poses, self.covs = np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.zeros((0, 6, 6))
@@ -72,12 +72,12 @@ class SelfCalibration(Kept):
             return ""
         joint, particles = self._joint(filter_), filter_.particles
         self._slope = joint.pose_by_constants(particles)[:, 0]
-        found, gain = joint.presumed(particles, self._prior)
-        if gain <= DECISIVE or found.cov[0, 0] > KNOWN**2 * self._prior.cov[0, 0]:
+        found, gain = joint.presumed(particles, self._free)
+        if gain <= DECISIVE or found.cov[0, 0] > KNOWN**2 * self._free.cov[0, 0]:
             return ""
         self.is_estimated = True
         filter_.consolidate()
-        joint.presume(self._prior)
+        joint.presume(self._free)
         offset_px, std_px = self.estimate(filter_)
         size = f"{abs(offset_px):.2f} ± {std_px:.2f} px too {'small' if offset_px > 0.0 else 'large'}"
         return f"all disparities are {size}: the pair calibrates itself from here on"
@@ -88,18 +88,21 @@ class SelfCalibration(Kept):
         """All poses so far, anew, where it was decided by this pair, which has moved so since the last update."""
         if not self.is_held or (self.is_estimated and not self.stamps_ns.size):
             return None
-        offset_px, std_px = self.estimate(filter_)
-        earlier = SE3.retract(self.poses, offset_px * self.slopes)
-        spread = std_px**2 * self.slopes[:, :, None] * self.slopes[:, None, :]
+        if self.is_estimated:
+            # This pose knows what is learnt, the others do not.
+            offset_px, std_px = self.estimate(filter_)
+            self.poses = SE3.retract(self.poses, offset_px * self.slopes)
+            self.covs = self.covs + std_px**2 * self.slopes[:, :, None] * self.slopes[:, None, :]
         slope = SE3.adjoint(SE3.inverse(since_update)) @ self._slope
-        self.stamps_ns = np.append(self.stamps_ns, stamp_ns)
-        self.poses = np.append(earlier, pose[None], axis=0)
-        self.covs = np.append(self.covs + spread, cov[None], axis=0)
-        self.slopes = np.append(self.slopes, slope[None], axis=0)
-        revision = Revision(self.stamps_ns, self.poses, self.covs) if self.is_estimated else None
-        kept = slice(0, 0) if self.is_estimated else slice(-REVISED, None)
-        self.stamps_ns, self.poses = self.stamps_ns[kept], self.poses[kept]
-        self.covs, self.slopes = self.covs[kept], self.slopes[kept]
+        self.stamps_ns = np.append(self.stamps_ns, stamp_ns)[-REVISED:]
+        self.poses = np.append(self.poses, pose[None], axis=0)[-REVISED:]
+        self.covs = np.append(self.covs, cov[None], axis=0)[-REVISED:]
+        self.slopes = np.append(self.slopes, slope[None], axis=0)[-REVISED:]
+        if not self.is_estimated:
+            return None
+        revision = Revision(self.stamps_ns, self.poses, self.covs)
+        self.stamps_ns, self.poses = self.stamps_ns[:0], self.poses[:0]
+        self.covs, self.slopes = self.covs[:0], self.slopes[:0]
         return revision
 
     def estimate(self, filter_: Filter) -> tuple[float, float]:
