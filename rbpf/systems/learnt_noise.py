@@ -11,6 +11,11 @@ from rbpf.systems.system import MAP_IDS
 
 #: Measured numbers that a landmark's noise is worth before it is seen again, and that of all landmarks at first.
 OWN_NUMBERS, PRIOR_NUMBERS = 6.0, 30.0
+LEAST_LEFT = 0.05  #: Of a measurement's noise, that an update leaves, at least: of no residual nothing is learnt.
+WORSE = 4.0  #: Times the variance of the median landmark, from which on one is worse than most: twice the deviation.
+RECENT = 200  #: Landmarks of which that is the median, the last that were begun.
+EXACT = 1e-4  #: Times what is stated, least variance of the median landmark: pixels of a simulation may have none.
+RIGHT = 1.1  #: Times a standard deviation, up to which it is right: as much as a report has for right.
 
 
 @final
@@ -21,9 +26,14 @@ class LearntNoise(Kept):
     along as the view does. Given what the map knows after an update, Rᵢ⁻¹ (e eᵀ + cov e) has p times the factor on its trace
     for p numbers, on average (variational Bayes: S. Särkkä and A. Nummenmaa 2009). A new landmark has the mean of all others'.
 
+    Where all are taken to be alike, it is Σ eᵀR⁻¹e over Σ (p − tr R⁻¹ cov e), what is left of the noise over how much of it an
+    update leaves (variance components: W. Förstner 1979), and a landmark has that of all. One that is worse than most has as
+    many times more as it is worse: what slides along an edge by a few pixels would else take the whole map along, however
+    well all others keep their places.
+
     Args:
-        alike: no landmark has a factor of its own, but that of all.
-        right: as long as the factor of all is not above this, what is stated is right, and it is 1.
+        alike: that they are.
+        right: then, the factor of all up to which what is stated is right, and it is 1.
     """
 
     kept: ClassVar = {
@@ -51,11 +61,17 @@ class LearntNoise(Kept):
 
     def factor(self, ids: np.ndarray) -> np.ndarray:
         """Of landmarks (k,), some of which may be new."""
-        if self.alike:
-            return np.full(ids.size, self.mean)
         own, known = np.zeros((ids.size, 2)), np.isin(ids, self._ids)
         own[known] = self._own[np.searchsorted(self._ids, ids[known])]
-        return (OWN_NUMBERS * self._all[0] / self._all[1] + own[:, 0]) / (OWN_NUMBERS + own[:, 1])
+        usual = self._usual() if self.alike else float(self._all[0] / self._all[1])
+        found = (OWN_NUMBERS * usual + own[:, 0]) / (OWN_NUMBERS + own[:, 1])
+        return self.mean * np.maximum(found / (WORSE * usual), 1.0) if self.alike else found
+
+    def _usual(self) -> float:
+        """Factor of the median landmark, among the last that have been seen often enough to tell."""
+        total, numbers = self._own[-RECENT:].T
+        tells = numbers >= OWN_NUMBERS
+        return max(float(np.median(total[tells] / numbers[tells])), EXACT) if tells.any() else 1.0
 
     def learn_from(self, group: Observations, expected: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> None:
         """From what an update by a group has left of its innovations, but for outliers.
@@ -73,16 +89,21 @@ class LearntNoise(Kept):
 
     def learn(self, ids: np.ndarray, error: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
         """From residuals (k, p) after an update, with covariances (k, p, p), of landmarks (k,) of such noise (k, p, p)."""
-        seen = np.einsum("kab,kba->k", np.linalg.inv(noise), error[:, :, None] * error[:, None] + cov)
+        information, count = np.linalg.inv(noise), np.full(ids.size, float(error.shape[1]))
+        seen = np.einsum("kab,kba->k", information, error[:, :, None] * error[:, None])
+        told = np.einsum("kab,kba->k", information, cov)
         if self.alike:
-            self._all = self._all + np.array([seen.sum(), error.size])
-            return
-        held = np.union1d(self._ids, ids)
-        own = np.zeros((held.size, 2))
-        own[np.searchsorted(held, self._ids)] = self._own
-        found = np.column_stack([seen, np.full(ids.size, error.shape[1])])
-        own[np.searchsorted(held, ids)] += found
-        self._ids, self._own, self._all = held, own, self._all + found.sum(axis=0)
+            # An update takes as much of a measurement's error away as the map is left unsure of.
+            count = np.maximum(count - told / self.factor(ids), LEAST_LEFT * count)
+        else:
+            seen += told
+        new = np.setdiff1d(ids, self._ids)
+        at = np.searchsorted(self._ids, new)
+        self._ids, self._own = np.insert(self._ids, at, new), np.insert(self._own, at, 0.0, axis=0)
+        self._own[np.searchsorted(self._ids, ids)] += np.column_stack([seen, count])
+        # Where all are alike, what one is worse than most is not the noise of all.
+        counts = self.factor(ids) <= self.mean if self.alike else np.ones(ids.size, dtype=bool)
+        self._all = self._all + np.array([seen[counts].sum(), count[counts].sum()])
 
     def remove(self, ids: np.ndarray) -> None:
         kept = ~np.isin(self._ids, ids)

@@ -13,20 +13,7 @@ from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit, product
 from rbpf.sensors.camera import RectifiedStereo
-from tests.motion.stereo_pairs import (
-    CAR,
-    FAR_ROAD,
-    HAND,
-    LEAP,
-    ROAD,
-    ROOM,
-    World,
-    correlated,
-    joined,
-    mistaken,
-    noiseless,
-    simulate,
-)
+from tests.motion import stereo_pairs as worlds
 
 STRICT = Rule(offset=1e-7, iterations=100)
 COV = 0.25 * np.eye(3)
@@ -53,17 +40,17 @@ def adjusted_by_scipy(matches: Matches, start: np.ndarray):
 
 
 @pytest.mark.parametrize("points", ["adjusted", "propagated", "exact"])
-@pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
+@pytest.mark.parametrize("world", [worlds.ROAD, worlds.ROOM, worlds.LEAP], ids=["road", "room", "leap"])
 def test_without_noise_the_motion_is_exact(world, points):
-    before, now, delta = noiseless(world, 40, np.random.default_rng(0))
+    before, now, delta = worlds.noiseless(world, 40, np.random.default_rng(0))
     found = estimated(Matches.checked(world.camera, before, now, COV, COV), config=VoConfig(points, rule=STRICT))
     np.testing.assert_allclose(SE3.local(delta, found.previous_camera_from_camera), 0.0, atol=1e-7)
     assert found.found and found.inliers.all() and found.rms < 1e-4
 
 
-@pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
+@pytest.mark.parametrize("world", [worlds.ROAD, worlds.ROOM, worlds.LEAP], ids=["road", "room", "leap"])
 def test_the_default_is_scipys_bundle_adjustment(world):
-    matches, delta = correlated(world, 15, np.random.default_rng(1))
+    matches, delta = worlds.correlated(world, 15, np.random.default_rng(1))
     config = VoConfig(gate=1e6, rule=STRICT)
     ours = estimated(matches, config=config)
     theirs = adjusted_by_scipy(matches, ours.previous_camera_from_camera)
@@ -80,7 +67,7 @@ def test_the_default_is_scipys_bundle_adjustment(world):
 @pytest.mark.parametrize("points", ["propagated", "exact"])
 def test_the_other_kinds_are_scipys_least_squares(points):
     """With S held where the motion was found."""
-    matches, delta = correlated(LEAP, 20, np.random.default_rng(2))
+    matches, delta = worlds.correlated(worlds.LEAP, 20, np.random.default_rng(2))
     ours = fit(matches, delta, VoConfig(points, rule=STRICT))
     camera, best = matches.camera, ours.x
     before = camera.triangulate(matches.z_prev)
@@ -99,12 +86,12 @@ def test_the_other_kinds_are_scipys_least_squares(points):
     np.testing.assert_allclose(ours.cov, cov, rtol=2e-3, atol=2e-3 * np.abs(cov).min())
 
 
-@pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
+@pytest.mark.parametrize("world", [worlds.ROAD, worlds.ROOM, worlds.LEAP], ids=["road", "room", "leap"])
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.6])
 def test_false_matches_are_found(world, fraction):
     rng = np.random.default_rng(3)
-    pair = simulate(world, 300, rng)
-    matches, wrong = mistaken(pair, fraction, rng)
+    pair = worlds.simulate(world, 300, rng)
+    matches, wrong = worlds.mistaken(pair, fraction, rng)
     found = estimated(matches)
     off = SE3.local(pair.delta, found.previous_camera_from_camera)
     assert off @ np.linalg.solve(found.cov, off) < 22.5  # χ²₆, 99.9 %
@@ -125,19 +112,19 @@ class TestTooLittle:
 
     @pytest.mark.parametrize("count", [0, 1, 7])
     def test_too_few_matches(self, count):
-        matches = simulate(ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(count))
+        matches = worlds.simulate(worlds.ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(count))
         self.refused(matches, f"{count} matches are there, 8 are needed")
 
     def test_left_and_right_swapped(self):
-        matches = simulate(ROOM, 30, np.random.default_rng(0)).matches
+        matches = worlds.simulate(worlds.ROOM, 30, np.random.default_rng(0)).matches
         swapped = replace(matches, z_prev=matches.z_prev[:, [2, 1, 0]], z_now=matches.z_now[:, [2, 1, 0]])
         complaint = "30 of 30 matches have a negative disparity: are left and right swapped? 0 are left"
         self.refused(swapped, f"{complaint}, 8 are needed")
 
     def test_nothing_agrees(self):
         rng = np.random.default_rng(1)
-        pair = simulate(ROOM, 60, rng)
-        matches, _ = mistaken(pair, 1.0, rng)
+        pair = worlds.simulate(worlds.ROOM, 60, rng)
+        matches, _ = worlds.mistaken(pair, 1.0, rng)
         found = estimated(matches)
         assert not found.found
         assert "of 60 matches agree on a motion, 8 are needed" in found.failure
@@ -146,8 +133,8 @@ class TestTooLittle:
 class TestDegenerate:
     def test_far_points_leave_the_translation_open(self):
         """At infinity: the turn is known, the way is not, and the covariance says both."""
-        world = World(CAR, 1e5, 1e6, ROAD.xi)
-        pair = simulate(world, 200, np.random.default_rng(0), 0.1)
+        world = worlds.World(worlds.CAR, 1e5, 1e6, worlds.ROAD.xi)
+        pair = worlds.simulate(world, 200, np.random.default_rng(0), 0.1)
         found = estimated(pair.matches)
         assert found.found
         std = np.sqrt(np.diagonal(found.cov))
@@ -160,9 +147,9 @@ class TestDegenerate:
         rng = np.random.default_rng(1)
         way = 0.0 if place == "one place" else rng.uniform(-1.0, 1.0, (30, 1))
         points = np.array([0.3, 0.1, 3.0]) + way * np.array([0.5, 0.3, 1.0]) * np.ones((30, 1))
-        delta = SE3.exp(np.array(ROOM.xi))
-        before, now = HAND.project(points), HAND.project(SE3.inverse_transform(delta, points))
-        found = estimate_motion(Matches.checked(HAND, before, now, COV, COV), rng)
+        delta = SE3.exp(np.array(worlds.ROOM.xi))
+        before, now = worlds.HAND.project(points), worlds.HAND.project(SE3.inverse_transform(delta, points))
+        found = estimate_motion(Matches.checked(worlds.HAND, before, now, COV, COV), rng)
         assert found.found and found.inliers.all()
         # A turn about the line, or about any axis through the place, is open.
         axis = np.array([0.5, 0.3, 1.0]) / np.linalg.norm([0.5, 0.3, 1.0])
@@ -171,7 +158,9 @@ class TestDegenerate:
 
     def test_disparities_below_zero_are_used(self):
         """Noise on points far away; to drop them would push the rest nearer."""
-        pair = simulate(World(CAR, 5.0, 2000.0, ROAD.xi), 300, np.random.default_rng(2), 1.0)
+        pair = worlds.simulate(
+            worlds.World(worlds.CAR, 5.0, 2000.0, worlds.ROAD.xi), 300, np.random.default_rng(2), 1.0
+        )
         behind = pair.matches.z_prev[:, 0] < pair.matches.z_prev[:, 2]
         found = estimated(pair.matches)
         assert behind.sum() > 5
@@ -189,7 +178,7 @@ class TestDegenerate:
 )
 def test_wrong_input_is_refused(z_prev, z_now, cov, complaint):
     with pytest.raises(InputError, match=complaint):
-        Matches.checked(HAND, z_prev, z_now, cov, cov)
+        Matches.checked(worlds.HAND, z_prev, z_now, cov, cov)
 
 
 def trials(world, points, count, runs, noise_px):
@@ -197,7 +186,7 @@ def trials(world, points, count, runs, noise_px):
     rng, config = np.random.default_rng(11), VoConfig(points)
     errors, covs = [], []
     for _ in range(runs):
-        pair = simulate(world, count, rng, noise_px)
+        pair = worlds.simulate(world, count, rng, noise_px)
         found = estimated(pair.matches, config=config, start=pair.delta)
         assert found.found
         errors.append(SE3.local(found.previous_camera_from_camera, pair.delta))
@@ -212,7 +201,7 @@ def mean_nees(errors, covs):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "count", "noise_px"),
-    [(ROAD, 100, 0.5), (ROOM, 100, 1.0), (LEAP, 30, 0.5), (FAR_ROAD, 100, 1.0)],
+    [(worlds.ROAD, 100, 0.5), (worlds.ROOM, 100, 1.0), (worlds.LEAP, 30, 0.5), (worlds.FAR_ROAD, 100, 1.0)],
     ids=["road", "room", "leap", "far"],
 )
 def test_nees(world, count, noise_px):
@@ -226,14 +215,14 @@ def test_nees(world, count, noise_px):
 @pytest.mark.slow
 def test_nees_of_the_papers_covariance():
     """(JᵀJ)⁻¹ with the earlier points taken as exact: over-confident by a factor of four or so, as a fact."""
-    assert 15.0 < mean_nees(*trials(ROAD, "exact", 100, 100, 0.5)) < 50.0
+    assert 15.0 < mean_nees(*trials(worlds.ROAD, "exact", 100, 100, 0.5)) < 50.0
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_matches_on_a_thing_that_moves_are_counted(seed):
     rng = np.random.default_rng(seed)
-    room, thing = simulate(ROOM, 60, rng), simulate(LEAP, 20, rng)
-    found = estimated(joined(room.matches, thing.matches))
+    room, thing = worlds.simulate(worlds.ROOM, 60, rng), worlds.simulate(worlds.LEAP, 20, rng)
+    found = estimated(worlds.joined(room.matches, thing.matches))
     assert found.inliers[:60].sum() >= 54 and not found.inliers[60:].any()
     assert 16 <= sum(other.inliers.sum() for other in found.others) <= 20
 
@@ -248,7 +237,7 @@ class TestVisualOdometry:
         return odometry.candidates(pair.matches, np.asarray(velocity), self.DT, np.random.default_rng(0))
 
     def test_a_clear_motion_is_the_estimate_itself(self):
-        pair = simulate(ROOM, 60, np.random.default_rng(0))
+        pair = worlds.simulate(worlds.ROOM, 60, np.random.default_rng(0))
         found = self.step(pair, np.zeros(6))
         (motion,), estimate = found.motions, estimated(pair.matches)
         np.testing.assert_array_equal(motion.odometry.delta, estimate.previous_camera_from_camera)
@@ -256,7 +245,7 @@ class TestVisualOdometry:
         assert motion.note == found.failure == ""
 
     def test_without_a_motion_there_is_the_prior(self):
-        none = simulate(ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(0))
+        none = worlds.simulate(worlds.ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(0))
         odometry, rng = VisualOdometry(prior=MotionPrior(0.5, 2.0)), np.random.default_rng(0)
         found = odometry.candidates(none, np.full(6, 0.3), self.DT, rng)
         assert found.motions == () and found.failure == "0 matches are there, 8 are needed"
@@ -264,8 +253,10 @@ class TestVisualOdometry:
         np.testing.assert_allclose(found.prior.cov, np.diag(self.DT**2 * np.repeat([0.25, 4.0], 3)))
 
     def test_joining_is_a_product_of_gaussians(self):
-        pair = simulate(World(CAR, 300.0, 3000.0, ROAD.xi), 60, np.random.default_rng(1), 0.5)
-        velocity = np.concatenate([np.array(ROAD.xi)[:3], [0.0, 0.0, 0.85]]) / self.DT
+        pair = worlds.simulate(
+            worlds.World(worlds.CAR, 300.0, 3000.0, worlds.ROAD.xi), 60, np.random.default_rng(1), 0.5
+        )
+        velocity = np.concatenate([np.array(worlds.ROAD.xi)[:3], [0.0, 0.0, 0.85]]) / self.DT
         found = self.step(pair, velocity, std_speed=2.0)
         (motion,), prior = found.motions, found.prior
         assert motion.note.startswith("the matches leave the motion open (a standard deviation ")
@@ -282,6 +273,6 @@ class TestVisualOdometry:
         np.testing.assert_allclose(product(measured, prior)[0].by_constants, slope, atol=1e-9)
 
     def test_what_makes_no_sense_is_refused(self):
-        matches = simulate(ROOM, 20, np.random.default_rng(0)).matches
+        matches = worlds.simulate(worlds.ROOM, 20, np.random.default_rng(0)).matches
         with pytest.raises(InputError, match=r"needs time between its frames, got 0\.0 s"):
             VisualOdometry().candidates(matches, np.zeros(6), 0.0, np.random.default_rng(0))

@@ -208,8 +208,9 @@ class MonoConfig(RunConfig):
     #: next one, and old ones come back when they are in view. No point is dropped; rays that are left behind are.
     submap: Annotated[Count, Formerly("active")] = 300
     #: of a joint map: the noise of what is measured is the one that is stated, unless what the map makes of it says that it
-    #: is larger by a tenth or more, and then that (at_least); or whatever that says (learnt); or as stated (stated), as
-    #: always of a camera that calibrates itself.
+    #: is larger by a tenth or more, and then that (at_least); or whatever that says (learnt); a feature that is worse than
+    #: most has more, in both. Or as stated (stated). Of a camera that calibrates itself, learnt is at_least, and of features
+    #: that are worse alone.
     noise: Literal["at_least", "learnt", "stated"] = "at_least"
     #: of a joint map: the camera calibrates itself, its focal lengths, k1 and k2 being estimated with everything else.
     calibrate: Literal["off", "online"] = "off"

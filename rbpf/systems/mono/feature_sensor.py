@@ -222,13 +222,17 @@ class FeatureSensor(Sensor):
 
     @property
     def noise_factor(self) -> float:
-        """Of the variance that what is measured says."""
+        """Of the variance that what is measured says, for all features."""
         return 1.0 if self.noise is None else self.noise.mean
+
+    def noisy(self, names: np.ndarray, cov: np.ndarray) -> np.ndarray:
+        """The covariances (K, 2, 2) that what is measured of features (K,) says, times the factor of each."""
+        return cov if self.noise is None else self.noise.factor(names)[:, None, None] * cov
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
         """Groups of observations for known points, points, and features of unknown depth."""
         groups, inside = list[Observations](), self.camera.inside(frame.z)
-        cov_z = self.noise_factor * frame.cov_z
+        cov_z = self.noisy(frame.landmarks, frame.cov_z)
 
         # All members of the constellation that are seen are one measurement of it.
         members = self.members(frame.landmarks)
@@ -397,6 +401,8 @@ class FeatureSensor(Sensor):
         if names.size:
             ids = self._ids(belief, names, self.members(names))
             belief.map.remove(ids[ids >= 0])
+            if self.noise is not None:
+                self.noise.remove(names)
 
     def _in_world(self, belief: Belief, position: np.ndarray, particles: slice) -> np.ndarray:
         """Homogeneous points (n, k, 4) of some particles' frames, where states are, in their worlds."""

@@ -28,7 +28,7 @@ from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
-from rbpf.systems.learnt_noise import LearntNoise
+from rbpf.systems.learnt_noise import RIGHT, LearntNoise
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -50,7 +50,6 @@ from rbpf.systems.system import Revision
 LINEARISATIONS = 3  #: Of the proposal: moments of the samples hand on what a few weights cannot mend.
 #: Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that.
 SETTLED = 0.2
-RIGHT = 1.1  #: Times a stated standard deviation, up to which it is right: as much as a report has for right.
 JOINT = "joint/mean"  #: In the checkpoint of a filter on a joint map.
 #: Of the first frames, that take part in the hand-over's adjustment at most: it takes what they told from nothing else.
 MAX_FRAMES = 150
@@ -108,10 +107,11 @@ class HandOver:
         self.config, self.camera, self.known, self.first = config, camera, known, first
         self.joint: JointMap | None = None  #: The joint map; None as long as every particle has a map of its own.
         self._rays: JointRays | None = None
-        # What a camera that is not known yet leaves of the innovations is not noise.
         self.noise: LearntNoise | None = None
-        if wanted and config.noise != "stated" and config.calibrate == "off":
-            self.noise = LearntNoise(alike=True, right=RIGHT**2 if config.noise == "at_least" else 0.0)
+        if wanted and config.noise != "stated":
+            # What a camera that is not known yet leaves of all innovations is not noise.
+            level = 0.0 if config.noise == "learnt" else RIGHT**2
+            self.noise = LearntNoise(alike=True, right=np.inf if config.calibrate == "online" else level)
         if wanted:
             if not isinstance(rays, InverseDepthRays):
                 raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
@@ -204,7 +204,7 @@ class HandOver:
         if best is not None and self.noise is not None:
             # That noise is less than stated the first frames do not tell: errors grow as the view changes.
             noise_px = residual_px(seen, config, best)
-            is_noisier = noise_px > RIGHT * seen.noise_px
+            is_noisier = (noise_px / seen.noise_px) ** 2 > max(RIGHT**2, self.noise.right)
             # What an attempt before this one found, from which nothing began, is forgotten: no checkpoint has it.
             self.noise.expect((noise_px / seen.noise_px) ** 2 if is_noisier else 1.0)
             if is_noisier:

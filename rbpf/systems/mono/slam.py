@@ -377,7 +377,7 @@ class MonoSlam(System):
             names = np.concatenate([seen["features"][kept], seen["started"]])
             px = np.concatenate([seen["px"][kept], seen["started_px"]])
             noise = np.tile(self.config.search.noise_px**2 * np.eye(2), (seen["started"].size, 1, 1))
-            cov = self.features.noise_factor * np.concatenate([seen["cov_px"][kept], noise])
+            cov = self.features.noisy(names, np.concatenate([seen["cov_px"][kept], noise]))
             frames.append(FeatureFrame(stamp_ns, names, px, cov))
         found = self.hand_over.calibration(self.filter)
         return FeatureLog(name, self.camera if found is None else found[0], frames, self.known_points)
