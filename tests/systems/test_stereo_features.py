@@ -172,7 +172,7 @@ def test_a_pair_calibrates_itself_where_that_explains_it_better(log):
     wrong = replace(log, frames=[replace(frame, z=frame.z + np.array([0.0, 0.0, 2.0])) for frame in log.frames])
     tried, online, off = (filtered(wrong, replace(config, calibrate=each)) for each in ("auto", "online", "off"))
     (found, std), right = tried.system.calibration(), online.system.calibration()[0]
-    assert abs(found - right) < std and not tried.log["offset_px"][:5].any()
+    assert abs(found - right) < 1.5 * std and not tried.log["offset_px"][:5].any()
     assert [message.split(": ")[-1] for message in tried.messages] == ["the pair calibrates itself from here on"]
     apart = [np.abs(SE3.translation(run.log.poses) - SE3.translation(online.log.poses)).max() for run in (tried, off)]
     assert apart[0] < 0.25 * apart[1] and 18.0 < (online.log["log_evidence"] - tried.log["log_evidence"]).sum() < 40.0

@@ -26,7 +26,7 @@ DECISIVE = 18.0
 AS_GOOD_AS_KNOWN = 1e-3
 """How uncertain the constant is before, as a fraction of what it is then."""
 KNOWN = 0.25
-"""To which fraction of that it must be known to be decided: of less, the draws of paths may seem to tell as much."""
+"""To which fraction of that it must be known to be decided: where little tells it, what else disparities err by is as much."""
 REVISED = 1000
 """Pairs before the decision whose poses are told anew, at most."""
 

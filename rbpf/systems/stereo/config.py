@@ -57,7 +57,7 @@ class MapConfig(Ranged):
     kind: Literal["particles", "joint"] = "joint"
     #: of a joint map: updates sampled, at most, before they are taken into it; fewer where the effective sample size
     #: falls below the threshold of resampling, which does not take place.
-    window: Count = 5
+    window: Count = 1
     #: of a joint map: landmarks beyond which a sub-map ends; those in the pair, and of the others those seen last up to half
     #: of these, go over into the next one, and old ones come back when they are seen again. No landmark is dropped.
     submap: Annotated[Count, Formerly("active")] = 300
