@@ -15,6 +15,7 @@ LEAST_LEFT = 0.05  #: Of a measurement's noise, that an update leaves, at least:
 WORSE = 4.0  #: Times the variance of the median landmark, from which on one is worse than most: twice the deviation.
 RECENT = 200  #: Landmarks of which that is the median, the last that were begun.
 EXACT = 1e-4  #: Times what is stated, least variance of the median landmark: pixels of a simulation may have none.
+NOBODY = -2  #: No landmark's name, behind those that are known; −1 stands for what has none.
 RIGHT = 1.1  #: Times a standard deviation, up to which it is right: as much as a report has for right.
 
 
@@ -47,6 +48,7 @@ class LearntNoise(Kept):
         self.alike, self.right = alike, right
         self._ids = np.zeros(0, dtype=np.int64)
         self._own = np.zeros((0, 2))  # of each landmark the sum of these traces, and how many numbers they are of
+        self._median = self._own, 1.0  # of which sums it is the median, and the median
         self.expect(1.0)
 
     def expect(self, factor: float) -> None:
@@ -61,17 +63,21 @@ class LearntNoise(Kept):
 
     def factor(self, ids: np.ndarray) -> np.ndarray:
         """Of landmarks (k,), some of which may be new."""
-        own, known = np.zeros((ids.size, 2)), np.isin(ids, self._ids)
-        own[known] = self._own[np.searchsorted(self._ids, ids[known])]
+        own, at = np.zeros((ids.size, 2)), np.searchsorted(self._ids, ids)
+        known = np.append(self._ids, NOBODY)[at] == ids
+        own[known] = self._own[at[known]]
         usual = self._usual() if self.alike else float(self._all[0] / self._all[1])
         found = (OWN_NUMBERS * usual + own[:, 0]) / (OWN_NUMBERS + own[:, 1])
         return self.mean * np.maximum(found / (WORSE * usual), 1.0) if self.alike else found
 
     def _usual(self) -> float:
         """Factor of the median landmark, among the last that have been seen often enough to tell."""
-        total, numbers = self._own[-RECENT:].T
-        tells = numbers >= OWN_NUMBERS
-        return max(float(np.median(total[tells] / numbers[tells])), EXACT) if tells.any() else 1.0
+        if self._median[0] is not self._own:
+            total, numbers = self._own[-RECENT:].T
+            tells = numbers >= OWN_NUMBERS
+            median = float(np.median(total[tells] / numbers[tells])) if tells.any() else 1.0
+            self._median = self._own, max(median, EXACT)
+        return self._median[1]
 
     def learn_from(self, group: Observations, expected: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> None:
         """From what an update by a group has left of its innovations, but for outliers.
@@ -97,9 +103,11 @@ class LearntNoise(Kept):
             count = np.maximum(count - told / self.factor(ids), LEAST_LEFT * count)
         else:
             seen += told
-        new = np.setdiff1d(ids, self._ids)
-        at = np.searchsorted(self._ids, new)
-        self._ids, self._own = np.insert(self._ids, at, new), np.insert(self._own, at, 0.0, axis=0)
+        at = np.searchsorted(self._ids, ids)
+        new = np.append(self._ids, NOBODY)[at] != ids
+        order = np.argsort(ids[new])
+        self._ids = np.insert(self._ids, at[new][order], ids[new][order])
+        self._own = np.insert(self._own, at[new][order], 0.0, axis=0)
         self._own[np.searchsorted(self._ids, ids)] += np.column_stack([seen, count])
         # Where all are alike, what one is worse than most is not the noise of all.
         counts = self.factor(ids) <= self.mean if self.alike else np.ones(ids.size, dtype=bool)
