@@ -11,9 +11,9 @@ from rbpf.systems.system import MAP_IDS
 
 #: Measured numbers that a landmark's noise is worth before it is seen again, and that of all landmarks at first.
 OWN_NUMBERS, PRIOR_NUMBERS = 6.0, 30.0
-LEAST_LEFT = 0.05  #: Of a measurement's noise, that an update leaves, at least: of no residual nothing is learnt.
-WORSE = 4.0  #: Times the variance of the median landmark, from which on one is worse than most: twice the deviation.
-RECENT = 200  #: Landmarks of which that is the median, the last that were begun.
+LEAST_REDUNDANCY = 0.05  #: Of each measured number: where the residual is all but explained away, little is learnt.
+OUTLYING = 4.0  #: Times the variance of the median landmark, beyond which one is an outlier: two standard deviations.
+RECENT = 200  #: Landmarks of which the median is taken, those with the largest ids.
 EXACT = 1e-4  #: Times what is stated, least variance of the median landmark: pixels of a simulation may have none.
 NOBODY = -2  #: No landmark's name, behind those that are known; −1 stands for what has none.
 RIGHT = 1.1  #: Times a standard deviation, up to which it is right: as much as a report has for right.
@@ -23,18 +23,15 @@ RIGHT = 1.1  #: Times a standard deviation, up to which it is right: as much as 
 class LearntNoise(Kept):
     """A factor of the variance that is stated for what is measured, learnt as landmarks are seen: of each its own, or of all.
 
-    A keypoint on a corner of a thing keeps its place; one on an edge with something farther behind it has none, and moves
-    along as the view does. Given what the map knows after an update, Rᵢ⁻¹ (e eᵀ + cov e) has p times the factor on its trace
-    for p numbers, on average (variational Bayes: S. Särkkä and A. Nummenmaa 2009). A new landmark has the mean of all others'.
-
-    Where all are taken to be alike, it is Σ eᵀR⁻¹e over Σ (p − tr R⁻¹ cov e), what is left of the noise over how much of it an
-    update leaves (variance components: W. Förstner 1979), and a landmark has that of all. One that is worse than most has as
-    many times more as it is worse: what slides along an edge by a few pixels would else take the whole map along, however
-    well all others keep their places.
+    A keypoint on a corner of a thing keeps its place; one on an edge with something farther behind it has none, and slides
+    as the view changes. The factor is a variance component (W. Förstner 1979), Σ eᵀR⁻¹e of the residuals e after updates,
+    over their redundancy Σ (p − tr R⁻¹ cov e) of p measured numbers each. A new landmark has the mean of all others'.
 
     Args:
-        alike: that they are.
-        right: then, the factor of all up to which what is stated is right, and it is 1.
+        shared: all landmarks have one factor, but outliers: they have as many times more as their variance is beyond
+            `OUTLYING` times that of the median landmark. What slides would else take along a map whose other landmarks keep
+            their places, however well they do.
+        right: of a shared factor, up to which what is stated is right, and it is 1.
     """
 
     kept: ClassVar = {
@@ -44,10 +41,10 @@ class LearntNoise(Kept):
     }
     prefix = "noise/"
 
-    def __init__(self, alike: bool = False, right: float = 0.0) -> None:
-        self.alike, self.right = alike, right
+    def __init__(self, shared: bool = False, right: float = 0.0) -> None:
+        self.shared, self.right = shared, right
         self._ids = np.zeros(0, dtype=np.int64)
-        self._own = np.zeros((0, 2))  # of each landmark the sum of these traces, and how many numbers they are of
+        self._own = np.zeros((0, 2))  # of each landmark the two sums
         self._median = self._own, 1.0  # of which sums it is the median, and the median
         self.expect(1.0)
 
@@ -66,9 +63,9 @@ class LearntNoise(Kept):
         own, at = np.zeros((ids.size, 2)), np.searchsorted(self._ids, ids)
         known = np.append(self._ids, NOBODY)[at] == ids
         own[known] = self._own[at[known]]
-        usual = self._usual() if self.alike else float(self._all[0] / self._all[1])
+        usual = self._usual() if self.shared else float(self._all[0] / self._all[1])
         found = (OWN_NUMBERS * usual + own[:, 0]) / (OWN_NUMBERS + own[:, 1])
-        return self.mean * np.maximum(found / (WORSE * usual), 1.0) if self.alike else found
+        return self.mean * np.maximum(found / (OUTLYING * usual), 1.0) if self.shared else found
 
     def _usual(self) -> float:
         """Factor of the median landmark, among the last that have been seen often enough to tell."""
@@ -95,23 +92,20 @@ class LearntNoise(Kept):
 
     def learn(self, ids: np.ndarray, error: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
         """From residuals (k, p) after an update, with covariances (k, p, p), of landmarks (k,) of such noise (k, p, p)."""
-        information, count = np.linalg.inv(noise), np.full(ids.size, float(error.shape[1]))
-        seen = np.einsum("kab,kba->k", information, error[:, :, None] * error[:, None])
-        told = np.einsum("kab,kba->k", information, cov)
-        if self.alike:
-            # An update takes as much of a measurement's error away as the map is left unsure of.
-            count = np.maximum(count - told / self.factor(ids), LEAST_LEFT * count)
-        else:
-            seen += told
+        information, p = np.linalg.inv(noise), error.shape[1]
+        squared = np.einsum("ka,kab,kb->k", error, information, error)
+        # The noise that the update had is what is stated times the factor so far.
+        redundancy = p - np.einsum("kab,kba->k", information, cov) / self.factor(ids)
+        found = np.column_stack([squared, np.maximum(redundancy, LEAST_REDUNDANCY * p)])
         at = np.searchsorted(self._ids, ids)
         new = np.append(self._ids, NOBODY)[at] != ids
         order = np.argsort(ids[new])
         self._ids = np.insert(self._ids, at[new][order], ids[new][order])
         self._own = np.insert(self._own, at[new][order], 0.0, axis=0)
-        self._own[np.searchsorted(self._ids, ids)] += np.column_stack([seen, count])
-        # Where all are alike, what one is worse than most is not the noise of all.
-        counts = self.factor(ids) <= self.mean if self.alike else np.ones(ids.size, dtype=bool)
-        self._all = self._all + np.array([seen[counts].sum(), count[counts].sum()])
+        self._own[np.searchsorted(self._ids, ids)] += found
+        if self.shared:
+            found = found[self.factor(ids) <= self.mean]  # without outliers
+        self._all = self._all + found.sum(axis=0)
 
     def remove(self, ids: np.ndarray) -> None:
         kept = ~np.isin(self._ids, ids)

@@ -105,7 +105,7 @@ def test_noise_of_each_landmark_is_learnt_from_its_residuals():
 )
 def test_noise_of_all_landmarks_is_learnt_together(deviation, right, found):
     """A first guess does not hold it; what is stated is right up to a limit, but for what slides; a checkpoint keeps it."""
-    rng, noise, ids = np.random.default_rng(0), LearntNoise(alike=True, right=right), np.arange(20)
+    rng, noise, ids = np.random.default_rng(0), LearntNoise(shared=True, right=right), np.arange(20)
     cov, times = np.repeat(0.1 * np.eye(2)[None], ids.size, axis=0), np.where(ids == 7, 10.0, 1.0)
     noise.expect(4.0)
     for _ in range(800):
@@ -113,7 +113,7 @@ def test_noise_of_all_landmarks_is_learnt_together(deviation, right, found):
         noise.learn(ids, error, 0.1 * noise.factor(ids)[:, None, None] * cov, cov)
     factors = np.sqrt(noise.factor(np.array([3, 77, 7])))
     np.testing.assert_allclose(factors, np.array([1.0, 1.0, 5.0]) * found, rtol=0.06)
-    again = LearntNoise(alike=True, right=right)
+    again = LearntNoise(shared=True, right=right)
     again.restore(noise.arrays() | {MAP_IDS: ids})
     assert again.mean == noise.mean
 

@@ -226,7 +226,7 @@ class FeatureSensor(Sensor):
         return 1.0 if self.noise is None else self.noise.mean
 
     def noisy(self, names: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """The covariances (K, 2, 2) that what is measured of features (K,) says, times the factor of each."""
+        """Covariances (K, 2, 2) of the noise of features (K,), as stated, times the factor of each."""
         return cov if self.noise is None else self.noise.factor(names)[:, None, None] * cov
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:

@@ -111,7 +111,7 @@ class HandOver:
         if wanted and config.noise != "stated":
             # What a camera that is not known yet leaves of all innovations is not noise.
             level = 0.0 if config.noise == "learnt" else RIGHT**2
-            self.noise = LearntNoise(alike=True, right=np.inf if config.calibrate == "online" else level)
+            self.noise = LearntNoise(shared=True, right=np.inf if config.calibrate == "online" else level)
         if wanted:
             if not isinstance(rays, InverseDepthRays):
                 raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
