@@ -57,7 +57,8 @@ class Drive:
         names = sensor.manager.add(self.descriptors)
         table = np.column_stack([names, np.full(landmarks, 5), np.zeros(landmarks, dtype=np.int64)])
         sensor.manager.restore(sensor.manager.arrays() | {"key_manager/table": table})
-        sensor.places.put(names, self.places, SE3.identity())
+        sensor.places.add(np.zeros((landmarks, 0, 0), np.uint8), np.zeros((landmarks, 4)))  # no first views
+        sensor.places.put(np.arange(landmarks), self.places, SE3.identity())
         held = self.filter.belief().map
         for part in np.array_split(names, max(1, landmarks // 500)):
             mean = self.places[part] + PLACE_M * self.rng.standard_normal((n, part.size, 3))

@@ -17,9 +17,10 @@ from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import OdometryMotion
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, ids_of, seen
-from tests.core.worlds import MAX_RANGE, Recipe, Sightings, World, anonymous, drive, planar_world
+from tests.core.worlds import MAX_RANGE, Recipe, World, anonymous, drive, planar_world
 
 
 def problem(rng: np.random.Generator, n: int, k: int, m: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +91,7 @@ def test_log_odds_of_existence():
 # A small world without names, with and without clutter, against the run that knows the names.
 
 STEPS, LANDMARKS = 80, 12
-NOTHING = Sightings(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+NOTHING = FeatureFrame(0, np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
 def position_error(world: World, reports) -> float:
@@ -102,7 +103,7 @@ def position_error(world: World, reports) -> float:
 def test_map_and_accuracy_are_those_of_the_run_that_knows_the_names(clutter):
     """And landmarks started by clutter leave the map: about one in a frame, which lives while in view, and four misses."""
     world = planar_world(STEPS, LANDMARKS, 3, clutter)
-    named = replace(world, frames=[without_clutter(frame) for frame in world.frames])
+    named = replace(world, frames=[frame.take(frame.landmarks >= 0) for frame in world.frames])
     filter_, reference = Recipe(n=40, known=False).build(), Recipe(n=40).build()
     started, sizes = set(), []
 
@@ -123,13 +124,8 @@ def test_map_and_accuracy_are_those_of_the_run_that_knows_the_names(clutter):
     assert np.mean(sizes[-20:]) < 1.1 * np.mean(sizes[40:60])
 
 
-def without_clutter(frame: Sightings) -> Sightings:
-    true = frame.landmarks >= 0
-    return Sightings(frame.landmarks[true], frame.z[true], frame.cov_z[true])
-
-
-def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> Sightings:
-    return Sightings(np.zeros(1, dtype=int), np.array([[distance, bearing]]), np.diag([0.01, 0.001])[None])
+def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> FeatureFrame:
+    return FeatureFrame(0, np.zeros(1, dtype=int), np.array([[distance, bearing]]), np.diag([0.01, 0.001])[None])
 
 
 def test_life_of_a_landmark():

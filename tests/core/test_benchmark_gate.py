@@ -1,7 +1,10 @@
 """The committed baseline of the benchmarks: what a run is told, and what recording some rows keeps."""
 
+import pytest
+
 from benchmarks.gate import regressions, write_baseline
 from benchmarks.rows import Row
+from benchmarks.stereo_step import Drive
 
 
 def row(name: str, ratio: float, higher: bool = True) -> Row:
@@ -27,3 +30,10 @@ def test_recording_some_rows_keeps_the_others(tmp_path):
     assert regressions(path, [row("one", 1.0)], partial=True) != []
     write_baseline(path, [row("one", 3.0)], partial=False)
     assert regressions(path, [row("other", 2.0)], partial=True) == ["other: no baseline, record one"]
+
+
+@pytest.mark.slow
+def test_two_cameras_are_driven_as_their_benchmarks_do():
+    drive = Drive(100, 2)
+    drive()
+    assert (drive.sensor.ids >= 0).sum() > 10

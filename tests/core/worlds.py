@@ -11,6 +11,7 @@ from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 
@@ -21,20 +22,11 @@ STEP_NS = 100_000_000
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """What was seen in one frame, with the landmarks' names; clutter has the name −1."""
-
-    landmarks: np.ndarray
-    z: np.ndarray
-    cov_z: np.ndarray
-
-
-@dataclass(frozen=True)
 class World:
-    """A recording: one control and one frame per step, the true poses and landmarks."""
+    """A recording: one control and one frame per step, where clutter has the name −1; the true poses and landmarks."""
 
     controls: list[Odometry | None]
-    frames: list[Sightings]
+    frames: list[FeatureFrame]
     truth: np.ndarray
     landmarks: np.ndarray
 
@@ -56,7 +48,7 @@ def planar_world(steps: int, landmarks: int = 12, seed: int = 0, clutter: float 
     return World(controls, frames, np.array(poses), points)
 
 
-def _sightings(pose: np.ndarray, points: np.ndarray, clutter: float, rng: np.random.Generator) -> Sightings:
+def _sightings(pose: np.ndarray, points: np.ndarray, clutter: float, rng: np.random.Generator) -> FeatureFrame:
     model = RangeBearing(SE2)
     z = model.predict(pose, points)
     names = np.flatnonzero(z[:, 0] < MAX_RANGE)
@@ -65,7 +57,7 @@ def _sightings(pose: np.ndarray, points: np.ndarray, clutter: float, rng: np.ran
     order = rng.permutation(names.size + false.shape[0])
     names = np.concatenate([names, np.full(false.shape[0], -1)])[order]
     z = np.concatenate([z, false])[order]
-    return Sightings(names, z, np.repeat(np.diag(STD_Z**2)[None], names.size, axis=0))
+    return FeatureFrame(0, names, z, np.repeat(np.diag(STD_Z**2)[None], names.size, axis=0))
 
 
 @dataclass(frozen=True)

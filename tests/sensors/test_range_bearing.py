@@ -16,6 +16,7 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion, wheel_errors
 from rbpf.runs.recordings import filter_opened, open_robot_log
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel, wrap_angle
 from rbpf.sensors.readers import RobotLog
@@ -24,7 +25,6 @@ from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.system import FrameLog
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from tests.core.scripted import ids_of
-from tests.core.worlds import Sightings
 
 MOUNTED_2D = np.array([0.4, 0.3, -0.2])
 MOUNTED_3D = SE3.retract(SE3.identity(), np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
@@ -127,9 +127,9 @@ def test_visible():
 MODEL = RangeBearing(SE2)
 
 
-def frame(*names: object) -> Sightings:
+def frame(*names: object) -> FeatureFrame:
     z = np.stack([np.arange(3.0, 3.0 + len(names)), np.zeros(len(names))], axis=-1)
-    return Sightings(np.array(names), z, np.repeat(np.diag([0.01, 0.01])[None], len(names), axis=0))
+    return FeatureFrame(0, np.array(names), z, np.repeat(np.diag([0.01, 0.01])[None], len(names), axis=0))
 
 
 def named() -> Filter:
