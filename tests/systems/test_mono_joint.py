@@ -17,7 +17,7 @@ from rbpf.sensors.camera.points import CameraPoint, CameraRay
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers.formats import open_images
 from rbpf.sensors.readers.known_points import read_known_points
-from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, SearchConfig, VelocityConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, SearchConfig, StartConfig, VelocityConfig
 from rbpf.systems.mono.place_recognition import RISK, WRONG, log_likelihood, log_odds
 from rbpf.systems.mono.relocalisation import CORNER_PX
 from rbpf.systems.mono.slam import MonoSlam
@@ -28,7 +28,7 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems.mono_logs import desk, errors, nees, without_known
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, sequence, texture
 
-JOINT = MonoConfig(map="joint", settled_frames=4)
+JOINT = MonoConfig(map="joint", settled_frames=4, start=StartConfig(depth_std_ratio=0.03))
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -49,7 +49,7 @@ def test_images_from_anywhere_give_the_bytes_of_a_run_over_a_recording():
 
 
 def test_a_start_without_known_points_is_revised_and_says_so():
-    slam = MonoSlam(CAMERA, CONFIG)
+    slam = MonoSlam(CAMERA, replace(CONFIG, start=StartConfig(depth_std_ratio=0.03)))
     frames = images(40)
     tracked = tracked_all(slam, frames)
     assert slam.start.over

@@ -24,6 +24,7 @@ from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, optimum
 from rbpf.systems.system import Revision
 
+SLOW = 3.0  #: Times `depth_std_ratio`, after twice `max_frames`.
 #: Of a start without known points that ended before depths were known.
 DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
@@ -74,13 +75,15 @@ class UnknownStart(Kept):
         found = gathered(first, self.features, filter_.belief(), self.config.start.max_frames)
         if found is None:
             return None, None
-        steps, names, seen, start = found
-        best = optimum(seen, self.config, start) if seen.is_connected() else None
+        steps, names, seen, guess = found
+        best = optimum(seen, self.config, guess) if seen.is_connected() else None
         if best is None:
             self.over = True
             return None, DISCONNECTED
         in_view = np.isin(names, first.seen[-1].landmarks)
-        self.over = best.depth_std_ratio(in_view) < self.config.start.depth_std_ratio
+        start = self.config.start
+        limit = start.depth_std_ratio * (1.0 if count <= 2 * start.max_frames else SLOW)
+        self.over = best.depth_std_ratio(in_view) < limit
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         stamps = np.array(first.stamps_ns)
