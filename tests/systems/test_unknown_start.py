@@ -87,7 +87,7 @@ def test_frames_are_adjusted_ever_less_often(adjusted):
     assert adjusted[0] == 5 and adjusted[-1] < 27
     adjusted.clear()
     run(LOG, replace(SMALL, start=replace(config, depth_std_ratio=0.05, max_frames=6)))
-    assert adjusted == [5, 8, 12, 18]  # thrice as uncertain after twice six frames
+    assert adjusted == [5, 8, 12]  # where a ratio of 0.14 is more than the 0.08 before, and less than thrice 0.05
     adjusted.clear()
     run(desk(), SMALL)
     run(LOG, NEVER)

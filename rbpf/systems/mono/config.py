@@ -67,8 +67,8 @@ class StartConfig(Ranged):
     growth: Annotated[float, Range(gt=1.0, le=100.0)] = 1.25  #: … and the next ones after this many times as many each.
     #: that take part in an adjustment at most, evenly chosen.
     max_frames: Annotated[int, Range(ge=3), Formerly("frames")] = 60
-    #: the start ends when half of the depths in view have a standard deviation below this fraction of them; below three
-    #: times that after twice as many frames as take part: a camera that hardly moves never knows them better.
+    #: the start ends when half of the depths in view have a standard deviation below this fraction of them; or below three
+    #: times that, if there are more frames than take part, and depths are known no better than in the adjustment before.
     depth_std_ratio: Annotated[Positive, Formerly("depth_share")] = 0.01
 
     def is_due(self, count: int) -> bool:

@@ -13,7 +13,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import Kept, integers, truths
+from rbpf.core.checkpoint import Kept, integers, numbers, truths
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.lie import SE3
@@ -24,7 +24,7 @@ from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, optimum
 from rbpf.systems.system import Revision
 
-SLOW = 3.0  #: Times `depth_std_ratio`, after twice `max_frames`.
+WELL_KNOWN = 3.0  #: Times `depth_std_ratio`, where a later adjustment knows depths no better.
 #: Of a start without known points that ended before depths were known.
 DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
@@ -40,7 +40,7 @@ class UnknownStart(Kept):
     points and without a map.
     """
 
-    kept: ClassVar = {"over": truths(), "_next": integers(least=0)}
+    kept: ClassVar = {"over": truths(), "_next": integers(least=0), "_ratio": numbers(values="any")}
     prefix = "start/"
 
     def __init__(
@@ -55,6 +55,7 @@ class UnknownStart(Kept):
         #: Whether depths are known well enough, and the filter goes on alone.
         self.over = not (needed and config.start.batch_adjust)
         self._next = config.start.first_adjustment
+        self._ratio = np.inf  # of depths' standard deviations to depths, by the last adjustment
 
     def after_frame(self, filter_: Filter, usable: bool, lost: bool) -> tuple[Adjusted | None, str | None]:
         """Adjusts all frames so far if it is time.
@@ -81,9 +82,9 @@ class UnknownStart(Kept):
             self.over = True
             return None, DISCONNECTED
         in_view = np.isin(names, first.seen[-1].landmarks)
-        start = self.config.start
-        limit = start.depth_std_ratio * (1.0 if count <= 2 * start.max_frames else SLOW)
-        self.over = best.depth_std_ratio(in_view) < limit
+        start, before, self._ratio = self.config.start, self._ratio, best.depth_std_ratio(in_view)
+        is_best = count >= start.max_frames and before <= self._ratio < WELL_KNOWN * start.depth_std_ratio
+        self.over = self._ratio < start.depth_std_ratio or is_best
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         stamps = np.array(first.stamps_ns)
