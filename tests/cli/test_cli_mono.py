@@ -239,14 +239,10 @@ def survived(folder, out, *arguments):
     return entries
 
 
-def image_path(folder, number):
-    return folder / "images" / f"{number:06d}.png"
-
-
 def test_darkness_from_the_start_is_said_and_no_frame_of_it_counts_as_tracked(folder, tmp_path):
     for number in range(FRAMES):
         if number < 9:
-            path = image_path(folder, number)
+            path = folder / "images" / f"{number:06d}.png"
             cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
     entries = survived(folder, tmp_path / "run")
     assert "shows nothing" in entries["problems"][0]

@@ -5,7 +5,7 @@ camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it is. W
 """
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
 
@@ -32,6 +32,8 @@ MIN_FRAMES = 3
 MIN_SHARED = 6
 SCALE_STD = 1e-4  #: Standard deviation to which the scale is held.
 MAX_STEPS, MIN_GAIN = 30, 1e-4  #: Steps of the adjustment at most, and the fraction of the cost that ends it.
+#: Times the noise: residuals that a minimum is far from, and by how much less each time on the way to it.
+FAR, NEARER = 1.5, 3.0
 _HALF = CAUCHY_SCALE**2 / 2.0
 _BEYOND = float(np.exp(_HALF) * exp1(_HALF))
 LOSS_INFORMATION = (1.0 - _HALF * _BEYOND) ** 2 / ((_BEYOND + _HALF * _BEYOND - 1.0) * _HALF * _BEYOND)
@@ -41,6 +43,7 @@ The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), 
 a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
 """
 
+NEAREST = 0.2  #: Times the mean inverse distance, that no feature is farther away than after a reversal.
 CHI2_MEDIAN = float(2.0 * np.log(2.0))  #: Of χ² with two degrees of freedom.
 #: A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s.
 MIN_STD_VELOCITY = 1e-6
@@ -232,6 +235,14 @@ class Structure:
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return Structure(path, direction, self.inverse + of_features[:, 2], tuned, frame)
 
+    def reversed(self) -> "Structure":
+        """What is near is far and what is far is near, along the same path.
+
+        From little parallax both shapes look alike, with a turn in place of a shift (L. Necker's reversal).
+        """
+        middle = float(self.inverse.mean())
+        return replace(self, inverse=np.maximum(2.0 * middle - self.inverse, NEAREST * middle))
+
 
 @final
 @dataclass(frozen=True)
@@ -272,10 +283,24 @@ class Optimum:
 
 
 def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | None:
-    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations; None: none.
+    """The minimum that lies downhill from a start; None: none.
 
-    What is expected before anything is seen, of inverse distances and velocities, is that of the settings.
+    What is expected before anything is seen, of inverse distances and velocities, is that of the settings. Where residuals are
+    far beyond the noise the loss is all but flat: from there by way of minima with more noise (graduated non-convexity: A.
+    Blake and A. Zisserman 1987).
     """
+    squared = np.square(Linearised(seen, config, start).misfit).sum(axis=1)
+    noise_px = seen.noise_px * float(np.sqrt(np.median(squared) / CHI2_MEDIAN))
+    while noise_px > FAR * seen.noise_px:
+        nearer = _downhill(replace(seen, noise_px=noise_px), config, start)
+        if nearer is None:
+            return None
+        start, noise_px = nearer.structure, noise_px / NEARER
+    return _downhill(seen, config, start)
+
+
+def _downhill(seen: Window, config: MonoConfig, start: Structure) -> Optimum | None:
+    """By Levenberg's and Marquardt's method on the normal equations."""
     now, damping = Linearised(seen, config, start), DAMPING
     for _ in range(MAX_STEPS):
         information, vector = now.normal_equations()

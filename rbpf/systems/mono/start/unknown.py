@@ -81,6 +81,9 @@ class UnknownStart(Kept):
         if best is None:
             self.over = True
             return None, DISCONNECTED
+        other = optimum(seen, self.config, best.structure.reversed())
+        if other is not None and other.cost < best.cost:
+            best = other
         in_view = np.isin(names, first.seen[-1].landmarks)
         start, before, self._ratio = self.config.start, self._ratio, best.depth_std_ratio(in_view)
         is_best = count >= start.max_frames and before <= self._ratio < WELL_KNOWN * start.depth_std_ratio
