@@ -24,7 +24,7 @@ from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, optimum
 from rbpf.systems.system import Revision
 
-WELL_KNOWN = 3.0  #: Times `depth_std_ratio`, where a later adjustment knows depths no better.
+WELL_KNOWN = 3.0  #: Times `depth_std_ratio`: enough where a later adjustment knows depths no better.
 #: Of a start without known points that ended before depths were known.
 DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
@@ -81,13 +81,12 @@ class UnknownStart(Kept):
         if best is None:
             self.over = True
             return None, DISCONNECTED
-        other = optimum(seen, self.config, best.structure.reversed())
-        if other is not None and other.cost < best.cost:
-            best = other
-        in_view = np.isin(names, first.seen[-1].landmarks)
-        start, before, self._ratio = self.config.start, self._ratio, best.depth_std_ratio(in_view)
-        is_best = count >= start.max_frames and before <= self._ratio < WELL_KNOWN * start.depth_std_ratio
-        self.over = self._ratio < start.depth_std_ratio or is_best
+        # As long as depths are not known, near and far exchanged may be as good, and another minimum.
+        start, before, known = self.config.start, self._ratio, WELL_KNOWN * self.config.start.depth_std_ratio
+        other = None if before < known else optimum(seen, self.config, best.structure.reversed())
+        best = best if other is None or best.cost <= other.cost else other
+        self._ratio = best.depth_std_ratio(np.isin(names, first.seen[-1].landmarks))
+        self.over = self._ratio < start.depth_std_ratio or (count >= start.max_frames and before <= self._ratio < known)
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         stamps = np.array(first.stamps_ns)
