@@ -125,7 +125,7 @@ def in_two(seed: int = 1) -> Filter:
 
         def of(self, frame):
             mine = frame.landmarks % 2 == self.odd
-            return type(frame)(frame.landmarks[mine], frame.z[mine], frame.cov_z[mine])
+            return frame.take(mine)
 
         def observe(self, frame, belief):
             return super().observe(self.of(frame), belief)
