@@ -88,14 +88,14 @@ class LearntNoise(Kept):
         if sure.any():
             ids = group.ids[sure]
             mean, cov = expected(ids)
-            self.learn(ids, group.z[sure] - mean, cov, group.cov[sure] / self.factor(ids)[:, None, None])
+            self.learn(ids, group.z[sure] - mean, cov, group.cov[sure])
 
     def learn(self, ids: np.ndarray, error: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
-        """From residuals (k, p) after an update, with covariances (k, p, p), of landmarks (k,) of such noise (k, p, p)."""
+        """From residuals (k, p) of landmarks (k,) after an update with the noise (k, p, p); of covariances (k, p, p)."""
         information, p = np.linalg.inv(noise), error.shape[1]
-        squared = np.einsum("ka,kab,kb->k", error, information, error)
         # The noise that the update had is what is stated times the factor so far.
-        redundancy = p - np.einsum("kab,kba->k", information, cov) / self.factor(ids)
+        squared = self.factor(ids) * np.einsum("ka,kab,kb->k", error, information, error)
+        redundancy = p - np.einsum("kab,kba->k", information, cov)
         found = np.column_stack([squared, np.maximum(redundancy, LEAST_REDUNDANCY * p)])
         at = np.searchsorted(self._ids, ids)
         new = np.append(self._ids, NOBODY)[at] != ids

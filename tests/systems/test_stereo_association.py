@@ -91,7 +91,7 @@ def test_noise_of_each_landmark_is_learnt_from_its_residuals():
     cov = np.repeat(0.1 * np.eye(3)[None], ids.size, axis=0)
     for _ in range(400):
         error = deviation[:, None] * np.sqrt(0.1) * rng.normal(size=(ids.size, 3)) * np.sqrt(0.9)
-        noise.learn(ids, error, 0.1 * deviation[:, None, None] ** 2 * cov, cov)
+        noise.learn(ids, error, 0.1 * deviation[:, None, None] ** 2 * cov, noise.factor(ids)[:, None, None] * cov)
     np.testing.assert_allclose(np.sqrt(noise.factor(ids)), deviation, rtol=0.1)
     assert noise.factor(np.array([3]))[0] == pytest.approx(0.5 * (9.0 + 0.25), rel=0.1)
     again = LearntNoise()
@@ -110,7 +110,8 @@ def test_noise_of_all_landmarks_is_learnt_together(deviation, right, found):
     noise.expect(4.0)
     for _ in range(800):
         error = deviation * times[:, None] * np.sqrt(0.1) * rng.normal(size=(ids.size, 2)) * np.sqrt(0.9)
-        noise.learn(ids, error, 0.1 * noise.factor(ids)[:, None, None] * cov, cov)
+        had = noise.factor(ids)[:, None, None] * cov
+        noise.learn(ids, error, 0.1 * had, had)
     factors = np.sqrt(noise.factor(np.array([3, 77, 7])))
     np.testing.assert_allclose(factors, np.array([1.0, 1.0, 5.0]) * found, rtol=0.06)
     again = LearntNoise(shared=True, right=right)

@@ -132,12 +132,12 @@ def test_a_start_that_shows_nothing_at_first_begins_later(resampled):
     """Logs and videos alike: a lens cap is no loss of a camera that has seen nothing yet."""
     blank = replace(LOG, frames=[frame.take(slice(0)) for frame in LOG.frames[:7]] + LOG.frames[7:])
     assert np.isfinite(run(blank, SMALL).log.poses).all() and resampled
-    resampled.clear()
     ramp = np.tile(np.linspace(60, 200, 320).astype(np.uint8), (240, 1))
-    for change in (lambda t, image: ramp if t < 8 else image, lambda t, image: 0 * image if 0 < t < 5 else image):
+    lens_cap, lost = lambda t, image: ramp if t < 8 else image, lambda t, image: 0 * image if 0 < t < 5 else image
+    for change in (lens_cap, lost):
+        resampled.clear()
         done = filter_opened(open_mono(sequence(24, change), SMALL))
-        assert done.failure is None and np.isfinite(done.log.poses).all()
-    assert resampled
+        assert done.failure is None and np.isfinite(done.log.poses).all() and bool(resampled) == (change is lens_cap)
 
 
 def test_a_frame_without_an_image_is_not_what_is_resampled_after(resampled):

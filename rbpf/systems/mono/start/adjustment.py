@@ -43,7 +43,7 @@ The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), 
 a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
 """
 
-NEAREST = 0.2  #: Times the mean inverse distance, that no feature is farther away than after a reversal.
+FARTHEST = 0.2  #: Times the mean inverse distance: no feature is farther away after a reversal.
 CHI2_MEDIAN = float(2.0 * np.log(2.0))  #: Of χ² with two degrees of freedom.
 #: A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s.
 MIN_STD_VELOCITY = 1e-6
@@ -241,7 +241,7 @@ class Structure:
         From little parallax both shapes look alike, with a turn in place of a shift (L. Necker's reversal).
         """
         middle = float(self.inverse.mean())
-        return replace(self, inverse=np.maximum(2.0 * middle - self.inverse, NEAREST * middle))
+        return replace(self, inverse=np.maximum(2.0 * middle - self.inverse, FARTHEST * middle))
 
 
 @final
@@ -289,26 +289,26 @@ def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | Non
     far beyond the noise the loss is all but flat: from there by way of minima with more noise (graduated non-convexity: A.
     Blake and A. Zisserman 1987).
     """
-    squared = np.square(Linearised(seen, config, start).misfit).sum(axis=1)
-    noise_px = seen.noise_px * float(np.sqrt(np.median(squared) / CHI2_MEDIAN))
+    now = Linearised(seen, config, start)
+    noise_px = min(now.spread_px(), float(seen.camera.width))
     while noise_px > FAR * seen.noise_px:
-        nearer = _downhill(replace(seen, noise_px=noise_px), config, start)
+        nearer = _downhill(Linearised(replace(seen, noise_px=noise_px), config, now.at))
         if nearer is None:
             return None
-        start, noise_px = nearer.structure, noise_px / NEARER
-    return _downhill(seen, config, start)
+        now, noise_px = Linearised(seen, config, nearer.structure), noise_px / NEARER
+    return _downhill(now)
 
 
-def _downhill(seen: Window, config: MonoConfig, start: Structure) -> Optimum | None:
+def _downhill(now: "Linearised") -> Optimum | None:
     """By Levenberg's and Marquardt's method on the normal equations."""
-    now, damping = Linearised(seen, config, start), DAMPING
+    damping = DAMPING
     for _ in range(MAX_STEPS):
         information, vector = now.normal_equations()
         while True:
             ahead = None
             with suppress(LinAlgError, ValueError):  # ValueError where it is not finite
                 factor = cho_factor(information + damping * np.diag(np.diag(information)))
-                ahead = Linearised(seen, config, now.at.moved(np.asarray(cho_solve(factor, vector))))
+                ahead = Linearised(now.seen, now.config, now.at.moved(np.asarray(cho_solve(factor, vector))))
             if ahead is not None and ahead.cost < now.cost:
                 break
             damping *= DAMPING_FACTOR
@@ -323,10 +323,9 @@ def _downhill(seen: Window, config: MonoConfig, start: Structure) -> Optimum | N
 
 def residual_px(seen: Window, config: MonoConfig, best: Optimum) -> float:
     """Standard deviation per axis, px, of what was seen, as the residuals of a minimum say it: by their median."""
-    squared = np.square(Linearised(seen, config, best.structure).misfit).sum(axis=1)
-    free = 2 * squared.size - best.information.shape[0]
-    ratio = float(np.median(squared)) / CHI2_MEDIAN * (2 * squared.size / free) if free > 0 else 0.0
-    return seen.noise_px * float(np.sqrt(ratio))
+    count = 2 * seen.frame.size
+    free = count - best.information.shape[0]
+    return Linearised(seen, config, best.structure).spread_px() * float(np.sqrt(count / free)) if free > 0 else 0.0
 
 
 @final
@@ -334,7 +333,7 @@ class Linearised:
     """All residuals at a structure, whitened; their derivatives where they are asked for."""
 
     def __init__(self, seen: Window, config: MonoConfig, at: Structure) -> None:
-        self.seen, self.rho, self.at = seen, config.inverse_depth, at
+        self.seen, self.config, self.rho, self.at = seen, config, config.inverse_depth, at
         pose, feature = at.path[seen.frame], seen.feature
         position = SE3.translation(pose)
         place = at.direction[feature] + (1.0 - at.inverse[feature, None]) * position
@@ -371,6 +370,11 @@ class Linearised:
         """The first of T − 1 rows, and from row to row, whitened."""
         moved = np.concatenate([velocity[:1], np.diff(velocity, axis=0)])
         return np.einsum("ktj,jk...->tk...", self._whitener, moved)
+
+    def spread_px(self) -> float:
+        """Standard deviation per axis, px, that the residuals have, by their median."""
+        squared = np.square(self.misfit).sum(axis=1)
+        return self.seen.noise_px * float(np.sqrt(np.median(squared) / CHI2_MEDIAN))
 
     def optimum(self) -> Optimum | None:
         """This structure as a minimum; None where it is not finite."""
