@@ -28,22 +28,21 @@ from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import (
     Belief,
-    Jacobians,
     Landmark,
     LogDensities,
-    Map,
     NewLandmarks,
     ObservationModel,
     Observations,
     Part,
     Records,
+    RigidSpace,
     Transition,
 )
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights, weighted_mean
 from rbpf.errors import InputError
 from rbpf.kernels.dense import principal
 from rbpf.kernels.landmarks import expect_group
-from rbpf.lie import Array, Euclidean, LieGroup, SE2Group, SE3Group
+from rbpf.lie import Array, LieGroup, SE2Group, SE3Group
 from rbpf.maps.joint.columns import JointColumns
 from rbpf.maps.joint.present import Present
 from rbpf.maps.joint.rows import (
@@ -61,7 +60,7 @@ from rbpf.maps.joint.rows import (
 from rbpf.maps.joint.solution import Constants, Given, SubMap, exchanged, gain_of, moved
 from rbpf.maps.joint.submaps import SubMaps
 from rbpf.maps.point import Point
-from rbpf.maps.rows import checked_new_ids, expected, first_records, innovations
+from rbpf.maps.rows import MapOfRecords
 
 LARGEST = 6000
 """Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
@@ -77,7 +76,7 @@ SINGULAR = 1e-15
 
 
 @final
-class JointMap(Map):
+class JointMap(MapOfRecords):
     """Landmarks, the frame's pose and a substate as one Gaussian; give the filter a `Consolidation` with it.
 
     It takes points, what is anchored at a pose, and any `Landmark` that overrides `seen_from`.
@@ -109,10 +108,11 @@ class JointMap(Map):
     """
 
     evidence = False
+    space: RigidSpace
 
     def __init__(
         self,
-        space: SE2Group | SE3Group | Euclidean,
+        space: RigidSpace,
         substate: tuple[np.ndarray, np.ndarray] | None = None,
         compiled: bool = True,
         submap: int | None = None,
@@ -557,7 +557,7 @@ class JointMap(Map):
         if new_landmarks.mask is not None and not new_landmarks.mask.all():
             raise InputError("a joint map's landmarks are in all particles")
         model, z, own = new_landmarks.model, new_landmarks.z, slice(self.space.dim, self._first)
-        records = first_records(model, z, new_landmarks.cov, state)
+        records = self.first_records(new_landmarks, state)
         ids = self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
         slope = model.new_by_substate(z)
         if slope is not None and model.about is not None:
@@ -581,7 +581,7 @@ class JointMap(Map):
         if not (np.isfinite(records.mean).all() and np.isfinite(records.cov).all()):
             raise InputError("a new landmark has a mean or covariance that is not finite")
         count, dim, d = records.mean.shape[1], landmark.dim, self.space.dim
-        ids = checked_new_ids(ids, count, self._next_id, self.holds)
+        ids = self.checked_new_ids(ids, count, self._next_id)
         if not landmark.anchored:
             self._reach = max(self._reach, float(np.linalg.norm(records.mean[0], axis=-1).max(initial=0.0)))
         # Given the path, what is new owes its error to its own measurement alone, and a clone of the path has none.
@@ -677,16 +677,11 @@ class JointMap(Map):
     def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
         raise InputError("a joint map keeps no log-odds")
 
-    def innovations(
-        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
-    ) -> tuple[np.ndarray, Jacobians, Records]:
-        return innovations(model, self.space, z, state, self.read(ids, slice(particle, particle + 1)), self.compiled)
-
     def expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         kind, prior = self.held.of_one_kind(np.asarray(ids)), belief.prior
         kernel = self.held.kernel(model, kind) if self.compiled else None
         if kernel is None:
-            return expected(model, self.read(ids), belief)
+            return super().expected(model, ids, belief)
         predicted = np.empty((self.n, len(kind.rows), model.dim))
         within, held = np.empty((*predicted.shape, model.dim)), (kind.columns, kind.clones, kind.origins)
         arrays = belief.state, self.mean, self.cov, prior.spread(prior.mean)

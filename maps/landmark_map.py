@@ -9,18 +9,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.genealogy import Lineage
-from rbpf.core.models import (
-    Belief,
-    Jacobians,
-    Landmark,
-    LogDensities,
-    Map,
-    NewLandmarks,
-    ObservationModel,
-    Observations,
-    Part,
-    Records,
-)
+from rbpf.core.models import Belief, Landmark, LogDensities, NewLandmarks, ObservationModel, Observations, Part, Records
 from rbpf.core.particles import Information, Particles, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import project
@@ -32,7 +21,7 @@ from rbpf.maps.store import ALL, Layout, SharedStore
 
 
 @final
-class LandmarkMap(Map):
+class LandmarkMap(rows.MapOfRecords):
     """Landmarks of any parametrisation, shared between particles and copied only when written.
 
     Args:
@@ -77,8 +66,8 @@ class LandmarkMap(Map):
         return self.store.columns.kinds(ids) == self.register(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        records = rows.first_records(new_landmarks.model, new_landmarks.z, new_landmarks.cov, state)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
+        records = self.first_records(new_landmarks, state)
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
     def add_records(
@@ -88,7 +77,7 @@ class LandmarkMap(Map):
             raise InputError("landmarks of some particles only need a map with evidence=True")
         kind = self.register(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
-        ids = rows.checked_new_ids(ids, len(columns), self.store.columns.next_id, self.holds)
+        ids = self.checked_new_ids(ids, len(columns), self.store.columns.next_id)
         self.store.add(columns, ids)
         self.store.columns.kind[self.store.columns.rows(ids)] = kind
         return ids
@@ -147,16 +136,6 @@ class LandmarkMap(Map):
         if not moments:
             return np.zeros((0, 0)), np.zeros((0, 0, 0))
         return np.array([mean for mean, _ in moments]), np.array([cov for _, cov in moments])
-
-    def innovations(
-        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
-    ) -> tuple[np.ndarray, Jacobians, Records]:
-        return rows.innovations(
-            model, self.space, z, state, self.read(ids, slice(particle, particle + 1)), self.compiled
-        )
-
-    def expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        return rows.expected(model, self.read(ids), belief)
 
     def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
         """Whether `project` runs compiled for landmarks (K,) of one parametrisation."""

@@ -24,6 +24,8 @@ from rbpf.core.models import (
     Jacobians,
     Likelihood,
     LogDensities,
+    Map,
+    NewLandmarks,
     ObservationModel,
     Observations,
     Part,
@@ -405,59 +407,53 @@ def _likelihood(group: Observations) -> Likelihood:
     return group.likelihood or GAUSSIAN
 
 
-# What every map does alike: numbers for new landmarks, and what the particles expect to measure of the ones they hold.
+class MapOfRecords(Map):
+    """What every map does alike: numbers for new landmarks, and what the particles expect to measure of those they hold."""
 
+    space: LieGroup
+    compiled: bool  #: use the models' fused kernels where they have one.
 
-def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-    """As `Map.expected`, of their records."""
-    prior, state = belief.prior, belief.state[:, None, :]
-    predicted = model.predict(state, records.mean, records.const)
-    _, (by_state, by_landmark, _) = linearise(model, prior.space, predicted, state, records.mean, records.const)
-    assert by_state is not None and by_landmark is not None
-    moved = by_state @ prior.spread(prior.mean)[:, None]
-    within = by_landmark @ records.cov @ np.swapaxes(by_landmark, -1, -2)
-    return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
+    def checked_new_ids(self, ids: np.ndarray | None, count: int, next_id: int) -> np.ndarray:
+        """Numbers (K,) of `count` new landmarks, from `next_id` on where none are given; errors as `add_records`."""
+        if ids is None:
+            return np.arange(next_id, next_id + count)
+        ids = np.asarray(ids)
+        if ids.shape != (count,) or ids.dtype.kind not in "iu" or (ids < 0).any():
+            raise InputError(f"ids of {count} new landmarks must be as many whole numbers from 0 up, got {ids}")
+        numbers, times = np.unique(ids, return_counts=True)
+        taken = numbers[self.holds(numbers) | (times > 1)]
+        if taken.size:
+            raise InputError(f"a new landmark needs an id of its own: {taken[0]} is in use")
+        return ids.astype(np.int64)
 
+    def first_records(self, new: NewLandmarks, state: np.ndarray) -> Records:
+        """Estimates (N, K, …) of landmarks that are started at states (N, E)."""
+        name = type(new.model).__name__
+        return new.model.initialise(state, numbers(new.z, f"z of {name}"), numbers(new.cov, f"cov of {name}"))
 
-def checked_new_ids(
-    ids: np.ndarray | None, count: int, next_id: int, holds: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Numbers (K,) of `count` new landmarks, from `next_id` on where none are given.
+    def expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+        prior, state, records = belief.prior, belief.state[:, None, :], self.read(ids)
+        predicted = model.predict(state, records.mean, records.const)
+        _, (by_state, by_landmark, _) = linearise(model, prior.space, predicted, state, records.mean, records.const)
+        assert by_state is not None and by_landmark is not None
+        moved = by_state @ prior.spread(prior.mean)[:, None]
+        within = by_landmark @ records.cov @ np.swapaxes(by_landmark, -1, -2)
+        return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
 
-    Raises InputError: not new, not whole.
-    """
-    if ids is None:
-        return np.arange(next_id, next_id + count)
-    ids = np.asarray(ids)
-    if ids.shape != (count,) or ids.dtype.kind not in "iu" or (ids < 0).any():
-        raise InputError(f"ids of {count} new landmarks must be as many whole numbers from 0 up, got {ids}")
-    numbers, times = np.unique(ids, return_counts=True)
-    taken = numbers[holds(numbers) | (times > 1)]
-    if taken.size:
-        raise InputError(f"a new landmark needs an id of its own: {taken[0]} is in use")
-    return ids.astype(np.int64)
-
-
-def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state: np.ndarray) -> Records:
-    """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
-    name = type(model).__name__
-    return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))
-
-
-def innovations(
-    model: ObservationModel, space: LieGroup, z: Array, state: Array, records: Records, compiled: bool
-) -> tuple[Array, Jacobians, Records]:
-    """Of one particle's records (1, K, …) at its state (E,), as `Map.innovations`."""
-    kernel, const = fused_kernel(model) if compiled else None, records.const
-    if kernel is None:
-        nu, jac = linearise(model, space, z, state, records.mean, const)
-        assert jac.state is not None and jac.landmark is not None
-        return nu[0], Jacobians(jac.state[0], jac.landmark[0]), records
-    (_, k, dim), p = records.mean.shape, z.shape[1]
-    said, slope = np.zeros((k * p, 1 + space.dim, 1)), np.zeros((k * p, dim))
-    columns, none = np.arange(k * dim).reshape(k, dim), np.zeros((k, 0), dtype=np.int64)
-    arrays = state[None], records.mean.reshape(1, -1), np.empty((k, 0)) if const is None else const[0], z
-    at, mean, origins, z = (numbers(array, "what a kernel takes") for array in arrays)
-    linearise_group(kernel.function.address, kernel.params, at, mean, columns, none, origins, z, 0, said, slope)
-    nu, by_state = said[:, 0].reshape(k, p), said[:, 1:].reshape(k, p, space.dim)
-    return nu, Jacobians(by_state, slope.reshape(k, p, dim)), records
+    def innovations(
+        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
+    ) -> tuple[Array, Jacobians, Records]:
+        space, records = self.space, self.read(ids, slice(particle, particle + 1))
+        kernel, const = fused_kernel(model) if self.compiled else None, records.const
+        if kernel is None:
+            nu, jac = linearise(model, space, z, state, records.mean, const)
+            assert jac.state is not None and jac.landmark is not None
+            return nu[0], Jacobians(jac.state[0], jac.landmark[0]), records
+        (_, k, dim), p = records.mean.shape, z.shape[1]
+        said, slope = np.zeros((k * p, 1 + space.dim, 1)), np.zeros((k * p, dim))
+        columns, none = np.arange(k * dim).reshape(k, dim), np.zeros((k, 0), dtype=np.int64)
+        arrays = state[None], records.mean.reshape(1, -1), np.empty((k, 0)) if const is None else const[0], z
+        at, mean, origins, z = (numbers(array, "what a kernel takes") for array in arrays)
+        linearise_group(kernel.function.address, kernel.params, at, mean, columns, none, origins, z, 0, said, slope)
+        nu, by_state = said[:, 0].reshape(k, p), said[:, 1:].reshape(k, p, space.dim)
+        return nu, Jacobians(by_state, slope.reshape(k, p, dim)), records
