@@ -31,9 +31,8 @@ def _phasor(angle):
 @njit(void(READ_ONLY, READ_ONLY, MATRIX), cache=True, error_model="numpy")
 def retract(x, xi, out):
     """The product x Exp(ξ): the rotations exp(iθ) and exp(iω/2) of the increment are one."""
-    step_x, step_xi = int(x.shape[0] > 1), int(xi.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_x * i, step_xi * i
+        j, k = min(i, len(x) - 1), min(i, len(xi) - 1)
         half = 0.5 * xi[k, 0]
         step = _sinc(half) * _phasor(x[j, 0] + half) * complex(xi[k, 1], xi[k, 2])
         out[i, 0], out[i, 1], out[i, 2] = _wrap(x[j, 0] + xi[k, 0]), x[j, 1] + step.real, x[j, 2] + step.imag
@@ -42,9 +41,8 @@ def retract(x, xi, out):
 @njit(void(READ_ONLY, READ_ONLY, MATRIX), cache=True, error_model="numpy")
 def local(x, y, out):
     """Log(x⁻¹ y)."""
-    step_x, step_y = int(x.shape[0] > 1), int(y.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_x * i, step_y * i
+        j, k = min(i, len(x) - 1), min(i, len(y) - 1)
         angle = _wrap(y[k, 0] - x[j, 0])
         half = 0.5 * angle
         step = _phasor(-x[j, 0] - half) * complex(y[k, 1] - x[j, 1], y[k, 2] - x[j, 2]) / _sinc(half)

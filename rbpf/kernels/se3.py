@@ -229,9 +229,8 @@ def inverse(x, out):
 @njit(_TWO, cache=True, error_model="numpy")
 def compose(a, b, out):
     """Group product."""
-    step_a, step_b = int(a.shape[0] > 1), int(b.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_a * i, step_b * i
+        j, k = min(i, len(a) - 1), min(i, len(b) - 1)
         q = _quat(a, j)
         t = _added(_vector(a, j, 4), turned(q, _vector(b, k, 4)))
         _store(multiply(q, _quat(b, k)), t, out, i)
@@ -240,9 +239,8 @@ def compose(a, b, out):
 @njit(_TWO, cache=True, error_model="numpy")
 def retract(x, xi, out):
     """The product x Exp(ξ)."""
-    step_x, step_xi = int(x.shape[0] > 1), int(xi.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_x * i, step_xi * i
+        j, k = min(i, len(x) - 1), min(i, len(xi) - 1)
         q = _quat(x, j)
         turn, shift = exp_pair(_vector(xi, k, 0), _vector(xi, k, 3))
         _store(multiply(q, turn), _added(_vector(x, j, 4), turned(q, shift)), out, i)
@@ -255,9 +253,8 @@ def local(x, y, out):
     The difference of the translations is taken before the rotation, so that near points far from the origin lose no
     digits.
     """
-    step_x, step_y = int(x.shape[0] > 1), int(y.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_x * i, step_y * i
+        j, k = min(i, len(x) - 1), min(i, len(y) - 1)
         q = _inverse_quat(x, j)
         apart = (y[k, 4] - x[j, 4], y[k, 5] - x[j, 5], y[k, 6] - x[j, 6])
         _store_log(multiply(q, _quat(y, k)), turned(q, apart), out, i)
@@ -281,18 +278,16 @@ def mean(points, weights, iterations, tolerance, out):
 @njit(_TWO, cache=True, error_model="numpy")
 def transform(a, p, out):
     """World points of body points (K, 3)."""
-    step_a, step_p = int(a.shape[0] > 1), int(p.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_a * i, step_p * i
+        j, k = min(i, len(a) - 1), min(i, len(p) - 1)
         out[i, 0], out[i, 1], out[i, 2] = _added(_vector(a, j, 4), turned(_quat(a, j), _vector(p, k, 0)))
 
 
 @njit(_TWO, cache=True, error_model="numpy")
 def inverse_transform(a, p, out):
     """Body points of world points (K, 3)."""
-    step_a, step_p = int(a.shape[0] > 1), int(p.shape[0] > 1)
     for i in range(out.shape[0]):
-        j, k = step_a * i, step_p * i
+        j, k = min(i, len(a) - 1), min(i, len(p) - 1)
         apart = (p[k, 0] - a[j, 4], p[k, 1] - a[j, 5], p[k, 2] - a[j, 6])
         out[i, 0], out[i, 1], out[i, 2] = turned(_inverse_quat(a, j), apart)
 
