@@ -47,7 +47,7 @@ class InverseDepth(Ranged, Landmark):
         jac = np.zeros((*q.shape, 3, 3))
         jac[..., 0, 0] = jac[..., 1, 1] = 1.0 / q
         jac[..., :, 2] = -direction / np.square(q)[..., None]
-        return SE3.transform(const, direction / q[..., None]), SE3.matrix(const)[..., :3, :3] @ jac
+        return SE3.transform(const, direction / q[..., None]), SE3.rotation(const) @ jac
 
     def ready(self, records: Records) -> np.ndarray:
         """Whether q is positive and well known, (N, K): then depth is nearly Gaussian too (Fig. 2)."""

@@ -45,6 +45,8 @@ class Euclidean(Commutative):
     def log(self, x: States) -> TangentArray:
         return np.array(x, dtype=float)
 
+    normalise = log
+
     def compose(self, a: States, b: States) -> StateArray:
         return np.asarray(a, dtype=float) + np.asarray(b, dtype=float)
 
@@ -56,9 +58,6 @@ class Euclidean(Commutative):
 
     def local(self, x: States, y: States) -> TangentArray:
         return np.asarray(y, dtype=float) - np.asarray(x, dtype=float)
-
-    def normalise(self, x: States) -> StateArray:
-        return np.array(x, dtype=float)
 
     rotation = Commutative.adjoint  #: I (…, D, D).
     #: World points of body points, and their inverse: the group is that of translations.

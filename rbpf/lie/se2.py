@@ -115,21 +115,6 @@ class SE2Group(LieGroup):
         out[..., 1, 0], out[..., 0, 1] = z.imag, -z.imag
         return out
 
-    def matrix(self, a: States) -> Float[np.ndarray, "*batch 3 3"]:
-        """Homogeneous matrix, (..., 3) -> (..., 3, 3)."""
-        a = _contiguous(a)
-        out = np.zeros((*a.shape[:-1], 3, 3))
-        out[..., :2, :2] = self.rotation(a)
-        out[..., :2, 2] = a[..., 1:]
-        out[..., 2, 2] = 1.0
-        return out
-
-    def from_matrix(self, m: Like[ArrayLike, "*#batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Element of a homogeneous matrix, (..., 3, 3) -> (..., 3)."""
-        m = np.asarray(m, dtype=float)
-        angle = np.arctan2(m[..., 1, 0] - m[..., 0, 1], m[..., 0, 0] + m[..., 1, 1])
-        return np.concatenate([_wrap(angle)[..., None], m[..., :2, 2]], axis=-1)
-
 
 def _wrap(angle: Array) -> Array:
     # An angle that is in (-pi, pi] already must come back unrounded; the minimum catches pi + 1 ulp.
