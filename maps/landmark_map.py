@@ -96,7 +96,7 @@ class LandmarkMap(rows.MapOfRecords):
             kind = self.register(to or Point(records.mean.shape[-1]))
             log_odds = column[-1][:, None] if self.evidence else None
             self.store.replace(np.array([landmark_id]), self.layouts[kind].pack(records, log_odds))
-            self.store.columns.kind[self.store.columns.row(int(landmark_id))] = kind
+            self.store.columns.kind[self.store.columns.rows(landmark_id)] = kind
 
     def ready(self, weights: np.ndarray, fraction: float = 0.95) -> np.ndarray:
         """Landmarks of several components or with constants that are ready in `fraction` of the weight (N,)."""
@@ -137,18 +137,14 @@ class LandmarkMap(rows.MapOfRecords):
             return np.zeros((0, 0)), np.zeros((0, 0, 0))
         return np.array([mean for mean, _ in moments]), np.array([cov for _, cov in moments])
 
-    def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
-        """Whether `project` runs compiled for landmarks (K,) of one parametrisation."""
-        if not self.compiled or type(model).innovation is not ObservationModel.innovation:
-            return False
-        return self._layout_of(int(ids[0])).landmark.components == 1 and model.kernel() is not None
-
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         self._known(ids)
-        prior, weights = belief.prior, belief.weights
-        kernel = rows.fused_kernel(model) if self.is_compiled(model, ids) else None
+        prior, weights, landmark = belief.prior, belief.weights, self._layout_of(int(ids[0])).landmark
+        # A constraint is projected by its prediction.
+        is_plain = type(model).innovation is ObservationModel.innovation and landmark.components == 1
+        kernel = rows.fused_kernel(model) if self.compiled and is_plain else None
         if kernel is not None:
-            landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim
+            k, p = ids.size, model.dim
             mean, cov = np.empty((k, p)), np.empty((k, p, p))
             state, spread = map(np.ascontiguousarray, (prior.predicted(), prior.spread(prior.mean)))
             sizes = np.array([self.space.dim, landmark.dim, landmark.constants])
@@ -250,9 +246,6 @@ class LandmarkMap(rows.MapOfRecords):
 
         The filter that saves and the one that loads name the same ones in the same order.
         """
-        for number, layout in enumerate(self.layouts):
-            if layout.landmark is landmark:
-                return number
         layout = Layout(landmark, self.evidence)
         if layout not in self.layouts:
             self.layouts.append(layout)
@@ -269,7 +262,7 @@ class LandmarkMap(rows.MapOfRecords):
         return plan
 
     def _layout_of(self, landmark_id: int) -> Layout:
-        return self.layouts[self.store.columns.kind[self.store.columns.row(int(landmark_id))]]
+        return self.layouts[self.store.columns.kind[self.store.columns.rows(landmark_id)]]
 
     def _known(self, ids: np.ndarray | Sequence[int]) -> None:
         named = np.asarray(ids)

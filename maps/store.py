@@ -22,7 +22,7 @@ from rbpf.ranges import require_memory
 ALL = slice(None)
 
 _TABLES = {
-    "ids": integers("landmarks", least=0, below="ids"),
+    "ids": integers("landmarks", least=0, below="ids", distinct=True),
     "fields": integers("landmarks", least=1),
     "generation": integers("landmarks", least=0, below="generations"),
 }
@@ -127,12 +127,9 @@ class Columns:
         self.next_id = 0  #: One more than the largest id that was ever used.
         self._hold(np.zeros((5, 0), dtype=np.int64))
 
-    def rows(self, ids: np.ndarray) -> np.ndarray:
-        """Rows (K,) of columns (K,), which must be held."""
+    def rows(self, ids: np.ndarray | int) -> np.ndarray:
+        """Rows (K,) of columns (K,), which must be held; of a single one its number."""
         return self._order[self._ascending.searchsorted(ids)]
-
-    def row(self, column: int) -> int:
-        return int(self.rows(np.array(column)))
 
     def held(self, ids: np.ndarray) -> np.ndarray:
         """Whether each of some ids (K,) is that of a column held, (K,) bool."""
@@ -157,14 +154,6 @@ class Columns:
     def remove(self, ids: np.ndarray) -> None:
         """Drops columns (K,), which must be held."""
         self._hold(np.delete(self._tables, self.rows(ids), axis=1))
-
-    def restore(self, ids: np.ndarray, next_id: int) -> None:
-        """Holds the columns (M,) and no others; their tables have to be filled again. An id that comes twice is refused."""
-        if np.unique(ids).size < ids.size:
-            raise InputError("a landmark's id comes twice")
-        self._hold(np.zeros((5, 0), dtype=np.int64))
-        self.add(ids.size, ids)
-        self.next_id = next_id
 
     def _hold(self, tables: np.ndarray) -> None:
         """Five tables, one below the other."""
@@ -333,7 +322,7 @@ class SharedStore:
         self._join(stale, now)
         targets = self.columns.slab[at]
         if len(past) == columns.size:
-            return Access(pool.data, access.slabs, access.which, access.maps), targets
+            return access._replace(pool=pool.data), targets
         _, first = np.unique(columns, return_index=True)
         again = np.ones(columns.size, dtype=bool)
         again[first] = False
@@ -401,7 +390,8 @@ class SharedStore:
         next_id = int(read_one(arrays, "store/size", integers(least=0)))
         sizes = {"generations": self.lineage.generation + 1, "ids": next_id, "n": self.n}
         found = read(arrays, _TABLES, "store/", **sizes)
-        self.columns.restore(found["ids"], next_id)
+        self.columns.add(found["ids"].size, found["ids"])
+        self.columns.next_id = next_id
         self.columns.fields[:], self.columns.generation[:] = found["fields"], found["generation"]
         for row, column in enumerate(self.ids.tolist()):
             self._members.setdefault(int(self.columns.generation[row]), set()).add(column)

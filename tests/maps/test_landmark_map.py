@@ -158,6 +158,7 @@ def test_landmarks_have_the_numbers_that_their_sensor_gives_them():
         ([4.0, 5.0], "whole numbers"),
     ],
 )
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_numbers_that_no_new_landmark_can_have(ids, message):
     landmark_map, _ = filled()
     state = np.tile(SE2.identity(), (landmark_map.n, 1))

@@ -128,23 +128,16 @@ def test_as_a_dictionary(edits):
         np.testing.assert_array_equal(columns.ids, ids)
         assert columns.next_id == next_id
         again = Columns()
-        again.restore(ids, next_id)
+        again.add(ids.size, ids)
         np.testing.assert_array_equal(again.rows(ids), columns.rows(ids))
         rows = columns.rows(ids)
         np.testing.assert_array_equal(rows, np.arange(ids.size))
-        assert [columns.row(column) for column in model] == rows.tolist()
         np.testing.assert_array_equal(columns.fields[rows], ids + 1)
         np.testing.assert_array_equal(columns.generation[rows], 2 * ids)
         np.testing.assert_array_equal(columns.slab[rows], 3 * ids)
         asked = np.arange(-2, next_id + 3)
         np.testing.assert_array_equal(columns.held(asked), [column in model for column in asked.tolist()])
         np.testing.assert_array_equal(columns.kinds(asked), [model.get(column, -1) for column in asked.tolist()])
-
-
-@pytest.mark.parametrize("ids", [[1, 1], [3, 1, 3]])
-def test_ids_that_cannot_be(ids):
-    with pytest.raises(InputError, match="comes twice"):
-        Columns().restore(np.array(ids), 9)
 
 
 # Which rows are independent and which belong together.
@@ -313,13 +306,11 @@ def test_projections_equal_numpys(n, shared):
     prior = Prior(SE3, SE3.exp(0.02 * rng.normal(size=(n, 6))), 0.01 * rng.normal(size=(n, 6)), factor, centred=False)
     weights = rng.uniform(size=n)
     belief = Belief(np.log(weights / weights.sum()), prior, {Part.LANDMARK: landmark_map})
-    # A constraint is projected by its prediction.
-    assert not landmark_map.is_compiled(EpipolarRay(CAMERA), rays[-2:])
     point, ray, slab = CameraPoint(CAMERA), CameraRay(CAMERA), landmark_map.store.columns.slab
     assert (slab[points[-2:]] >= 0).all() and (slab[rays[-2:]] >= 0).all()
     assert n == 7 or min(slab[points[:2]].min(), slab[rays[:2]].min()) < 0  # of some, few records are left
-    for model, ids in ((point, points[-2:]), (ray, rays[-2:]), (point, points[:4]), (ray, rays[:4])):
-        assert landmark_map.is_compiled(model, ids)
+    constraint = EpipolarRay(CAMERA), rays[-2:]
+    for model, ids in ((point, points[-2:]), (ray, rays[-2:]), (point, points[:4]), (ray, rays[:4]), constraint):
         mean, cov = belief.project(model, ids)
         landmark_map.compiled = False
         expected_mean, expected_cov = belief.project(model, ids)
