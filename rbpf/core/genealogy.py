@@ -153,7 +153,7 @@ class Lineage:
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; what is stored per generation must be taken up again.
+        """The inverse of `arrays`, into a new lineage; what is stored per generation must be taken up again.
 
         Raises InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
         """
@@ -163,35 +163,27 @@ class Lineage:
         self._nodes[:] = np.column_stack([found[name] for name in _COLUMNS])
         self._leaves, self._free = found["leaves"], found["free"]
         self.generation, self._n_free = now, n_free
-        # Refused is what is no forest: parents are older than their children, and what is free is nobody's ancestor.
-        size = len(self._nodes)
-        alive, children = np.zeros(size, dtype=bool), np.zeros(size, dtype=np.int64)
-        parent, its_children, generation, _ = self._nodes.T
-        nodes = np.unique(self._leaves)
-        sound = nodes.size == self.n and self._n_free <= size <= self._free.size
-        children[nodes] = 1
-        self._oldest = 0
-        while sound and nodes.size:
-            alive[nodes] = True
-            parents = parent[nodes]
-            if (parents < 0).any():
-                self._oldest = max(self._oldest, int(generation[nodes[parents < 0]].max()))
-            older = parents >= 0
-            sound = bool((generation[parents[older]] < generation[nodes[older]]).all())
-            sound = sound and bool((generation[nodes] >= 0).all())
-            np.add.at(children, parents[older], 1)
-            nodes = np.unique(parents[older & ~alive[parents]])
-        free = self._free[: self._n_free]
-        sound = sound and np.unique(free).size == size - int(alive.sum()) == free.size
-        if not (sound and not alive[free].any() and np.array_equal(children[alive], its_children[alive])):
+        # Refused is what is no forest: what is not free has children or is a leaf, and a parent that is older and not free.
+        size, free = len(self._nodes), self._free[:n_free]
+        alive = np.ones(size, dtype=bool)
+        alive[free] = False
+        parent, children, generation, _ = self._nodes[alive].T
+        has_parent = parent >= 0
+        above = parent[has_parent]
+        counted = np.bincount(np.append(self._leaves, above), minlength=size)
+        if not (
+            n_free <= size <= self._free.size
+            and alive.sum() == size - n_free
+            and np.unique(self._leaves).size == self.n
+            and alive[self._leaves].all()
+            and alive[above].all()
+            and (self._nodes[above, GENERATION] < generation[has_parent]).all()
+            and (generation >= 0).all()
+            and np.array_equal(children, counted[alive])
+            and children.all()
+        ):
             raise InputError("the particles' ancestry is no forest")
-        self._pending.clear()
-        self._is_planted = True
-        self._retained.clear()
-        self._cache.clear()
-        self._alive.clear()
-        self._members.clear()
-        self._settled.clear()
+        self._oldest = int(generation[~has_parent].max())
 
     def _allocate(self, size: int) -> None:
         self._nodes = np.tile(_NO_NODE, (size, 1))
@@ -346,15 +338,12 @@ class History:
             "history/generations": np.array([b.generation for b in self.blocks], dtype=np.int64)
         }
         for number, block in enumerate(self.blocks):
-            out[f"history/{number}/kept"] = block.kept
-            out[f"history/{number}/stamps_ns"] = np.array(block.stamps_ns, dtype=np.int64)
-            out[f"history/{number}/states"] = np.array(block.states)
-            out[f"history/{number}/log_weights"] = np.array(block.log_weights)
+            kept = {name: np.array(value) for name, value in vars(block).items() if name != "generation"}
+            out |= {f"history/{number}/{name}": array for name, array in kept.items()}
         return out
 
     def restore(self, arrays: dict[str, np.ndarray], size: int | None = None) -> None:
-        """The inverse of `arrays`, of states of so many numbers; errors as `rbpf.core.checkpoint.read`."""
-        self._blocks = {}
+        """The inverse of `arrays`, of states of so many numbers, into a new one; errors as `rbpf.core.checkpoint.read`."""
         generations = read_one(arrays, "history/generations", integers("blocks", ascending=True)).tolist()
         shape = ("steps", "n") if self.clouds else (0,)
         block = {**_BLOCK, "log_weights": numbers(*shape, values="log")}

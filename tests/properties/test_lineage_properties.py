@@ -70,18 +70,6 @@ def test_size_of_the_forest():
     assert 1.0 < np.mean(excess[100:]) < 3.0
 
 
-def test_what_is_settled_is_forgotten_by_a_restoration():
-    """A generation's number may mean another ancestry after a restoration."""
-    lineage, other = Lineage(2), Lineage(2)
-    for one, ancestors in ((lineage, [0, 0]), (other, [1, 1])):
-        one.retain(0)
-        one.advance(np.array(ancestors))
-        np.testing.assert_array_equal(one.rows(0), ancestors)
-    lineage.restore(other.arrays())
-    lineage.retain(0)
-    np.testing.assert_array_equal(lineage.rows(0), [1, 1])
-
-
 class Copied:
     """All paths (T, N, E), gathered anew at every resampling."""
 
