@@ -4,7 +4,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf import gaussian
+from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.core.models import Landmark, Records, RigidSpace
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
@@ -68,8 +68,7 @@ class MixturePoint(Landmark):
         heaviest = records.log_weights.argmax(axis=-1)[..., None, None]
         mean = np.take_along_axis(records.mean, heaviest, axis=2)
         cov = np.take_along_axis(records.cov, heaviest[..., None], axis=2)
-        offset = gaussian.solve_lower(gaussian.cholesky(np.broadcast_to(cov, records.cov.shape)), records.mean - mean)
-        near = np.square(offset).sum(axis=-1) <= REACH**2
+        near = squared_mahalanobis(records.mean - mean, np.broadcast_to(cov, records.cov.shape)) <= REACH**2
         return (np.exp(records.log_weights) * near).sum(axis=-1) >= DOMINANT
 
 

@@ -133,9 +133,8 @@ def _expected(hint: Any, value: Any, allowed: Range) -> str | None:
     if hint is NoneType:
         return None if value is None else "none"
     if hint is bool:
-        boolean = (
-            isinstance(value, bool) or str(getattr(value, "dtype", "")) == "bool"
-        )  # NumPy's, which is not imported
+        # NumPy's, too, which is not imported.
+        boolean = isinstance(value, bool) or str(getattr(value, "dtype", "")) == "bool"
         return None if boolean else "true or false"
     if hint in (int, float):
         # NumPy's numbers are such numbers, too.

@@ -82,13 +82,6 @@ class StepReport:
         return mixture_estimate(*self.mixture, self.second)
 
 
-_FILTER = {
-    "numbers": checkpoint.integers(2),
-    "started": checkpoint.truths(),
-    "log_evidence": checkpoint.numbers(values="any"),
-}
-
-
 class Filter:
     """N weighted trajectories, each with its own marginalised part.
 
@@ -353,13 +346,18 @@ class Filter:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`. Raises InputError: an array does not fit; the filter is then in between."""
-        state = checkpoint.read_one(arrays, "particles/state", checkpoint.elements(self.space, "n"), n=self.n)
-        log_weights = checkpoint.read_one(
-            arrays, "particles/log_weights", checkpoint.numbers("n", values="log"), n=self.n
-        )
+        schema = {
+            "particles/state": checkpoint.elements(self.space, "n"),
+            "particles/log_weights": checkpoint.numbers("n", values="log"),
+            "filter/numbers": checkpoint.integers(2),
+            "filter/started": checkpoint.truths(),
+            "filter/log_evidence": checkpoint.numbers(values="any"),
+        }
+        if self.consolidation is not None:
+            schema["filter/age"] = checkpoint.integers(least=0)
+        state, log_weights, counted, started, evidence, *age = checkpoint.read(arrays, schema, n=self.n).values()
         if abs(np.logaddexp.reduce(log_weights)) > 1e-6:
             raise InputError("the particles' weights do not sum to 1")
-        counted = checkpoint.read(arrays, _FILTER, "filter/")
         lineage = Lineage(self.n)
         lineage.restore(arrays)
         history = History(lineage, self.history.lag, self.history.clouds)
@@ -368,13 +366,13 @@ class Filter:
         self.marginals.begin(self.n, lineage)
         self.marginals.restore(arrays)
         self.particles = Particles(state, log_weights)
-        steps, stamp = counted["numbers"].tolist()
+        steps, stamp = counted.tolist()
         if steps < 0:
             raise InputError(f"the array filter/numbers counts {steps} steps")
-        self.steps, self.stamp_ns = steps, stamp if counted["started"] else None
-        self.log_evidence = float(counted["log_evidence"])
-        if self.consolidation is not None:
-            self._age = int(checkpoint.read_one(arrays, "filter/age", checkpoint.integers(least=0)))
+        self.steps, self.stamp_ns = steps, stamp if started else None
+        self.log_evidence = float(evidence)
+        if age:
+            self._age = int(age[0])
 
     def _fingerprint(self) -> dict[str, object]:
         return {

@@ -256,8 +256,8 @@ def associations(
     # What is explained by no landmark is new, but clutter where a landmark is as near as the measurement's own noise: that
     # one is uncertain of its place is no reason to take another one for it.
     for reading in np.flatnonzero((chosen == NULL).any(axis=0)).tolist():
-        white = gaussian.solve_lower(gaussian.cholesky(noise[reading]), z[reading] - mean.reshape(len(mean), m, p))
-        near = np.square(white).sum(axis=-1).min(axis=1, initial=np.inf) <= gates.isolate
+        apart = squared_mahalanobis(z[reading] - mean.reshape(len(mean), m, p), noise[reading])
+        near = apart.min(axis=1, initial=np.inf) <= gates.isolate
         none = chosen[:, reading] == NULL
         if gates.log_new >= gates.log_clutter:
             chosen[none & ~near, reading] = NEW

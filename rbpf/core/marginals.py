@@ -1,9 +1,9 @@
 """What is marginalised, besides a map: a Kalman-filtered substate, nothing (`StateOnly`), and several parts side by side."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from rbpf.lie import Array, LieGroup
 
 GAUSSIAN = Gaussian()
 Moves = Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
-_SUBSTATE = {"mean": checkpoint.numbers("n", "m"), "cov": checkpoint.numbers("covs", "m", "m")}
 
 
 @final
@@ -103,7 +102,7 @@ ROUNDING = 8.0 * np.sqrt(np.finfo(float).eps)
 
 
 @final
-class KalmanSubstate(Conditional):
+class KalmanSubstate(checkpoint.Kept, Conditional):
     """A linear substate s ~ N(ŝ, P) in every particle, given the sampled states.
 
     The motion model says how it drives the increment and how it moves (`Transition`): the increment is then itself a
@@ -123,6 +122,8 @@ class KalmanSubstate(Conditional):
     """
 
     supplies = Part.SUBSTATE
+    kept: ClassVar = {"mean": checkpoint.numbers("n", "m"), "cov": checkpoint.numbers("covs", "m", "m")}
+    prefix = "substate/"
 
     def __init__(
         self, space: LieGroup, mean: np.ndarray, cov: np.ndarray, part: Part = Part.SUBSTATE, moves: Moves | None = None
@@ -215,15 +216,12 @@ class KalmanSubstate(Conditional):
     def moments(self, particles: Particles, of: Part | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return gaussian.mixture_moments(particles.weights, self.mean, self.cov)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"substate/mean": self.mean, "substate/cov": self.cov}
-
     def options(self) -> dict[str, object]:
         return {"substate size": int(self._mean.size)}
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
         n, m = self.mean.shape
-        self.mean, self.cov = checkpoint.read(arrays, _SUBSTATE, "substate/", n=n, m=m).values()
+        super().restore(arrays, n=n, m=m)
         if len(self.cov) not in (1, n):
             raise InputError(f"the array substate/cov must have 1 or {n} matrices")
 
@@ -284,8 +282,6 @@ class Marginals(Conditional):
         self.space = space
         self.parts = {part.supplies: part for part in (StateOnly(space), *parts)}
         self._holder = dict(self.parts)
-        #: Who takes groups of a part and of what their model reads.
-        self._found = dict[tuple[Part | None, frozenset[Part]], Conditional]()
         for part in parts:
             self._holder |= dict.fromkeys(part.also, part)
         held = [part.supplies for part in parts] + [other for part in parts for other in part.also - {Part.STATE}]
@@ -335,17 +331,14 @@ class Marginals(Conditional):
         ahead = [group.likelihood and group.likelihood.of_look_ahead() for group in groups]
         is_other = any(likelihood is not group.likelihood for likelihood, group in zip(ahead, groups, strict=True))
 
-        def information_at(state: np.ndarray) -> Information:
+        def linearise_at(increment: np.ndarray) -> Information:
+            is_mean = increment is prior.mean
+            state = prior.predicted() if is_mean else prior.at(increment)
             found = self.information(state, groups, prior)
             if is_other:
                 weighing = [replace(group, likelihood=other) for other, group in zip(ahead, groups, strict=True)]
                 others = self.information(state, weighing, prior), _all_outliers(weighing, found)
                 found = replace(found, otherwise=tuple(other for other in others if other is not None))
-            return found
-
-        def linearise_at(increment: np.ndarray) -> Information:
-            is_mean = increment is prior.mean
-            found = information_at(prior.predicted() if is_mean else prior.at(increment))
             if is_mean and prior.centred:
                 return found
             return found.charted(prior.space.right_jacobian(increment), increment - prior.mean)
@@ -355,8 +348,6 @@ class Marginals(Conditional):
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         routed = self._routed(groups)
         found = [self.parts[supplies].correct(state, increment, own) for supplies, own in routed.items()]
-        if len(found) == 1:
-            return found[0]
         zeros = np.zeros(state.shape[0])
         return LogDensities(*(sum(terms, zeros) for terms in zip(*found, strict=True)))
 
@@ -391,8 +382,7 @@ class Marginals(Conditional):
     def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
         routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
         for group in groups:
-            to = group.part, frozenset(group.model.reads)
-            holder = self._found[to] = self._found.get(to) or self._holder_of(group)
+            holder = self._holder_of(group)
             if group.data is not None and not holder.takes_raw:
                 raise InputError(f"{type(holder).__name__} takes no raw data, but rows with an observation model")
             routed[holder.supplies].append(group)

@@ -90,8 +90,7 @@ def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
     both = dict(defaults)
     for name, value in values.items():
         inner = defaults.get(name)
-        nested = isinstance(inner, dict) and isinstance(value, dict)
-        both[name] = _over(inner, value) if nested and inner is not None else value
+        both[name] = _over(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
     return both
 
 
