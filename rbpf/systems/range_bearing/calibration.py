@@ -76,7 +76,7 @@ class RobotCalibration(Kept):
         """The sensor where the particles have it on average."""
         if not self.free.any():
             return self.model
-        own = self._joint(filter_).driving()
+        own = filter_.marginals.driving()
         assert own is not None
         return self.model.tuned(filter_.particles.weights @ own, self.free)
 
@@ -95,14 +95,16 @@ class RobotCalibration(Kept):
         self.is_estimated = bool((self.score[0] ** 2 > DECISIVE**2 * self.score[1:].max(axis=0)).any())
         if self.is_estimated:
             filter_.consolidate()
-            self._joint(filter_).presume(Constants(np.zeros(self.learnt.size), self._cov))
+            joint = filter_.marginals.parts[Part.LANDMARK]
+            assert isinstance(joint, JointMap)
+            joint.presume(Constants(np.zeros(self.learnt.size), self._cov))
         return self.is_estimated
 
     def wheels(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
         """What the wheels get wrong as far as it is found (4,), as in `wheel_errors`, and its standard deviations (4,)."""
         found, std, own = np.zeros(4), np.zeros(4), self.learnt >= self.space.dim
         if own.any() and self.is_estimated:
-            (mean, cov), at = self._moments(filter_), self.learnt[own] - self.space.dim
+            (mean, cov), at = filter_.belief().moments(Part.SUBSTATE), self.learnt[own] - self.space.dim
             found[at], std[at] = mean[own], np.sqrt(np.diagonal(cov))[own]
         return found, std
 
@@ -115,7 +117,7 @@ class RobotCalibration(Kept):
         """Robot_from_sensor (E,) as it is given or found, and its covariance (d, d) in the right chart."""
         if not self.free.any():
             return self.model.robot_from_sensor, np.zeros((self.space.dim, self.space.dim))
-        mean, cov = self._moments(filter_)
+        mean, cov = filter_.belief().moments(Part.SUBSTATE)
         slope = self.space.right_jacobian(self.free @ mean) @ self.free
         return self.model.tuned(mean, self.free).robot_from_sensor, slope @ cov @ slope.T
 
@@ -137,12 +139,3 @@ class RobotCalibration(Kept):
             found[names[row]] = tuple(np.rad2deg(wheels[0]) if row == 0 else wheels[row])
         stds = {f"std_{name}": float(std) for name, (_, std) in found.items()}
         return {"calibration": {name: float(value) for name, (value, _) in found.items()} | stds}
-
-    def _joint(self, filter_: Filter) -> JointMap:
-        joint = filter_.marginals.parts[Part.LANDMARK]
-        assert isinstance(joint, JointMap)
-        return joint
-
-    def _moments(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (m,) and covariance (m, m), as they are known by now."""
-        return self._joint(filter_).moments(filter_.particles, Part.SUBSTATE)
