@@ -723,6 +723,12 @@ class JointMap(MapOfRecords):
             "mean": checkpoint.numbers("n", "size"), "cov": checkpoint.numbers("size", "size"),
             "origin": checkpoint.elements(self.space), "next": checkpoint.integers(1, least=0),
         }  # fmt: skip
+        if self.submap is not None:
+            dim = self.point.dim
+            schema |= {name: checkpoint.integers(f"{name} ids") for name in ("given", "leaving", "returning")}
+            schema |= {"walked_ids": checkpoint.integers("walked"), "walked": checkpoint.numbers("walked", dim, dim)}
+            if not self.passed_on:
+                schema["reach"] = checkpoint.numbers(1)
         found = checkpoint.read(arrays, schema, "joint/", n=self.n)
         self.mean, self.cov, self.origin = found["mean"], found["cov"], found["origin"]
         self.held.restore(arrays, "joint/", self.mean.shape[1])
@@ -731,14 +737,8 @@ class JointMap(MapOfRecords):
             raise InputError("the array joint/ids names a landmark twice, or one that was never started")
         if self.submap is not None:
             self.old.restore(arrays)
-            schema = {name: checkpoint.integers(f"{name} ids") for name in ("given", "leaving", "returning")}
-            found = checkpoint.read(arrays, schema, "joint/")
             self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
-            dim = self.point.dim
-            schema = {"walked_ids": checkpoint.integers("walked"), "walked": checkpoint.numbers("walked", dim, dim)}
-            found = checkpoint.read(arrays, schema, "joint/")
             self._walked = dict(zip(found["walked_ids"].tolist(), found["walked"], strict=True))
-            if not self.passed_on:
-                self._reach = float(checkpoint.read_one(arrays, "joint/reach", checkpoint.numbers(1))[0])
+            self._reach = float(found["reach"][0]) if "reach" in found else 0.0
             if not np.isin(self._given_ids, self.old.about.ids).all():
                 raise InputError("the array joint/given names a landmark that is not about the start of the sub-map")

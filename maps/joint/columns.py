@@ -1,13 +1,15 @@
-"""Which landmarks and clones a joint map holds, and in which columns of its Gaussian."""
+"""Which landmarks and clones a joint map holds, and in which columns of its Gaussian; and old landmarks beside these."""
 
+from collections.abc import Mapping
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 
 from rbpf.core import checkpoint
-from rbpf.core.models import FusedKernel, Landmark, ObservationModel, Part
+from rbpf.core.models import FusedKernel, Landmark, ObservationModel, Part, RigidSpace
 from rbpf.errors import InputError
-from rbpf.lie import Euclidean, SE2Group, SE3Group
+from rbpf.lie import Array, SE3Group
 from rbpf.maps.rows import fused_kernel
 
 
@@ -45,7 +47,7 @@ class JointColumns:
         clone_first: (C,) their first columns.
     """
 
-    def __init__(self, space: SE2Group | SE3Group | Euclidean, first: int, kinds: list[Landmark]) -> None:
+    def __init__(self, space: RigidSpace, first: int, kinds: list[Landmark]) -> None:
         none = np.zeros(0, dtype=np.int64)
         self.space, self.first, self.kinds = space, first, kinds
         self.size, self.clones, self.clone_first = first, np.zeros((0, space.size)), none
@@ -169,3 +171,43 @@ class JointColumns:
         if not landmark.anchored:
             return Kind(landmark, rows, columns, np.zeros((rows.size, 0), dtype=np.int64), np.zeros((rows.size, 0)))
         return Kind(landmark, rows, columns, self.clone_columns(clones), self.clones[clones])
+
+
+class Beside(NamedTuple):
+    """Old landmarks (K,) at `points` (K, D) as seen from the end of the present sub-map, which does not have them.
+
+    Its own landmarks (M,) are at `theirs` (M, D): as these move, so do the others, by `slope` (KD, MD); `rest` (KD, KD) is
+    what is then uncertain about them.
+    """
+
+    ids: np.ndarray
+    points: np.ndarray
+    own: np.ndarray
+    theirs: np.ndarray
+    slope: np.ndarray
+    rest: np.ndarray
+
+    def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
+        """What is held, of means (N, n) and covariance (n, n), and beside it what is not."""
+        own, new, dim = held.holds(self.own), ~held.holds(self.ids) & (self.ids >= 0), self.points.shape[1]
+        columns = held.of_one_kind(self.own[own]).columns.ravel()
+        at, rows = np.repeat(own, dim), np.repeat(new, dim)
+        slope, rest = self.slope[np.ix_(rows, at)], self.rest[np.ix_(rows, rows)]
+        moved, cross = mean[:, columns] - self.theirs[own].ravel(), slope @ cov[columns]
+        wide = copy(held)
+        wide.add(self.ids[new], held.kinds[0], np.full(int(new.sum()), -1), held.clones[:0])
+        mean = np.concatenate([mean, self.points[new].ravel() + moved @ slope.T], axis=1)
+        return wide, mean, np.block([[cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, np.ndarray], dim: int) -> "Beside":
+        """What a checkpoint has held of D numbers for each landmark. Raises InputError: it is damaged."""
+        schema = {
+            "ids": checkpoint.integers("others", least=0), "points": checkpoint.numbers("others", dim),
+            "own": checkpoint.integers("own", least=0), "theirs": checkpoint.numbers("own", dim),
+            "slope": checkpoint.numbers("rows", "columns"), "rest": checkpoint.numbers("rows", "rows"),
+        }  # fmt: skip
+        found = cls(**checkpoint.read(arrays, schema, "joint/beside/"))
+        if found.slope.shape != (found.points.size, found.theirs.size):
+            raise InputError("the array joint/beside/slope does not fit the landmarks beside it")
+        return found

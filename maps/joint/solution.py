@@ -6,9 +6,9 @@ import numpy as np
 from scipy.linalg import LinAlgError, block_diag
 
 from rbpf import gaussian
+from rbpf.core.models import RigidSpace
 from rbpf.errors import InputError
 from rbpf.kernels.dense import principal
-from rbpf.lie import Euclidean, SE2Group, SE3Group
 from rbpf.maps.joint.elimination import Elimination, cliques_of
 
 ENOUGH, ITERATIONS = 0.1, 20
@@ -42,11 +42,6 @@ class Constants(NamedTuple):
 
     mean: np.ndarray
     cov: np.ndarray
-
-
-def are_seams(ids: np.ndarray) -> np.ndarray:
-    """Which of these (K,) are no landmarks, but what drove the motion where one sub-map ended and another began."""
-    return (ids < 0) & (ids > FORGOTTEN)
 
 
 NOTHING = Constants(np.zeros(0), np.zeros((0, 0)))
@@ -84,9 +79,7 @@ def gain_of(found: Constants, before: Constants, after: Constants) -> float:
     return float(nats[1] - nats[0])
 
 
-def moved(
-    space: SE2Group | SE3Group | Euclidean, pose: np.ndarray, by: np.ndarray, cov: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def moved(space: RigidSpace, pose: np.ndarray, by: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A pose (E,) moved by (d,) in its right chart, and the covariance (n, n) that begins with its own, there."""
     turn = block_diag(space.right_jacobian(by), np.eye(len(cov) - len(by)))
     return space.retract(pose, by), turn @ cov @ turn.T
@@ -187,9 +180,7 @@ class Solution(NamedTuple):
     eliminated: Elimination
     is_whole: bool  #: is a minimum of all that is known, and next to nothing counts twice.
 
-    def seen_from(
-        self, space: SE2Group | SE3Group | Euclidean, number: int, rows: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def seen_from(self, space: RigidSpace, number: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Landmarks by rows (K,) as seen from a start by number (K, D), and the covariance of it, them and the constants."""
         d, dim = space.dim, self.world.shape[1]
         start, first = self.starts[number], d * (len(self.starts) - 1)
@@ -203,7 +194,7 @@ class Solution(NamedTuple):
 
 
 def solve(
-    space: SE2Group | SE3Group | Euclidean,
+    space: RigidSpace,
     maps: list[SubMap],
     ids: np.ndarray,
     starts: np.ndarray,
@@ -289,9 +280,7 @@ def solve(
     return Solution(ids, world, starts, constants, factors, eliminated, is_whole=off > 0.0)
 
 
-def _looser(
-    space: SE2Group | SE3Group | Euclidean, maps: list[SubMap], starts: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _looser(space: RigidSpace, maps: list[SubMap], starts: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """By how much less is known of each sub-map's landmarks (M, D, D), and of those it was given (K, D, D), than it was.
 
     They have walked since, Mathematics (passed-on-walk); and what drives the motion is never taken for exact.
@@ -305,7 +294,9 @@ def _looser(
                 walked = turn @ each.given.walked @ turn.T
                 since |= {name: since.get(name, none) + by for name, by in zip(ids.tolist(), walked, strict=True)}
             by_all = np.array([since.get(name, none) for name in ids.tolist()]).reshape(-1, dim, dim)
-            both.append(turn.T @ by_all @ turn + EXACT**2 * are_seams(ids)[:, None, None] * np.eye(dim))
+            # No landmarks, but what drove the motion where one sub-map ended and another began.
+            are_seams = (ids < 0) & (ids > FORGOTTEN)
+            both.append(turn.T @ by_all @ turn + EXACT**2 * are_seams[:, None, None] * np.eye(dim))
         found.append((both[0], both[1]))
     return found[::-1]
 
@@ -336,7 +327,7 @@ def _weighed(
     return half, np.concatenate([half @ by_poses, turned, half[:, last:]], axis=1)
 
 
-def fused(space: SE2Group | SE3Group | Euclidean, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
+def fused(space: RigidSpace, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
     """What two say of their landmarks, as seen from the end of the new one; the old one ends `between` from there.
 
     They are solved for with the new one's end and how the old one lies. Where the old one began is left out.

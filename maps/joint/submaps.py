@@ -19,11 +19,12 @@ from scipy.linalg import block_diag, cho_solve, solve_triangular
 
 from rbpf import gaussian
 from rbpf.core import checkpoint
+from rbpf.core.models import RigidSpace
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.kernels.dense import principal
-from rbpf.lie import Array, Euclidean, SE2Group, SE3Group
-from rbpf.maps.joint.beside import Beside
+from rbpf.lie import Array
+from rbpf.maps.joint.columns import Beside
 from rbpf.maps.joint.rows import plus_gram
 from rbpf.maps.joint.solution import (
     EXACT,
@@ -84,12 +85,7 @@ class SubMaps:
     """
 
     def __init__(
-        self,
-        space: SE2Group | SE3Group | Euclidean,
-        dim: int,
-        most: int,
-        unnamed: bool = False,
-        constants: Constants = NOTHING,
+        self, space: RigidSpace, dim: int, most: int, unnamed: bool = False, constants: Constants = NOTHING
     ) -> None:
         self.space, self.dim, self.most, self.unnamed, self.prior = space, dim, most, unnamed, constants
         self.frame: Estimate | None = None
