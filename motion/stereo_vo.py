@@ -5,7 +5,7 @@ agree finds the motion, and what they leave open about it is its covariance. In 
 method, which `points="exact"` gives: the earlier points are estimated together with the motion, both images of the
 later pair count, and the covariance includes the earlier points' noise.
 
-`estimate_motion` looks at the matches alone; `VisualOdometry` starts from a prior, and joins with it what says less.
+`estimate_motion` looks at the matches alone; `candidate_motions` starts from a prior, and joins with it what says less.
 """
 
 import math
@@ -15,7 +15,6 @@ from typing import Annotated, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.least_squares import Minimum, Rule, minimise
 from rbpf.motion.odometry import Odometry
@@ -55,10 +54,8 @@ class MotionEstimate:
     previous_camera_from_camera: Array  #: (7,) increment; the start where none was found.
     cov: Array  #: (6, 6) in the right chart there, order [ω, v]; NaN where none was found.
     inliers: np.ndarray  #: (K,) bool, matches that agree with it.
-    #: root mean square of the inliers' whitened residuals, by their degrees of freedom and for what the gate cuts off: 1
-    #: is expected.
-    rms: float
     failure: str = ""  #: why no motion was found, in words; empty where one was.
+    note: str = ""  #: in words, where it is not simply what the matches say; empty else.
     #: motions that matches far from this one agree on, as those on a thing that moves, each with its own inliers; false
     #: matches agree on none.
     others: tuple["MotionEstimate", ...] = ()
@@ -67,6 +64,11 @@ class MotionEstimate:
     def found(self) -> bool:
         """Whether there is a motion."""
         return not self.failure
+
+    @property
+    def odometry(self) -> Odometry:
+        """The increment and its covariance, to hand to a filter."""
+        return Odometry(self.previous_camera_from_camera, self.cov)
 
 
 def estimate_motion(
@@ -171,11 +173,10 @@ def _refined(
             break
     if not found.converged:
         return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations"), squared
-    rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
     cov = _consistent_covariance(part, motion, found.factor) if config.points == "adjusted" else found.cov
     if config.points != "exact":
         cov = trimming(config.gate) * cov
-    return MotionEstimate(motion, cov, inliers, float(rms)), squared
+    return MotionEstimate(motion, cov, inliers), squared
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
@@ -185,7 +186,7 @@ def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
 
 
 def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:
-    return MotionEstimate(start, np.full((6, 6), np.nan), np.zeros(len(matches), dtype=bool), float("nan"), why)
+    return MotionEstimate(start, np.full((6, 6), np.nan), np.zeros(len(matches), dtype=bool), why)
 
 
 def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Array:
@@ -247,64 +248,28 @@ class MotionPrior(Ranged):
         return Odometry(SE3.exp(dt * velocity), np.diag(std**2))
 
 
-@final
-@dataclass(frozen=True)
-class CandidateMotion:
-    """A motion that a group of matches agrees on."""
+def candidate_motions(
+    matches: Matches, expected: Odometry, rng: np.random.Generator, config: VoConfig
+) -> tuple[tuple[MotionEstimate, ...], str]:
+    """The motions that the matches may tell of, that of the first consensus first; else, in words, why there is none.
 
-    odometry: Odometry  #: previous_camera_from_camera and its covariance, to hand to a filter.
-    inliers: np.ndarray  #: (K,) bool, the group.
-    note: str  #: in words, where the increment is not simply what the group says; empty else.
-
-
-@final
-@dataclass(frozen=True)
-class CandidateMotions:
-    """What the matches of two frames say of the camera's motion.
-
-    One candidate is the rule. Several mean that something in the view moves: which of them is the camera's is not in
-    the matches, and is for the caller to say.
+    One is the rule. Several mean that something in the view moves: which of them is the camera's is not in the matches,
+    and is for the caller to say. Where they tell less than what is `expected` before anything is seen (nothing but far
+    points: how far did the camera go?) both are joined, and a motion's `note` says so.
     """
-
-    prior: Odometry  #: the motion expected before anything was seen.
-    #: that of the first consensus first; none where matches are too few or do not agree.
-    motions: tuple[CandidateMotion, ...]
-    failure: str  #: why there is none, in words; empty where there is one.
+    found = estimate_motion(matches, rng, expected.delta, config)
+    motions = (found, *found.others) if found.found else ()
+    return tuple(_joined(one, expected) for one in motions), found.failure
 
 
-@final
-class VisualOdometry:
-    """Estimates the motion between two frames, under a prior of what is expected before anything is seen.
-
-    Where no motion is found there is only the prior; where the matches tell less than it in some direction (nothing
-    but far points: how far did the camera go?) both are joined, and the candidate's `note` says so.
-    """
-
-    def __init__(self, config: VoConfig | None = None, prior: MotionPrior | None = None) -> None:
-        self.config, self.prior = config or VoConfig(), prior or MotionPrior()
-
-    def candidates(self, matches: Matches, velocity: Array, dt: float, rng: np.random.Generator) -> CandidateMotions:
-        """The motions over `dt` seconds that the matches may tell of, after a velocity (6,) [ω, v], rad/s, m/s.
-
-        Raises InputError: dt is not positive.
-        """
-        if not dt > 0.0:
-            raise InputError(f"visual odometry needs time between its frames, got {dt} s")
-        expected = self.prior.increment(velocity, dt)
-        found = estimate_motion(matches, rng, expected.delta, self.config)
-        motions = (found, *found.others) if found.found else ()
-        return CandidateMotions(expected, tuple(_joined(one, expected) for one in motions), found.failure)
-
-
-def _joined(found: MotionEstimate, expected: Odometry) -> CandidateMotion:
+def _joined(found: MotionEstimate, expected: Odometry) -> MotionEstimate:
     """The estimate, or in case it is the weaker one anywhere, the product of its Gaussian and the expected one."""
-    measured = Odometry(found.previous_camera_from_camera, found.cov)
-    joined, worst = product(measured, expected)
+    joined, worst = product(found.odometry, expected)
     if worst <= 1.0:
-        return CandidateMotion(measured, found.inliers, "")
+        return found
     times = f"a standard deviation {np.sqrt(worst):.1f} times the expected one"
     note = f"the matches leave the motion open ({times}); it is joined with the expected one"
-    return CandidateMotion(joined, found.inliers, note)
+    return replace(found, previous_camera_from_camera=joined.delta, cov=joined.cov, note=note)
 
 
 def product(measured: Odometry, expected: Odometry) -> tuple[Odometry, float]:

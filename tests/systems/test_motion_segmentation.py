@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
-from rbpf.motion.stereo_vo import CandidateMotion, CandidateMotions, VisualOdometry
+from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VoConfig, candidate_motions
 from rbpf.systems.stereo.motion_segmentation import (
     CHANGES,
     MISTAKEN,
@@ -23,19 +23,23 @@ PRIOR = Odometry(SE3.identity(), np.diag(np.repeat(0.1**2, 6)))
 STILL, AWAY = (Odometry(SE3.exp(np.array([0.0, 0.0, 0.0, x, 0.0, 0.0])), 1e-6 * np.eye(6)) for x in (0.0, 0.3))
 
 
-def candidates(*counts: int, left: int = 5) -> CandidateMotions:
+def motion_of(odometry: Odometry, inliers: np.ndarray) -> MotionEstimate:
+    return MotionEstimate(odometry.delta, odometry.cov, inliers)
+
+
+def candidates(*counts: int, left: int = 5) -> list[MotionEstimate]:
     """Disjoint groups of so many matches that stand still and move away, and some matches that are in none."""
     motions, first = [], 0
     for count, odometry in zip(counts, (STILL, AWAY), strict=True):
         rows = np.arange(sum(counts) + left)
-        motions.append(CandidateMotion(odometry, (rows >= first) & (rows < first + count), ""))
+        motions.append(motion_of(odometry, (rows >= first) & (rows < first + count)))
         first += count
-    return CandidateMotions(PRIOR, tuple(motions), "")
+    return motions
 
 
-def chosen(found: CandidateMotions, support=(0.0, 0.0, 0.0), informed: bool = False) -> int:
-    labels = np.full(found.motions[0].inliers.size, UNKNOWN)
-    return camera_motion(found, labels, False, np.array(support), informed)
+def chosen(found: list[MotionEstimate], support=(0.0, 0.0, 0.0), informed: bool = False) -> int:
+    labels = np.full(found[0].inliers.size, UNKNOWN)
+    return camera_motion(found, PRIOR if informed else None, labels, False, np.array(support))
 
 
 def test_the_group_that_is_the_camera():
@@ -65,18 +69,18 @@ def test_the_past_against_enumeration(marks):
     still, moved = likelihood(True), likelihood(False)
     ratio = ((1 - CHANGES) * still + CHANGES * moved) / ((1 - CHANGES) * moved + CHANGES * still)
     even = -np.log(ratio) - np.log1p((labels == UNKNOWN).sum())
-    found = CandidateMotions(PRIOR, (CandidateMotion(STILL, np.ones(3, dtype=bool), ""),), "")
+    found = [motion_of(STILL, np.ones(3, dtype=bool))]
     for more, expected in ((1e-9, 0), (-1e-9, -1)):
-        assert camera_motion(found, labels, False, np.array([even + more, 0.0]), False) == expected
+        assert camera_motion(found, None, labels, False, np.array([even + more, 0.0])) == expected
 
 
 def test_the_past_is_no_proof():
     """A thing of 1,000 features that has stopped: bounded by how often things stop."""
-    found = CandidateMotions(PRIOR, (CandidateMotion(STILL, np.ones(1000, dtype=bool), ""),), "")
+    found = [motion_of(STILL, np.ones(1000, dtype=bool))]
     even = np.log((1 - CHANGES) / CHANGES)
     for more, expected in ((1e-6, 0), (-1e-6, -1)):
         support = np.array([even + more, 0.0])
-        assert camera_motion(found, np.full(1000, MOVING), False, support, False) == expected
+        assert camera_motion(found, None, np.full(1000, MOVING), False, support) == expected
 
 
 def test_when_a_single_motion_is_doubted():
@@ -94,8 +98,9 @@ def test_the_few_that_stood_still_before(seed):
     rng = np.random.default_rng(seed)
     room, thing = simulate(ROOM, 20, rng), simulate(LEAP, 60, rng)
     both = joined(room.matches, thing.matches)
-    found = VisualOdometry().candidates(both, np.zeros(6), 0.1, np.random.default_rng(1))
+    expected = MotionPrior().increment(np.zeros(6), 0.1)
+    found, _ = candidate_motions(both, expected, np.random.default_rng(1), VoConfig())
     labels = np.concatenate([np.full(20, STATIC), np.full(60, MOVING)])
     for known, pair in ((np.zeros(80), thing), (labels, room)):
-        motion = found.motions[camera_motion(found, known, False, np.zeros(3), False)]
+        motion = found[camera_motion(found, None, known, False, np.zeros(3))]
         assert np.linalg.norm(SE3.local(motion.odometry.delta, pair.delta)) < 0.02

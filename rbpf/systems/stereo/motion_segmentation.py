@@ -14,11 +14,14 @@ A feature is labelled 1 if it stood still in its pair, −1 if it moved, 0 where
 from one pair to the next.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3
-from rbpf.motion.stereo_vo import CandidateMotions
+from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_vo import MotionEstimate
 
 STATIC, UNKNOWN, MOVING = 1, 0, -1  #: Labels of features.
 MISTAKEN = 0.1  #: Fraction of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features).
@@ -38,27 +41,30 @@ def contradicts(inliers: np.ndarray, labels: np.ndarray, hidden: bool) -> bool:
 
 
 def camera_motion(
-    candidates: CandidateMotions, labels: np.ndarray, hidden: bool, log_support: np.ndarray, prior_is_informed: bool
+    candidates: Sequence[MotionEstimate],
+    prior: Odometry | None,
+    labels: np.ndarray,
+    hidden: bool,
+    log_support: np.ndarray,
 ) -> int:
     """Number of the candidate that most probably is the camera's motion; −1 where none of them is.
 
     Args:
         candidates: M motions.
+        prior: what was expected by a velocity that was measured; None before, where any motion is as likely.
         labels: (K,) of the matches in the earlier pair.
         hidden: whether nothing in the earlier pair stood still.
         log_support: (M + 1,) log-density of the map's landmarks in the later pair under each candidate, and under the
             prior alone; up to a constant. Zeros where there is no map.
-        prior_is_informed: whether the prior follows from a velocity that was measured; before, any motion is as likely.
     """
-    groups = np.array([motion.inliers for motion in candidates.motions])
+    groups = np.array([motion.inliers for motion in candidates])
     scores = np.array([_log_past(labels[group]) for group in (*groups, ~groups.any(axis=0))]) + log_support
     none = scores[-1] + np.log((1.0 - CHANGES) / CHANGES) * hidden
     scores = scores[:-1] + np.log1p((groups & (labels == UNKNOWN)).sum(axis=1))
     plausible = scores
-    if prior_is_informed:
-        prior = candidates.prior
+    if prior is not None:
         chol = gaussian.cholesky(prior.cov)
-        off = [SE3.local(prior.delta, motion.odometry.delta) for motion in candidates.motions]
+        off = [SE3.local(prior.delta, motion.odometry.delta) for motion in candidates]
         plausible = scores - 0.5 * np.square([gaussian.solve_lower(chol, one) for one in off]).sum(axis=1)
     best = int(np.argmax(plausible))
     return best if scores[best] >= none else -1

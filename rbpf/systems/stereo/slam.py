@@ -22,7 +22,7 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.motion.stereo_vo import VisualOdometry, pixel_gains, product, refine_motion
+from rbpf.motion.stereo_vo import candidate_motions, pixel_gains, product, refine_motion
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
@@ -132,7 +132,6 @@ class StereoSlam(System):
         self.front_end = front_end
         free = CAMERA_PLANE if config.dof == 3 else None
         added = np.repeat([config.odometry.std_added_rad, config.odometry.std_added_m], 3)
-        self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
         self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
         joint, self._calibration = None, SelfCalibration(config, front_end)
@@ -218,7 +217,7 @@ class StereoSlam(System):
             if last.stamp_ns is not None:  # the next pair is measured from the same one as this
                 then = "the last velocity is assumed, widely"
                 self.reckoning = replace(last, passed_over=last.passed_over + 1)
-                step = self._constrained(self.visual_odometry.prior.increment(last.velocity, dt))
+                step = self._constrained(config.odometry.prior.increment(last.velocity, dt))
                 expected = last.moved(last.stamp_ns, step, last.velocity, is_assumed=True)
             messages.append(f"passed over: {why}; {then}")
             motion = _Motion(expected)
@@ -385,44 +384,42 @@ class StereoSlam(System):
 
     def _motion_to(self, pair: Pair[Any], dt: float) -> tuple[Pair[Any], "_Motion"]:
         """The pair, with those of its points that the last measured one has, aligned; the motion between, `dt` seconds."""
-        before, kept, stamp_ns = self.reckoning, self._kept, pair.stamp_ns
+        before, kept, stamp_ns, config = self.reckoning, self._kept, pair.stamp_ns, self.config.odometry
         if kept is None:
             return pair, _Motion(replace(before, stamp_ns=stamp_ns))
         rows = self.front_end.match(kept, pair)
         pair = self.front_end.aligned(kept, pair, rows)
         matches, labels = self.front_end.matches(kept, pair, rows), kept.labels[rows[0]]
-        found = self.visual_odometry.candidates(matches, before.velocity, dt, self.filter.rng)
+        expected, is_moving = config.prior.increment(before.velocity, dt), bool(before.velocity.any())
+        motions, failure = candidate_motions(matches, expected, self.filter.rng, config.estimate)
 
         # Which of the motions that matches agree on is the camera's: one is, if the rest of what is known agrees with it.
-        chosen, failure = (0 if found.motions else -1), found.failure
-        doubted = len(found.motions) > 1 or (
-            found.motions and contradicts(found.motions[0].inliers, labels, before.hidden)
-        )
+        chosen = 0 if motions else -1
+        doubted = len(motions) > 1 or (motions and contradicts(motions[0].inliers, labels, before.hidden))
         moving = np.zeros(len(matches), dtype=bool)
         if doubted:
             # What the map says of each candidate, and of the prior alone.
-            support = np.zeros(len(found.motions) + 1)
+            support = np.zeros(len(motions) + 1)
             if self.filter.steps:
                 view = replace(pair, uncertain=before.assumed > 0)
-                for number, step in enumerate([*(motion.odometry for motion in found.motions), found.prior]):
+                for number, step in enumerate([*(motion.odometry for motion in motions), expected]):
                     belief = self.filter.expect(before.since_update.then(self._constrained(step)), stamp_ns)
                     support[number] = self.front_end.landmarks.log_support(view, belief)
-            chosen = camera_motion(found, labels, before.hidden, support, bool(before.velocity.any()))
-            for number, other in enumerate(found.motions):
+            chosen = camera_motion(motions, expected if is_moving else None, labels, before.hidden, support)
+            for number, other in enumerate(motions):
                 moving |= other.inliers & (number != chosen)
-            many = " and ".join(str(motion.inliers.sum()) for motion in found.motions)
+            many = " and ".join(str(motion.inliers.sum()) for motion in motions)
             failure = f"{many} of {len(matches)} matches agree on a motion, but not the map and what stood still before"
 
         # Where none is, what was expected is assumed.
         if chosen < 0:
-            what = "the last velocity" if before.velocity.any() else "a camera at rest"
-            step = self._constrained(found.prior)
+            what = "the last velocity" if is_moving else "a camera at rest"
+            step = self._constrained(expected)
             at = before.moved(stamp_ns, step, before.velocity, is_assumed=True, hidden=bool(moving.any()))
             nobody = np.zeros(len(matches), dtype=bool)
             return pair, _Motion(at, rows, labels, nobody, moving, f"{failure}; {what} is assumed, widely")
-        motion, notes = found.motions[chosen], list[str]()
-        if motion.note:
-            notes.append(motion.note)
+        motion = motions[chosen]
+        notes = [motion.note] if motion.note else []
         if moving.any():
             count = motion.inliers.sum()
             notes.append(
@@ -430,13 +427,13 @@ class StereoSlam(System):
                 f"view moves, and the camera's motion is taken to be that of the {count}"
             )
         velocity = before.velocity
-        if self.config.odometry.prior.keep_velocity:
+        if config.prior.keep_velocity:
             velocity = SE3.log(motion.odometry.delta) / dt
         cross, noise = None, None
-        if not self.config.odometry.independent:
+        if not config.independent:
             # Of the error of this step and the last one, which the pixels of the pair between them have caused both.
             used = matches.take(motion.inliers)
-            earlier, later = pixel_gains(used, motion.odometry, self.config.odometry.estimate)
+            earlier, later = pixel_gains(used, motion.odometry, config.estimate)
             if before.noise.size:
                 shared = before.noise[rows[0][motion.inliers]]
                 cross = self._free @ np.einsum("kap,kbp->ab", shared, earlier) @ self._free
@@ -511,7 +508,7 @@ class StereoSlam(System):
         dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
         # Of a camera that has not been seen to move nothing is known: the prior is about what the odometry says.
         velocity = self.reckoning.velocity_at_update if self.filter.steps > 1 else SE3.log(moved.delta) / dt
-        prior = self.visual_odometry.prior.increment(velocity, dt)
+        prior = self.config.odometry.prior.increment(velocity, dt)
         if self.joint is not None:
             view, free = self.front_end.landmarks.left_over(view)
             if left_over.size:
@@ -535,7 +532,7 @@ class StereoSlam(System):
         found = refine_motion(matches, moved.delta, config)
         if not found.found:
             return prior
-        measured = Odometry(found.previous_camera_from_camera, found.cov)
+        measured = found.odometry
         if not self._calibration.is_held:
             return product(measured, prior)[0]
         # The pixels are free of the disparities' error as it was known when the pair was measured, before old landmarks were
