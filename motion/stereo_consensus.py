@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, projective, times_pixels
+from rbpf.motion.stereo_geometry import Matches, homography, projective, times_pixels
 from rbpf.ranges import Formerly, Probability, Range, Ranged
 
 REFINEMENTS = 2  #: Gauss-Newton steps on the nine pixels of a triple.
@@ -94,7 +94,7 @@ class _Search:
         from rbpf.motion.stereo_kernels import propose
 
         matches, motions = self.matches, np.empty((len(rows), 7))
-        pixels = (matches.z_prev, matches.z_now, self.white, intrinsics(matches.camera))
+        pixels = (matches.z_prev, matches.z_now, self.white, matches.camera.intrinsics)
         propose(rows, self.before, self.now, *pixels, self.start, REFINEMENTS, motions)
         return motions
 

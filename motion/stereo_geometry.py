@@ -3,16 +3,11 @@
 A homogeneous point X = (x, y, z, ρ) in the left camera's frame, at (x, y, z) / ρ, and its pixels m = (u_left, v,
 u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T = previous_camera_from_camera at g with
 
-    (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography),
+    (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography).
 
-a homography, which does not notice where infinity is: noise may well make the disparity of a far point negative.
+Measured are z⁻ = m + v⁻ and z = g(T, m) + v. About an m̂, which `Points` says, eliminating m leaves S05 (14) as
 
-Both measurements are noisy, z⁻ = m + v⁻ and z = g(T, m) + v. About any m̂, eliminating m leaves S05 (14) as
-
-    ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ
-
-by Mathematics (vo-innovation). A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points`
-says which m̂: by default that of least Mathematics (vo-profile).
+    ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ,    Mathematics (vo-innovation).
 """
 
 from dataclasses import dataclass
@@ -40,26 +35,16 @@ Points = Literal["adjusted", "propagated", "exact"]
 SWEEPS, SWEPT_PX = 10, 1e-4
 
 
-class PinholeCamera(Protocol):
-    """Focal lengths and principal point, px."""
-
-    @property
-    def fx(self) -> float: ...
-    @property
-    def fy(self) -> float: ...
-    @property
-    def cx(self) -> float: ...
-    @property
-    def cy(self) -> float: ...
-
-
 class StereoCamera(Protocol):
     """Two equal undistorted pinholes side by side, the left one the reference, as a `RectifiedStereo`."""
 
     @property
-    def camera(self) -> PinholeCamera: ...
+    def intrinsics(self) -> Array:
+        """(5,) fx, fy, cx, cy and fx · baseline."""
+
     @property
     def baseline_m(self) -> float: ...
+    def __hash__(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -127,19 +112,10 @@ class Reprojection:
         return np.concatenate([self.by_rotation, by_translation], axis=-1)
 
 
-def intrinsics(camera: StereoCamera) -> Array:
-    """What compiled functions take a camera for, (5,): fx, fy, cx, cy, fx · baseline."""
-    one = camera.camera
-    return np.array([one.fx, one.fy, one.cx, one.cy, one.fx * camera.baseline_m])
-
-
+@lru_cache(maxsize=16)
 def projective(camera: StereoCamera) -> tuple[Array, Array]:
     """Q (4, 4), from points to pixels, and Q⁻¹ (4, 4), which are not to be written into."""
-    return _projective(*intrinsics(camera).tolist())
-
-
-@lru_cache(maxsize=16)
-def _projective(fx: float, fy: float, cx: float, cy: float, shift: float) -> tuple[Array, Array]:
+    fx, fy, cx, cy, shift = camera.intrinsics.tolist()
     q = np.array([[fx, 0.0, cx, 0.0], [0.0, fy, cy, 0.0], [fx, 0.0, cx, -shift], [0.0, 0.0, 1.0, 0.0]])
     back = np.asarray(np.linalg.inv(q), dtype=float)
     q.flags.writeable = back.flags.writeable = False
@@ -205,7 +181,7 @@ def white_rows(matches: Matches, delta: Array, points: Points) -> tuple[Array, n
     count = len(matches)
     found = np.empty((count, 3, 7)), np.empty(count, dtype=bool), np.empty((count, 3))
     matrix, *others = _arguments(matches, delta, points)
-    stereo_kernels.white_rows(matrix, intrinsics(matches.camera), *others, *found)
+    stereo_kernels.white_rows(matrix, matches.camera.intrinsics, *others, *found)
     return found
 
 

@@ -202,7 +202,7 @@ def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Ar
     """
     # ρ = (u_left − u_right) / (f b), of the pixels m̂: cov m̂ = R⁻ − R⁻Aᵀ S⁻¹ A R⁻.
     cov, seen = linearised(matches, motion, white_rows(matches, motion, "adjusted")[2], "adjusted")
-    shift = matches.camera.camera.fx * matches.camera.baseline_m
+    shift = matches.camera.intrinsics[4]
     across = matches.cov_prev @ (np.array([1.0, 0.0, -1.0]) / shift)
     gain = seen.by_pixels @ across[..., None]
     solved = np.linalg.solve(cov, np.concatenate([gain, seen.by_scaled_translation], axis=-1))

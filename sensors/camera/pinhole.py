@@ -99,14 +99,6 @@ class Pinhole:
         """The distortion, in normalised coordinates."""
         return LENSES[self.distortion_model](self.distortion)  # type: ignore[arg-type]  # counted when made
 
-    @property
-    def monotonic_radius(self) -> float:
-        """Distance from the axis, in normalised coordinates, at which distortion folds the image back, or ∞.
-
-        Of an equidistant lens no more than tan 75°.
-        """
-        return self.lens.monotonic_radius
-
     def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels (…, 2) of points (…, 3) in the camera's frame.
 
@@ -194,6 +186,11 @@ class RectifiedStereo:
             bent = f"{self.camera.distortion_model} distortion {self.camera.distortion}"
             found = f"the camera of a rectified stereo pair has {bent}"
             raise InputError(f"{found}: rectify the images and give the camera of the rectified ones")
+
+    @cached_property
+    def intrinsics(self) -> Float[np.ndarray, "5"]:
+        """(5,) fx, fy, cx, cy and fx · baseline."""
+        return np.append(self.camera.params[:4], self.camera.fx * self.baseline_m)
 
     def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Pixels (u_left, v, u_right) (…, 3) of points (…, 3) in the left camera's frame; nothing is checked."""

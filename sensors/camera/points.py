@@ -22,14 +22,12 @@ from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION
 class CameraModel(ObservationModel):
     """The chain from a landmark to pixels; a subclass says where the landmark lies.
 
-    A landmark nearer to the border than `margin_px` is not expected to be seen. `about` (m,) is the substate with which the
-    camera is as given, where it is not known: its last four numbers are those of `Pinhole.tuned`, of a pair the last one is
-    by how much columns of the right image are too large.
+    `about` (m,) is the substate with which the camera is as given, where it is not known: its last four numbers are those
+    of `Pinhole.tuned`, of a pair the last one is by how much columns of the right image are too large.
     """
 
-    def __init__(self, camera: Pinhole | RectifiedStereo, margin_px: float = 0.0, about: Given = None) -> None:
+    def __init__(self, camera: Pinhole | RectifiedStereo, about: Given = None) -> None:
         self.camera = camera
-        self.margin_px = margin_px
         self.dim = camera.dim
         self.about = about
         if about is not None:
@@ -77,7 +75,7 @@ class CameraModel(ObservationModel):
         return Jacobians(by_state, slope @ turned, by_substate)
 
     def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
-        return self.camera.visible(self.in_camera(state, landmark, const), self.margin_px)
+        return self.camera.visible(self.in_camera(state, landmark, const))
 
 
 class CameraPoint(CameraModel):
@@ -103,10 +101,8 @@ class CameraRay(CameraModel):
     `rho` (2,) is the inverse depth of a landmark just started: mean and standard deviation, 1/m.
     """
 
-    def __init__(
-        self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0, about: Given = None
-    ) -> None:
-        super().__init__(camera, margin_px, about)
+    def __init__(self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), about: Given = None) -> None:
+        super().__init__(camera, about)
         if not (np.isfinite(rho).all() and min(rho) > 0.0):
             raise InputError(f"the prior of the inverse depth needs a positive mean and deviation, got {rho}")
         self.pinhole = camera
@@ -201,8 +197,8 @@ class StereoPoint(CameraPoint):
     every u_right.
     """
 
-    def __init__(self, rig: RectifiedStereo, margin_px: float = 0.0, about: Given = None) -> None:
-        super().__init__(rig, margin_px, about)
+    def __init__(self, rig: RectifiedStereo, about: Given = None) -> None:
+        super().__init__(rig, about)
         self.rig = rig
 
     def by_substate(self, state: Array, landmark: Array, const: Given = None) -> Array:

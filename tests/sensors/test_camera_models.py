@@ -243,7 +243,7 @@ def test_chosen_features_are_those_that_the_camera_sees_nearly_as_at_first(camer
     first_pose, pose = SE3.exp(0.5 * rng.normal(size=(count, 6))), SE3.exp(0.2 * rng.normal(size=6))
     alive = rng.uniform(size=count) < 0.8
     rows, px = np.empty(count, dtype=np.int64), np.empty((count, 2))
-    limits = np.array([camera.width, camera.height, margin, camera.monotonic_radius, least, most])
+    limits = np.array([camera.width, camera.height, margin, camera.lens.monotonic_radius, least, most])
     found = in_view(place, first_pose, alive, pose, camera.params, limits, rows, px)
 
     seen = directions(place, pose)

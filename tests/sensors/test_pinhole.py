@@ -92,7 +92,7 @@ def test_slope_is_the_derivative(camera):
 def test_unproject_jacobian_is_the_derivative_and_the_inverse(camera):
     px = camera.project(seen_points(camera))
     uv = camera.unproject(px)
-    inner = np.hypot(*uv.T) < 0.8 * camera.monotonic_radius
+    inner = np.hypot(*uv.T) < 0.8 * camera.lens.monotonic_radius
     px, uv = px[inner], uv[inner]
     slope = camera.unproject_jacobian(px)
     numeric = numeric_slope(camera.unproject, px, np.full(len(px), 0.05))
@@ -208,7 +208,7 @@ def test_the_camera_of_turned_and_of_smaller_images_sees_the_same_there(camera):
 @pytest.mark.parametrize("k3", [0.0, 1e-300, -1e-300, -0.05, -3.0])
 @pytest.mark.parametrize(("k1", "k2"), [(-0.4, 0.02), (-0.4, -0.1), (0.3, -0.2), (0.0, -0.1)])
 def test_radius_is_the_first_turning_point(k1, k2, k3):
-    radius = Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, (k1, k2, 0.0, 0.0, k3)).monotonic_radius
+    radius = Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, (k1, k2, 0.0, 0.0, k3)).lens.monotonic_radius
 
     def slope(r):
         return 1.0 + 3.0 * k1 * r**2 + 5.0 * k2 * r**4 + 7.0 * k3 * r**6
@@ -218,7 +218,7 @@ def test_radius_is_the_first_turning_point(k1, k2, k3):
 
 
 def test_pixels_beyond_the_fold_have_no_direction():
-    radius = FOLDING.monotonic_radius
+    radius = FOLDING.lens.monotonic_radius
     reach = FOLDING.fx * radius * (1.0 - 0.25 * radius**2)
     px = FOLDING.cx + np.array([-1.0, -0.999, 0.999, 1.001, 5.0])[:, None] * [reach, 0.0]
     px[:, 1] = FOLDING.cy
@@ -238,7 +238,7 @@ def test_pixels_beyond_the_fold_have_no_direction():
 )
 def test_every_visible_direction_comes_back(k1, k2, k3, tangential, fraction, angle):
     camera = Pinhole(4000, 4000, 500.0, 500.0, 2000.0, 2000.0, (k1, k2, *tangential, k3))
-    length = fraction * min(camera.monotonic_radius, 1.5)
+    length = fraction * min(camera.lens.monotonic_radius, 1.5)
     seen = np.array([length * np.cos(angle), length * np.sin(angle), 1.0])
     if camera.visible(seen):
         assert_it_comes_back(camera, seen)

@@ -184,7 +184,7 @@ class ActiveSearch:
         from rbpf.sensors.camera.kernels import in_view
 
         table, camera, config = self.table, self.features.camera, self.config
-        of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)
+        of_image = (camera.width, camera.height, config.border_px, camera.lens.monotonic_radius)
         limits = np.array([*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float)
         rows, px = np.empty(len(table), dtype=np.int64), np.empty((len(table), 2))
         columns = (table.position, table.first_pose, among)
