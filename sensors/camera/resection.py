@@ -98,7 +98,7 @@ def resect_consensus(
     poses = three_point_poses(points, camera.unproject(px), triples, rng)
     if not poses.shape[0]:
         return None
-    errors = squared_distances(camera, poses, _exact(points, px))
+    errors = squared_distances(camera, poses, Sights.known(points, px))
     # The truncated error tells apart poses that as many points agree with (P. Torr and A. Zisserman 2000).
     pose = poses[np.minimum(errors, within_px**2).sum(axis=1).argmin()]
     return refined(camera, pose, points, px, within_px)
@@ -106,11 +106,7 @@ def resect_consensus(
 
 def refined(camera: Pinhole, pose: np.ndarray, points: np.ndarray, px: np.ndarray, within_px: float) -> Resected | None:
     """`refined_on_all` of points (M, 3) that are known and agree if they are seen (M, 2) within so many px."""
-    return refined_on_all(camera, pose, _exact(points, px), (within_px**2,) * (ROUNDS + 1))
-
-
-def _exact(points: np.ndarray, px: np.ndarray) -> "Sights":
-    return Sights(points, np.zeros_like(points), px, np.ones(len(px)))
+    return refined_on_all(camera, pose, Sights.known(points, px), (within_px**2,) * (ROUNDS + 1))
 
 
 GATE = 9.2  #: Squared Mahalanobis distance within which a point agrees: 99 % of two dimensions.
@@ -129,6 +125,11 @@ class Sights:
     spread: np.ndarray
     px: np.ndarray
     std_px: np.ndarray
+
+    @classmethod
+    def known(cls, points: np.ndarray, px: np.ndarray, std_px: float = 1.0) -> "Sights":
+        """Of points that are known, seen equally well."""
+        return cls(points, np.zeros_like(points), px, np.full(len(px), std_px))
 
     def __add__(self, other: "Sights") -> "Sights":
         """Both, one after the other."""

@@ -366,7 +366,7 @@ class Relocaliser:
         if view is not None:
             poses = three_point_poses(points, camera.unproject(places), config.p3p_samples, rng)
             if poses.shape[0]:
-                both = known_sights(points, places, config.inlier_px) + view
+                both = Sights.known(points, places, config.inlier_px / np.sqrt(GATE)) + view
                 # A landmark says twice as much as a corner of unknown depth, and fixes the scale.
                 weights = np.where(np.arange(both.std_px.size) < points.shape[0], 2.0, 1.0)
                 losses = np.minimum(squared_distances(camera, poses, both), 4.0 * GATE) @ weights
@@ -382,7 +382,8 @@ class Relocaliser:
         """A pose refined on landmarks, and on the corners of the last view if these agree; `inliers` of landmarks."""
         inlier_px = self.config.inlier_px
         if view is not None:
-            found = refined_on_all(self.camera, rough, known_sights(points, places, inlier_px) + view)
+            sights = Sights.known(points, places, inlier_px / np.sqrt(GATE)) + view
+            found = refined_on_all(self.camera, rough, sights)
             if found is not None and most_agree(found.inliers[len(points) :]):
                 return replace(found, inliers=found.inliers[: len(points)])
         return refined(self.camera, rough, points, places, inlier_px)
@@ -461,11 +462,6 @@ def most_agree(agreeing: np.ndarray) -> bool:
     Where the map is torn they do not, and it is the map in which the camera has to be found.
     """
     return bool(agreeing.sum() >= max(MIN_VIEW_CORNERS, MIN_VIEW_FRACTION * agreeing.size))
-
-
-def known_sights(points: np.ndarray, px: np.ndarray, inlier_px: float) -> Sights:
-    """Of landmarks (M, 3) at px (M, 2), which agree within so many pixels."""
-    return Sights(points, np.zeros_like(points), px, np.full(len(px), inlier_px / np.sqrt(GATE)))
 
 
 def image_corners(sensor: ImageSensor, image: np.ndarray, config: RelocalisationConfig, border_px: float) -> Keypoints:
