@@ -35,7 +35,6 @@ DICTIONARIES = (
     *("4X4_50", "4X4_100", "4X4_250", "5X5_50", "5X5_100", "5X5_250", "6X6_50", "6X6_100", "6X6_250"),
     "APRILTAG_36H11",
 )  #: Sets of patterns of markers.
-_SEARCHES = (0, "CALIB_CB_NORMALIZE_IMAGE", "CALIB_CB_EXHAUSTIVE")
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
 
 
@@ -104,8 +103,8 @@ def board_corners(image: np.ndarray, board: Board, thorough: bool = True) -> np.
     """
     import cv2
 
-    for search in _SEARCHES if thorough else _SEARCHES[:2]:
-        flags = getattr(cv2, search) if isinstance(search, str) else search
+    searches = (0, cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_EXHAUSTIVE)
+    for flags in searches if thorough else searches[:2]:
         found, px = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
         if found:
             break

@@ -54,7 +54,8 @@ class Sift(FeatureExtractor, Descriptor):
         reduced = self._reduced(image)
         found, histograms = self._sift.detectAndCompute(reduced, None)
         if not found:
-            return Features(*_NONE, np.zeros((0, config.length), dtype=np.float32))
+            none = np.zeros(0)
+            return Features(np.zeros((0, 2)), none, none, none, np.zeros((0, config.length), dtype=np.float32))
         table = np.array([(*p.pt, p.size, p.angle, p.response) for p in found])
         features = Features(
             px=(table[:, :2] + 0.5) / config.working_scale - 0.5,
@@ -97,9 +98,6 @@ class Sift(FeatureExtractor, Descriptor):
         config = self.config
         # Without the precise scaling every pixel is a quarter off.
         return cv2.SIFT.create(config.features, config.layers, config.contrast, config.edge, _SIGMA, True)
-
-
-_NONE = np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0)
 
 
 def descriptors_from_histograms(histograms: np.ndarray, length: int, norm: str = "root") -> np.ndarray:

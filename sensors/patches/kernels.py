@@ -385,9 +385,9 @@ OUTSIDE = np.float32(-2.0)  #: In a map of scores: not searched.
 
 
 @njit(cache=True, error_model="numpy")
-def interval(centre, cov, limits, shape, size):
+def interval(centre, cov, sigmas, most, shape, size):
     """First and last column and row of the whole pixels to search; empty where the last is before the first."""
-    sigmas, most, half = limits[0], limits[1], size // 2
+    half = size // 2
     uu, _, vv = ellipse(cov, sigmas)
     if not (math.isfinite(uu) and math.isfinite(vv) and math.isfinite(centre[0]) and math.isfinite(centre[1])):
         return (0, -1), (0, -1)
@@ -431,17 +431,16 @@ def search_all(k, arguments):
     found keeps what the caller put there.
     """
     image, templates, centres, covs, sigmas, most, least_std, places = arguments
-    limits = sigmas, most, least_std
     template, centre, cov, found = templates[k], centres[k], covs[k], places[k]
-    unit = normalised(template, limits[2])
+    unit = normalised(template, least_std)
     if unit.shape[0] == 0:
         return
-    columns, rows = interval(centre, cov, limits, image.shape, template.shape[0])
+    columns, rows = interval(centre, cov, sigmas, most, image.shape, template.shape[0])
     width, height = columns[1] - columns[0] + 1, rows[1] - rows[0] + 1
     if width <= 0 or height <= 0:
         return
     scores = np.full((height, width), OUTSIDE, np.float32)
-    score_ellipse(image, unit, template.shape[0], centre, cov, limits[0], columns, rows, scores)
+    score_ellipse(image, unit, template.shape[0], centre, cov, sigmas, columns, rows, scores)
     v, u = divmod(scores.argmax(), width)
     if scores[v, u] <= -1.0:
         return

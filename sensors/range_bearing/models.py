@@ -29,6 +29,7 @@ class RigidPointModel(ObservationModel):
 
     def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None) -> None:
         self.space = space
+        self.dim = space.point_dim
         self._mount(space.identity() if robot_from_sensor is None else robot_from_sensor)
 
     def _mount(self, robot_from_sensor: Array) -> None:
@@ -118,7 +119,6 @@ class RangeBearing(RigidPointModel):
         half_field_of_view: float = np.pi,
     ) -> None:
         super().__init__(space, robot_from_sensor)
-        self.dim = 2 if isinstance(space, SE2Group) else 3
         self.pitch_sign = float(pitch_sign)
         self.max_range = max_range
         self.half_field_of_view = half_field_of_view
@@ -181,7 +181,6 @@ class RelativePosition(RigidPointModel):
         self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None, max_range: float = np.inf
     ) -> None:
         super().__init__(space, robot_from_sensor)
-        self.dim = 2 if isinstance(space, SE2Group) else 3
         self.max_range = max_range
 
     def measure(self, point: Array) -> Array:

@@ -28,7 +28,7 @@ A clock that is set back by more is refused. Scans that turn against the odometr
 
 import logging
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self, final
@@ -331,9 +331,8 @@ def _not_beams(start: float, step: float, count: int) -> str:
     return f"expected beams in radians, within a turn, found {count} from {start:g} on, each {step:g} further"
 
 
-def _numbers(path: Path, line: int, names: Iterable[str], words: list[str]) -> Array:
+def _numbers(path: Path, line: int, names: Sequence[str], words: list[str]) -> Array:
     """Words as finite numbers; a line that ends before the last name is refused."""
-    names = tuple(names)
     if len(words) < len(names):
         raise line_error(path, line, f"expected {names[len(words)]}, found the end of the line")
     return np.array([parse_number(path, line, *pair) for pair in zip(names, words, strict=True)])

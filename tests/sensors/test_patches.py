@@ -117,7 +117,7 @@ def kernel_map(image, template, centre, cov, sigmas, most_px):
     """(H, W) scores of the kernel."""
     size, scores = template.shape[0], np.full(image.shape, float(OUTSIDE))
     centre, cov = np.array(centre, float), np.array(cov, float)
-    columns, rows = interval(centre, cov, (sigmas, most_px, 0.0), image.shape, size)
+    columns, rows = interval(centre, cov, sigmas, most_px, image.shape, size)
     part = np.full((max(rows[1] - rows[0] + 1, 0), max(columns[1] - columns[0] + 1, 0)), OUTSIDE)
     if part.size:
         units = normalised(template.astype(np.float32), 0.0)

@@ -87,17 +87,11 @@ class DeadReckoning:
         return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=world, velocity_at_update=self.velocity)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {
-            "reckoning/stamp_ns": np.array([] if self.stamp_ns is None else [self.stamp_ns], dtype=np.int64),
-            "reckoning/velocity": self.velocity,
-            "reckoning/delta": self.since_update.delta,
-            "reckoning/cov": self.since_update.cov,
-            "reckoning/world_from_camera": self.world_from_camera,
-            "reckoning/missed": np.array([self.assumed, self.waiting, self.hidden, self.passed_over]),
-            "reckoning/velocity_at_update": self.velocity_at_update,
-            "reckoning/noise": self.noise,
-            "reckoning/left_over": self.left_over,
-        }
+        stamps = np.array([] if self.stamp_ns is None else [self.stamp_ns], dtype=np.int64)
+        missed = np.array([self.assumed, self.waiting, self.hidden, self.passed_over])
+        motion = self.since_update.delta, self.since_update.cov, self.world_from_camera
+        parts = stamps, self.velocity, *motion, missed, self.velocity_at_update, self.noise, self.left_over
+        return {f"reckoning/{name}": part for name, part in zip(_KEPT, parts, strict=True)}
 
     @classmethod
     def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":

@@ -358,17 +358,14 @@ class StereoSlam(System):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The last measured pair, the landmarks' descriptors or names, and the odometry."""
+        frames, doubted = np.array([self.frames, self._last_update]), np.array(self._doubted)
+        own = frames, self.at_update.mean, self.at_update.cov, self.since_update, self._impossible, doubted
         return {
             **({} if self._kept is None else self.front_end.arrays(self._kept)),
             **self._calibration.arrays(),
             **self.front_end.landmarks.arrays(),
             **self.reckoning.arrays(),
-            "stereo/frames": np.array([self.frames, self._last_update]),
-            "stereo/at_update": self.at_update.mean,
-            "stereo/cov_at_update": self.at_update.cov,
-            "stereo/since_update": self.since_update,
-            "stereo/impossible": self._impossible,
-            "stereo/doubted": np.array(self._doubted),
+            **{f"stereo/{name}": array for name, array in zip(_STEREO, own, strict=True)},
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:

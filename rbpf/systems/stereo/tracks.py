@@ -28,10 +28,8 @@ def tracked_features(
     for step, (is_measured, shown) in enumerate(zip(measured, observed, strict=True)):
         if is_measured:
             tracks.add(step, shown)
-    rows, numbers = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 9))
-    if tracks.rows:
-        rows, numbers = np.concatenate(tracks.rows), np.concatenate(tracks.numbers)
-    label = tracks.labels(rows)[rows[:, 1]] if len(rows) else rows[:, 1]
+    rows, numbers = np.concatenate(tracks.rows), np.concatenate(tracks.numbers)
+    label = tracks.labels(rows)[rows[:, 1]]
     _, index, counts = np.unique(label, return_inverse=True, return_counts=True)
     order = np.lexsort((label, rows[:, 0]))
     order = order[(counts[index] >= LEAST)[order]]
@@ -46,8 +44,8 @@ class _Tracks:
     """The tracks of the pairs so far, and what is to be joined."""
 
     def __init__(self) -> None:
-        self.rows: list[np.ndarray] = []  # number of the pair and of the track of each observation, (k, 2) each
-        self.numbers: list[np.ndarray] = []  # (k, 9) pixels and packed covariance of each
+        # Of each observation the numbers of its pair and its track, (k, 2), and its pixels and packed covariance, (k, 9).
+        self.rows, self.numbers = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 9))]
         self._named: dict[int, int] = {}
         self._joined: list[tuple[int, int]] = []
         self._count, self._step = 0, -1
