@@ -24,20 +24,8 @@ from rbpf.ranges import MOST, Range
 
 PROGRAM = "rbpf"
 BAD_INPUT, STOPPED = 2, 130  #: Exit codes; 0 is success, 1 a fault of the program.
-APP = Commands("""Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
-
-  try it:    rbpf demo
-  record:    rbpf simulate desk --out desk
-  camera:    rbpf calibrate board.mp4 --board 9x6 --square 0.024; rbpf recalibrate RUN
-  run:       rbpf run mono desk --known-points desk/known_points.csv --out RUN --view
-  look:      rbpf report RUN; rbpf plot RUN OTHER; rbpf export RUN --format tum ply
-  check:     rbpf validate RUN --against gtsam; rbpf compare RUN OTHER; rbpf sweep plan.yaml
-  machine:   rbpf doctor; eval "$(rbpf completion bash)"
-
-Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C.""")
 
 
-@APP.add("demo")
 @dataclass(frozen=True, kw_only=True)
 class Demo(Printed):
     """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video."""
@@ -56,18 +44,34 @@ class Demo(Printed):
         RunMono(sequence=images, world=WorldOptions(known_points=known), result=made, filter=noise, json=self.json)()
 
 
-APP.kinds["simulate"] = SIMULATE
-APP.add("calibrate")(cameras.Calibrate)
-APP.add("recalibrate")(cameras.Recalibrate)
-APP.kinds["run"] = RUN
-APP.add("report")(judging.Report)
-APP.add("plot")(judging.Plot)
-APP.add("export")(judging.Export)
-APP.add("validate")(judging.Validate)
-APP.add("compare")(judging.Compare)
-APP.add("sweep")(judging.Sweep)
-APP.add("doctor")(installed.Doctor)
-APP.add("completion")(installed.Completion)
+APP = Commands(
+    """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
+
+  try it:    rbpf demo
+  record:    rbpf simulate desk --out desk
+  camera:    rbpf calibrate board.mp4 --board 9x6 --square 0.024; rbpf recalibrate RUN
+  run:       rbpf run mono desk --known-points desk/known_points.csv --out RUN --view
+  look:      rbpf report RUN; rbpf plot RUN OTHER; rbpf export RUN --format tum ply
+  check:     rbpf validate RUN --against gtsam; rbpf compare RUN OTHER; rbpf sweep plan.yaml
+  machine:   rbpf doctor; eval "$(rbpf completion bash)"
+
+Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C.""",
+    {
+        "demo": Demo,
+        "simulate": SIMULATE,
+        "calibrate": cameras.Calibrate,
+        "recalibrate": cameras.Recalibrate,
+        "run": RUN,
+        "report": judging.Report,
+        "plot": judging.Plot,
+        "export": judging.Export,
+        "validate": judging.Validate,
+        "compare": judging.Compare,
+        "sweep": judging.Sweep,
+        "doctor": installed.Doctor,
+        "completion": installed.Completion,
+    },
+)
 
 
 def _require_streams(wanted: bool) -> None:

@@ -1,33 +1,24 @@
 """A group of commands that knows their names and options: what the parser says of others is long, or beside the point."""
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, is_dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
 from rbpf.errors import InputError
 from rbpf.ranges import SettingError, check_ranges
 
-Command = TypeVar("Command", bound=Callable[[], None])
 
-
+@dataclass(frozen=True, eq=False)
 class Commands:
-    """Commands, and groups of them, by name; `first` is called before each command of the group."""
+    """A group of commands."""
 
-    def __init__(self, help: str, first: Callable[[], object] | None = None) -> None:
-        self.kinds: dict[str, Commands | type[Any]] = {}
-        self._help, self._first = help, first
-
-    def add(self, name: str) -> Callable[[type[Command]], type[Command]]:
-        """Makes a dataclass a command of this name: its fields are the options, its call is what the command does."""
-
-        def added(kind: type[Command]) -> type[Command]:
-            self.kinds[name] = kind
-            return kind
-
-        return added
+    help: str  #: its first line says in which it is itself one of a group.
+    #: by name, further groups, and dataclasses whose fields are options, and whose call is what the command does.
+    kinds: "Mapping[str, Commands | type[Any]]"
+    first: Callable[[], object] = lambda: None  #: called before each command.
 
     def call(self, arguments: list[str], before: str) -> None:
         """Calls the command that the arguments name; `before` are the words that led here.
@@ -37,7 +28,7 @@ class Commands:
         Raises InputError: there is no such command or option, or a value is out of its range.
         """
         if not arguments or arguments[0].startswith("-"):
-            tyro.cli(self._parsed(), prog=before, description=self._help, args=arguments)
+            tyro.cli(self._parsed(), prog=before, description=self.help, args=arguments)
             return
         name = arguments[0].replace("_", "-")
         if name not in self.kinds:
@@ -57,8 +48,7 @@ class Commands:
                 check_ranges(options_of)
         except SettingError as error:
             raise InputError(f"--{error.name.replace('_', '-')} {error.words}") from error
-        if self._first is not None:
-            self._first()
+        self.first()
         command()
 
     def _parsed(self) -> Any:
@@ -66,7 +56,7 @@ class Commands:
         parts = []
         for name, kind in self.kinds.items():
             if isinstance(kind, Commands):
-                first = kind._help.partition("\n")[0]
+                first = kind.help.partition("\n")[0]
                 group = tyro.conf.subcommand(name, description=first, constructor_factory=kind._parsed)
                 parts.append(Annotated[Any, group])
             else:

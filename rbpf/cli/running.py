@@ -29,19 +29,6 @@ if TYPE_CHECKING:
     from rbpf.systems.system import Tracked
     from rbpf.validation.report.live import RunView
 
-RUN = Commands(
-    """Filter a recording; `rbpf run SYSTEM --help` says more.
-
-  rbpf run mono walk.mp4 --calibration camera.yaml --out RUN
-  rbpf run stereo PAIRS --out RUN
-  rbpf run range-bearing LOG --out RUN
-  rbpf run laser robot.clf --out RUN
-
-`rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
-It is refused when the recording has changed. Further options are those of the run's system.""",
-    compile_kernels,
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
@@ -155,7 +142,6 @@ class ImageRunOptions(RunOptions):
     recording: Group[ImageOptions] = ImageOptions()
 
 
-@RUN.add("range-bearing")
 @dataclass(frozen=True, kw_only=True)
 class RunRangeBearing(RunOptions):
     """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
@@ -182,7 +168,6 @@ class RunRangeBearing(RunOptions):
         _run(self, RobotRecording(self.log, self.recording.part()), config, tell, batch=self.batch)
 
 
-@RUN.add("laser")
 @dataclass(frozen=True, kw_only=True)
 class RunLaser(RunOptions):
     """Grid SLAM over a laser scanner's log (Grisetti et al. 2007: scan matching in each particle's own map)."""
@@ -204,7 +189,6 @@ class RunLaser(RunOptions):
         _run(self, LaserRecording(self.log, options), self.settings(LaserConfig, "laser"))
 
 
-@RUN.add("mono")
 @dataclass(frozen=True, kw_only=True)
 class RunMono(ImageRunOptions):
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
@@ -243,7 +227,6 @@ class RunMono(ImageRunOptions):
         _run(self, recording, config, video=video, batch=self.result.batch, most_iterations=self.result.batch_limit)
 
 
-@RUN.add("stereo")
 @dataclass(frozen=True, kw_only=True)
 class RunStereo(ImageRunOptions):
     """Stereo SLAM over a sequence of pairs of images (SIFT landmarks in a joint map, visual odometry)."""
@@ -266,6 +249,21 @@ class RunStereo(ImageRunOptions):
         recording = StereoRecording(self.sequence, images.calibration, topics, images.part(images.resize))
         made = self.result
         _run(self, recording, config, video=made.video, batch=made.batch, most_iterations=made.batch_limit)
+
+
+RUN = Commands(
+    """Filter a recording; `rbpf run SYSTEM --help` says more.
+
+  rbpf run mono walk.mp4 --calibration camera.yaml --out RUN
+  rbpf run stereo PAIRS --out RUN
+  rbpf run range-bearing LOG --out RUN
+  rbpf run laser robot.clf --out RUN
+
+`rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
+It is refused when the recording has changed. Further options are those of the run's system.""",
+    {"range-bearing": RunRangeBearing, "laser": RunLaser, "mono": RunMono, "stereo": RunStereo},
+    compile_kernels,
+)
 
 
 def repeated(arguments: list[str]) -> list[str]:

@@ -16,10 +16,7 @@ from rbpf.ranges import MOST, Count, CountOrNone, Fraction, NotNegative, Range, 
 if TYPE_CHECKING:
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
-SIMULATE = Commands("Make a recording of a world whose truth is known.", compile_kernels)
 
-
-@SIMULATE.add("range-bearing")
 @dataclass(frozen=True, kw_only=True)
 class SimulateRangeBearing(Printed):
     """A log of a robot among landmarks, with ground truth."""
@@ -39,7 +36,6 @@ class SimulateRangeBearing(Printed):
         answer({"out": str(self.out), "steps": self.steps}, self.json, f"wrote {self.out}")
 
 
-@SIMULATE.add("laser")
 @dataclass(frozen=True, kw_only=True)
 class SimulateLaser(Printed):
     """A log of a robot with a laser scanner that drives round a corridor, with ground truth."""
@@ -96,7 +92,6 @@ class ImagesOptions(RenderOptions):
     square: RealPositive = None  #: side of its squares, m; by default none.
 
 
-@SIMULATE.add("desk")
 @dataclass(frozen=True, kw_only=True)
 class SimulateDesk(ImagesOptions):
     """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
@@ -111,7 +106,6 @@ class SimulateDesk(ImagesOptions):
         render(lies, self)
 
 
-@SIMULATE.add("room")
 @dataclass(frozen=True, kw_only=True)
 class SimulateRoom(ImagesOptions):
     """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
@@ -122,6 +116,13 @@ class SimulateRoom(ImagesOptions):
         if self.board is not None or self.square is not None:
             raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
         render(TexturedRoom(frames=self.frames, contrast=self.contrast), self)
+
+
+SIMULATE = Commands(
+    "Make a recording of a world whose truth is known.",
+    {"range-bearing": SimulateRangeBearing, "laser": SimulateLaser, "desk": SimulateDesk, "room": SimulateRoom},
+    compile_kernels,
+)
 
 
 def render(world: "ImageWorld", options: RenderOptions) -> None:
