@@ -62,8 +62,7 @@ class Reconstruction:
     name: str  #: of the sequence.
     chosen: NDArray[np.int64]  #: (C,) frames that were handed to it.
     frames: NDArray[np.int64]  #: (R,) those of which it found the pose, ascending.
-    stamps_ns: NDArray[np.int64]  #: (R,) their times.
-    world_from_camera: Array  #: (R, 7).
+    path: Trajectory  #: (R,) the poses, with the frames' times.
     points: Array  #: (M, 3).
     metric: bool  #: whether the scale is that of a stereo pair's baseline; otherwise it is arbitrary.
     model: Any  #: the `pycolmap.Reconstruction`, in the same scale.
@@ -72,11 +71,6 @@ class Reconstruction:
     def fraction(self) -> float:
         """Share of the key frames whose pose was found."""
         return len(self.frames) / len(self.chosen)
-
-    @property
-    def path(self) -> Trajectory:
-        """The poses with their times."""
-        return Trajectory(self.stamps_ns, self.world_from_camera)
 
     def as_dict(self) -> dict[str, Any]:
         """Figures for JSON."""
@@ -172,8 +166,7 @@ def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None =
         name=sequence.name,
         chosen=np.array(numbers, dtype=np.int64),
         frames=frames,
-        stamps_ns=np.asarray(sequence.stamps_ns, dtype=np.int64)[frames],
-        world_from_camera=np.array([poses[frame] for frame in frames.tolist()]),
+        path=Trajectory(np.asarray(sequence.stamps_ns)[frames], np.array([poses[frame] for frame in frames.tolist()])),
         points=np.array([by_id[index].xyz for index in sorted(by_id)]).reshape(-1, 3),
         metric=metric,
         model=model,
@@ -288,13 +281,13 @@ def compare_with_path(
 
 def compare_with_truth(found: Reconstruction, truth: Truth) -> ColmapComparison:
     """COLMAP beside the truth, interpolated at the key frames; an InputError where there is too little."""
-    rows, poses = poses_at(SE3, truth.stamps_ns, truth.poses, found.stamps_ns)
+    rows, poses = poses_at(SE3, truth.stamps_ns, truth.poses, found.path.stamps_ns)
     if len(rows) < LEAST_FRAMES:
         raise InputError(
             f"The ground truth of {found.name} covers {len(rows)} of {len(found.frames)} key frames, expected "
             f"{LEAST_FRAMES} or more; its stamps must be those of the images' clock."
         )
-    return compare_with_path(found, Trajectory(found.stamps_ns[rows], poses))
+    return compare_with_path(found, Trajectory(found.path.stamps_ns[rows], poses))
 
 
 def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array) -> CloudDistance:

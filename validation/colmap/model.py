@@ -95,8 +95,8 @@ def build_model(
         shift = np.array([-camera.baseline_m, 0.0, 0.0])
         rig.add_sensor(sensors[RIGHT], pycolmap.Rigid3d(pycolmap.Rotation3d(), shift))
     model.add_rig(rig)
+    tracks: list[list[Any]] = [[] for _ in points]
     for step, inverse in enumerate(SE3.inverse(world_from_camera)):
-        cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:4]), inverse[4:])
         rows = np.flatnonzero(table.steps == step)
         images = [
             pycolmap.Image(
@@ -114,24 +114,17 @@ def build_model(
         for image in images:
             image.frame_id = step + 1
             frame.add_data_id(image.data_id)
-        frame.rig_from_world = cam_from_world
+        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:4]), inverse[4:])
         model.add_frame(frame)
         for image in images:
             model.add_image(image)
         model.register_frame(step + 1)
-    # Points with their tracks: an observation is its image and its place among this image's pixels.
+        # An observation is its image and its place among this image's pixels.
+        for place, index in enumerate(table.index[rows].tolist()):
+            tracks[index] += [pycolmap.TrackElement(image.image_id, place) for image in images]
     grey = np.full((len(points), 3), 128, dtype=np.uint8)
-    tracks: list[list[Any]] = [[] for _ in points]
-    places = dict[int, int]()
-    for step, index in zip(table.steps.tolist(), table.index.tolist(), strict=True):
-        place = places.get(step, 0)
-        places[step] = place + 1
-        shown = [image_id(step, side, stereo) for side in sides if (step, side) in names]
-        tracks[index] += [pycolmap.TrackElement(image, place) for image in shown]
-    for index, (point, colour) in enumerate(zip(points, grey if colours is None else colours, strict=True)):
-        model.add_point3D_with_id(index + 1, pycolmap.Point3D(xyz=point, color=colour))
-        for element in tracks[index]:
-            model.add_observation(index + 1, element)
+    for point, colour, track in zip(points, grey if colours is None else colours, tracks, strict=True):
+        model.add_point3D(point, pycolmap.Track(track), colour)
     model.update_point_3d_errors()
     return model
 
