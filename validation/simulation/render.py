@@ -34,7 +34,6 @@ class Renderer:
         tops, lefts = range(0, camera.height, side), range(0, camera.width, side)
         tiles = [_extent(around[y : y + side, x : x + side].reshape(1, -1, 2))[0] for y in tops for x in lefts]
         self._tiles = np.array(tiles).reshape(len(tops), len(lefts), 4)
-        self._view = _extent(self._tiles.reshape(1, -1, 2, 2).swapaxes(2, 3).reshape(1, -1, 2))[0]
         self._sides = sides(rectangles)
         sheets = {id(r.texture): r.texture for r in rectangles}
         place = {key: k for k, key in enumerate(sheets)}
@@ -52,18 +51,17 @@ class Renderer:
         whole number, at least grid².
         """
         poses = np.atleast_2d(world_from_camera)
-        seen = self._in_view(poses)
         # Places in a pixel [px], n² on a rotated grid: i/n² in one direction, n i mod (n² + 1) in the other, around 0.
         side = max(self._grid, math.isqrt(len(poses)))
         i = np.arange(1, side * side + 1)
         shifts = (np.stack([i, side * i % (side * side + 1)], axis=-1) - 0.5) / (side * side) - 0.5
         light = np.empty(self._uv.shape[:2], dtype=np.float32)
         self._kernel.expose(
-            np.array([rays_to_sides(self._sides[seen], pose) for pose in poses]),
-            np.array([self._bounds(pose, seen) for pose in poses]),
+            np.array([rays_to_sides(self._sides, pose) for pose in poses]),
+            np.array([self._bounds(pose) for pose in poses]),
             np.arange(len(shifts)) % len(poses),
-            self._sheet[seen],
-            self._gain[seen],
+            self._sheet,
+            self._gain,
             self._uv,
             self._slope,
             self._tiles,
@@ -79,24 +77,14 @@ class Renderer:
         """Depth z (H, W) [m] at the pixels' centres, infinite where there is nothing; rectangles (H, W), then -1."""
         inverse = np.empty(self._uv.shape[:2])
         rows = np.empty(inverse.shape, dtype=np.int64)
-        seen = self._in_view(world_from_camera[None])
-        h, bounds = rays_to_sides(self._sides[seen], world_from_camera), self._bounds(world_from_camera, seen)
+        h, bounds = rays_to_sides(self._sides, world_from_camera), self._bounds(world_from_camera)
         self._kernel.trace(h, bounds, self._uv, self._slope, self._tiles, inverse, rows)
         with np.errstate(divide="ignore"):
-            return 1.0 / inverse, np.append(seen, -1)[rows]
+            return 1.0 / inverse, rows
 
-    def _in_view(self, poses: np.ndarray) -> np.ndarray:
-        """(S,) rows of the rectangles of which some pose (K, 7) may see something."""
-        local = SE3.inverse_transform(poses[:, None], self._corners.reshape(-1, 3))
-        x, y, z = np.moveaxis(local.reshape(len(poses), -1, 4, 3), -1, 0)
-        left, right, top, bottom = self._view
-        beyond = x < left * z, x > right * z, y < top * z, y > bottom * z, z < 0.0
-        out = np.logical_or.reduce([side.all(axis=-1) for side in beyond])
-        return np.flatnonzero(~out.all(axis=0))
-
-    def _bounds(self, world_from_camera: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    def _bounds(self, world_from_camera: np.ndarray) -> np.ndarray:
         """(S, 4) least and greatest u and v of rectangles' parts before the camera; empty where there is none."""
-        local = SE3.inverse_transform(world_from_camera, self._corners[seen].reshape(-1, 3)).reshape(-1, 4, 3)
+        local = SE3.inverse_transform(world_from_camera, self._corners.reshape(-1, 3)).reshape(-1, 4, 3)
         following = np.roll(local, -1, axis=1)
         with np.errstate(all="ignore"):
             fraction = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
