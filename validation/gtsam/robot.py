@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.errors import InputError
-from rbpf.lie import Array, SE2Group, skew
+from rbpf.lie import Array, SE2Group
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
 from rbpf.validation.gtsam import solvers
 from rbpf.validation.gtsam.observations import SINGULAR, Residuals
@@ -155,9 +155,7 @@ class Sensor:
                 high = at[..., 2] / flat
                 rows.append(self._sign * np.stack([-x * high, -y * high, flat], axis=-1) / far[..., None] ** 2)
             slope = np.stack(rows, axis=-2) @ slope
-        turning = np.stack([near[..., 1:], -near[..., :1]], axis=-2) if planar else skew(near)
-        still = np.broadcast_to(-np.eye(at.shape[-1]), (*near.shape, at.shape[-1]))
-        return slope @ np.concatenate([turning, still], axis=-1), slope @ self._space.rotation(pose).mT
+        return -slope @ self._space.transform_jacobian(near), slope @ self._space.rotation(pose).mT
 
 
 @final
