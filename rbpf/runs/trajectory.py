@@ -27,15 +27,11 @@ Alignment = Literal["none", "rigid", "similarity"]
 @final
 @dataclass(frozen=True)
 class Similarity:
-    """The map x ↦ scale · rotation x + translation from the estimate's world into the reference's, of D = 2 or 3 dimensions.
-
-    `unique` is False where other rotations fit as well; then `rotation` turns by the smallest angle of them.
-    """
+    """x ↦ scale · rotation x + translation from the estimate's world into the reference's, of D = 2 or 3 dimensions."""
 
     scale: float
     rotation: Array
     translation: Array
-    unique: bool = True
 
     def transform(self, points: ArrayLike) -> Array:
         """Points (..., D) of the estimate's world in the reference's."""
@@ -44,7 +40,7 @@ class Similarity:
 
     def in_dimension(self, dim: int) -> "Similarity":
         """The same for points of the plane z = 0 where `dim` is 2, of a similarity that keeps that plane."""
-        return Similarity(self.scale, self.rotation[:dim, :dim], self.translation[:dim], self.unique)
+        return Similarity(self.scale, self.rotation[:dim, :dim], self.translation[:dim])
 
     def transform_poses(self, world_from_body: Array) -> Array:
         """Poses (..., 7) in the estimate's world, as poses in the reference's; only for D = 3."""
@@ -120,8 +116,8 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
     """Similarity that brings estimated points (N, D) closest to the reference (N, D), D = 2 or 3, Umeyama (1991) (39)-(43).
 
     Too few points, and points on one line (D = 3) or all in one place, leave the rotation undetermined without changing the
-    residual: the smallest fitting rotation is returned and `unique` is False. The scale of an estimate that lies in one place
-    is 1, as it is without `with_scale`. Raises InputError: shapes do not fit, or a coordinate is not finite.
+    residual: the smallest fitting rotation is returned. The scale of an estimate that lies in one place is 1, as it is without
+    `with_scale`. Raises InputError: shapes do not fit, or a coordinate is not finite.
     """
     x, y = _checked(estimate_points, reference_points)
     centre_x, centre_y = x.mean(0), y.mean(0)
@@ -143,7 +139,7 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
     variance = np.square(dx).sum() / len(x)
     scale = float((rotation * cov_yx).sum() / variance) if with_scale and rank else 1.0
     translation = centre_y - scale * np.einsum("ij,j->i", rotation, centre_x)
-    return Similarity(scale, rotation, translation, unique=rank >= x.shape[1] - 1)
+    return Similarity(scale, rotation, translation)
 
 
 def fit(alignment: Alignment | Similarity, estimate_points: Array, reference_points: Array) -> Similarity:
