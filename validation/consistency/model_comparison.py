@@ -25,10 +25,10 @@ from rbpf.core.likelihoods import Gaussian
 from rbpf.errors import InputError
 from rbpf.runs.files import OnDone
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import RobotRecording, filter_features, filter_opened, filter_recording, open_robot_log
+from rbpf.runs.recordings import RobotRecording, filter_features, filter_recording
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers import Part, RobotLog
+from rbpf.sensors.readers import Part
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
@@ -37,7 +37,7 @@ from rbpf.systems.stereo.config import StereoConfig
 NOISY = 3.0  #: Spread s of log Ẑ over the seeds beyond which its distribution is not used.
 CLEAR = 2.0  #: A difference of this many of its errors is one.
 Config = RangeBearingConfig | MonoConfig | StereoConfig
-Data = Path | RobotRecording | RobotLog | FeatureLog
+Data = RobotRecording | FeatureLog
 
 
 @dataclass(frozen=True)
@@ -198,13 +198,7 @@ def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
 
 
 def _filtered(config: Any, data: Data) -> Run[Any]:
-    if isinstance(data, FeatureLog):
-        return filter_features(data, config)
-    if not isinstance(data, RobotLog):
-        return filter_recording(RobotRecording(data) if isinstance(data, Path) else data, config)
-    if config.noise.given():
-        raise InputError("a log that was read already has its noise: give the recording's path to change it")
-    return filter_opened(open_robot_log(data, config))
+    return filter_features(data, config) if isinstance(data, FeatureLog) else filter_recording(data, config)
 
 
 def _evidence(config: Config, data: Data) -> float:
