@@ -13,7 +13,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.files import OnDone, prepare_folder, write_text
-from rbpf.runs.plots import COLOURS, label, save_figures
+from rbpf.runs.plots import COLOURS, blank, label, save_figures
 from rbpf.sensors.calibration import Board, BoardCalibration, BoardView, board_corners, calibrate
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, camera_text, model_of
 from rbpf.sensors.readers.images.video import read_uncalibrated
@@ -96,9 +96,7 @@ def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out
 
 def _draw(found: BoardCalibration) -> Any:
     """Corners with residuals, enlarged; the residuals; the error of each view."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
+    figure = blank(13.0, 8.0)
     axes: Any = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
     image = axes["image"]
     px, residuals = np.concatenate([view.px for view in found.views]), found.residuals.reshape(-1, 2)
