@@ -3,11 +3,15 @@
 A homogeneous point X = (x, y, z, ρ) in the left camera's frame, at (x, y, z) / ρ, and its pixels m = (u_left, v,
 u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T = previous_camera_from_camera at g with
 
-    (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography).
+    (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography),
 
-Measured are z⁻ = m + v⁻ and z = g(T, m) + v. About an m̂, which `Points` says, eliminating m leaves S05 (14) as
+a homography, which does not notice where infinity is: noise may well make the disparity of a far point negative.
+
+Measured are z⁻ = m + v⁻ and z = g(T, m) + v. About an m̂, eliminating m leaves S05 (14) as
 
     ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ,    Mathematics (vo-innovation).
+
+`Points` says which m̂: by default that of least Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass
