@@ -8,8 +8,10 @@ import numpy as np
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.lie import SE3
 from rbpf.runs.run import Run
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.paths import HandHeld
 
 SMALL = MonoConfig(particles=20, map="particles")
@@ -40,6 +42,11 @@ def errors(run: Run) -> np.ndarray:
     """(T, 6) of the online estimates in the charts at them."""
     truth = run.source.log.truth  # type: ignore[attr-defined]
     return SE3.local(run.log.poses, truth.poses)
+
+
+def off(done_path: np.ndarray, truth: np.ndarray, stamps_ns: np.ndarray) -> float:
+    """Error after an alignment with scale, m."""
+    return ate(Trajectory(stamps_ns, done_path), Trajectory(stamps_ns, truth), "similarity").rmse
 
 
 def nees(run: Run) -> np.ndarray:

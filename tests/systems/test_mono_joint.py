@@ -25,7 +25,7 @@ from rbpf.systems.mono.start.adjustment import FirstFrames
 from rbpf.systems.system import TrackingState
 from rbpf.validation.simulation.desk_and_room import TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from tests.systems.mono_logs import desk, errors, nees, without_known
+from tests.systems.mono_logs import desk, errors, nees, off, without_known
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, sequence, texture
 
 JOINT = MonoConfig(map="joint", settled_frames=4, start=StartConfig(depth_std_ratio=0.03))
@@ -262,6 +262,20 @@ def test_a_lost_camera_is_found_in_an_old_sub_map():
     error = SE3.local(found.pose, poses[-1])
     assert found.state == TrackingState.TRACKED and held > 3
     assert np.linalg.norm(error[3:]) < 0.05 and error @ np.linalg.solve(found.cov, error) < 20.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_fast_camera_keeps_its_scale_where_noise_is_stated_too_large(seed):
+    """Three quarters of a round in 100 frames, with a tenth of the stated noise: one Gaussian before the start is over."""
+    log = simulate_features(RoomWorld(frames=100, laps=0.75, points=400), Measuring(noise_px=0.1), MONO, seed)
+    slam, path, begun = MonoSlam(log.camera), [], []
+    for frame in log.frames:
+        tracked = slam.take(replace(frame, cov_z=100.0 * frame.cov_z))
+        path = [*path, tracked.pose] if tracked.revision is None else list(tracked.revision.poses)
+        begun += [slam.start.over] if slam.joint is not None else []
+    assert not begun[0] and begun[-1]
+    assert off(np.array(path), log.truth.poses, log.truth.stamps_ns) < 0.02
 
 
 @pytest.mark.slow

@@ -11,24 +11,17 @@ from rbpf.motion.constant_velocity import velocity_walk
 from rbpf.runs.recordings import filter_features as run
 from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
-from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
 from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, gathered, optimum
 from rbpf.systems.mono.start.unknown import UnknownStart
-from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
-from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
+from tests.systems.mono_logs import SMALL, changed, desk, off, rows, without_known
 from tests.systems.plane_sequences import path, sequence
 
 LOG = without_known(desk(frames=30))
 EARLY = replace(SMALL, start=StartConfig(depth_std_ratio=0.03))
 NEVER = replace(SMALL, start=StartConfig(batch_adjust=False))
-
-
-def off(done_path: np.ndarray, truth: np.ndarray, stamps_ns: np.ndarray) -> float:
-    """Error after an alignment with scale, m."""
-    return ate(Trajectory(stamps_ns, done_path), Trajectory(stamps_ns, truth), "similarity").rmse
 
 
 @pytest.fixture(scope="module")

@@ -201,7 +201,7 @@ class MonoConfig(RunConfig):
     map: Literal["auto", "joint", "particles"] = "auto"
     #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
     #: below the threshold of resampling, which does not take place.
-    window: Count = 5
+    window: Count = 2
     #: of a joint map: particles have maps of their own until half of the depths in view were known in so many frames in a row;
     #: with known points until an adjustment of the first frames knows them, and all are adjusted once more then.
     settled_frames: Count = 30

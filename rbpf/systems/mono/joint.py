@@ -40,6 +40,7 @@ from rbpf.systems.mono.start.adjustment import (
     Window,
     between,
     gathered,
+    lowest,
     optimum,
     residual_px,
     tangents,
@@ -126,8 +127,9 @@ class HandOver:
 
     @property
     def is_ahead(self) -> bool:
-        """Whether the map will become a joint one, or be adjusted once more."""
-        return self._rays is not None and self._settled < self.config.settled_frames
+        """Whether the map will become a joint one, or be begun anew: not what has left the frame for an old sub-map."""
+        has_left = self.joint is not None and len(self.joint.old.maps) > 0
+        return self._rays is not None and self._settled < self.config.settled_frames and not has_left
 
     def after_frame(self, filter_: Filter, sensor: ImageSensor, seen: FeatureFrame) -> Adjusted | None:
         """Takes note of what a frame has shown that was tracked; the filter on the joint map, when it is time for it.
@@ -141,24 +143,24 @@ class HandOver:
         ratio, belief = self.config.inverse_depth.promote_std_ratio, filter_.belief()
         known = sensor.features.depth_known(belief, seen.landmarks, ratio)
         self._settled = self._settled + 1 if known.size and known.mean() >= KNOWN_FRACTION else 0
-        if self.joint is not None and self.joint.old.maps:
-            self._settled = self.config.settled_frames  # what has left the frame is not begun anew
-            return None
         is_early = self.known is not None and self.joint is None and self.config.start.is_due(len(self.first.stamps_ns))
         if self.is_ahead and not is_early:
             return None
-        adjusted = self.become(filter_, sensor, self.is_ahead)
-        if adjusted is None:
-            self._settled = min(self._settled, self.config.settled_frames - 1)
+        adjusted = self.become(sensor, filter_, if_known=self.is_ahead)
+        if adjusted is None and self._settled == self.config.settled_frames:
+            self._settled -= 1  # the next frame tries again
         return adjusted
 
-    def become(self, filter_: Filter, sensor: ImageSensor, if_known: bool = False) -> Adjusted | None:
+    def become(
+        self, sensor: ImageSensor, filter_: Filter, reverse: bool = False, if_known: bool = False
+    ) -> Adjusted | None:
         """The filter on a joint map, from an adjustment of the frames so far; None where they do not yet determine one.
 
-        With `if_known`, half of the depths in view must be known there; if not, the next adjustment starts from this one.
+        With `reverse` near and far exchanged are tried, too (`lowest`). With `if_known`, half of the depths in view must be
+        known there; if not, the next adjustment starts from this one.
         """
         assert self._rays is not None
-        found = self._adjusted(filter_, sensor.features)
+        found = self._adjusted(filter_, sensor.features, reverse)
         if found is None:
             return None
         if if_known:
@@ -178,14 +180,18 @@ class HandOver:
     def _kept_ns(self) -> np.ndarray:
         return np.array([frame.stamp_ns for frame in self.first.seen])
 
-    def _adjusted(self, filter_: Filter, features: FeatureSensor) -> tuple[np.ndarray, Window, Optimum] | None:
+    def _adjusted(
+        self, filter_: Filter, features: FeatureSensor, reverse: bool = False
+    ) -> tuple[np.ndarray, Window, Optimum] | None:
         """Names (F,), what was seen of them, and the optimum downhill from the particles; None where there is none."""
         belief, config, given = filter_.belief(), self.config, self.known
-        always = None if given is None else given.names
-        found = gathered(self.first, features, belief, MAX_FRAMES, always)
+        found = gathered(self.first, features, belief, MAX_FRAMES, min_views=1)
         if found is None:
             return None
         _, names, seen, start = found
+        if self.joint is not None and not seen.is_connected():
+            self._settled = config.settled_frames + 1  # what tied the frames to one another has left the map: it stays
+            return None
         if self._numbers:
             seen = replace(seen, camera=self.camera, tuning=np.linalg.inv(config.self_calibration.cov()))
             start = replace(start, tuned=np.zeros(len(self._numbers)))
@@ -200,7 +206,7 @@ class HandOver:
             away = np.linalg.norm(SE3.inverse_transform(world_from_first, given.positions[row]), axis=1)
             mean, std = self._rays.prior(away)
             config = replace(config, inverse_depth=replace(config.inverse_depth, mean_per_m=mean, std_per_m=std))
-        best = optimum(seen, config, start)
+        best = lowest(seen, config, start, reverse)
         if best is not None and self.noise is not None:
             # That noise is less than stated the first frames do not tell: errors grow as the view changes.
             noise_px = residual_px(seen, config, best)

@@ -11,6 +11,7 @@ search inside, what is reported, and, as long as depths are not settled, the bat
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, final
 
@@ -297,7 +298,8 @@ class MonoSlam(System):
             is_joint = self.joint is not None
             self.first.note(seen, pose if is_joint else mixture_estimate(*report.mixture).mean[:7])
             is_usable, is_lost = not sensor.bad_frames, sensor.lost and len(sensor.table) > 0
-            adjusted, words = self.start.after_frame(self.filter, is_usable, is_lost)
+            become = partial(self.hand_over.become, sensor) if self.hand_over.is_ahead else None
+            adjusted, words = self.start.after_frame(self.filter, is_usable, is_lost, become)
             messages = [words, *messages] if words is not None else messages
             if adjusted is None and self.start.over and is_usable:
                 used = measured.used if isinstance(measured, Measurement) else measured

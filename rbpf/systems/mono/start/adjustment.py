@@ -177,7 +177,7 @@ class Window:
 
 
 def gathered(
-    first: FirstFrames, features: FeatureSensor, belief: Belief, most: int, known: np.ndarray | None = None
+    first: FirstFrames, features: FeatureSensor, belief: Belief, most: int, min_views: int = MIN_VIEWS
 ) -> tuple[np.ndarray, np.ndarray, Window, "Structure"] | None:
     """Numbers (T,) of `most` frames to adjust, names (F,) of features in the map that were seen often enough, what was seen.
 
@@ -194,7 +194,7 @@ def gathered(
     seen_by = np.concatenate([frame.landmarks for frame in chosen])
     held = belief.map.holds(seen_by) | (features.members(seen_by) >= 0)
     names, views = np.unique(seen_by[held], return_counts=True)
-    names = names[(views >= MIN_VIEWS) | np.isin(names, [] if known is None else known)]
+    names = names[views >= min_views]
     parts = [np.isin(frame.landmarks, names) for frame in chosen]
     seen = Window(
         features.camera,
@@ -299,6 +299,13 @@ def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | Non
     return _downhill(now)
 
 
+def lowest(seen: Window, config: MonoConfig, start: Structure, reverse: bool) -> Optimum | None:
+    """`optimum`, and with `reverse` that from its result with near and far exchanged, too: the one of the lower cost."""
+    best = optimum(seen, config, start)
+    other = optimum(seen, config, best.structure.reversed()) if reverse and best is not None else None
+    return best if best is None or other is None or best.cost <= other.cost else other
+
+
 def _downhill(now: "Linearised") -> Optimum | None:
     """By Levenberg's and Marquardt's method on the normal equations."""
     damping = DAMPING
@@ -355,8 +362,11 @@ class Linearised:
         self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
         self.prior = (at.inverse - self.rho.mean_per_m) / self.rho.std_per_m
         # The scale is the known points', or held.
-        self._by_scale = 0.0 if seen.known else 1.0 / (at.inverse.size * self.rho.mean_per_m * SCALE_STD)
-        self.scale = 0.0 if seen.known else float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
+        holding = np.bincount(feature, minlength=at.inverse.size) >= MIN_VIEWS
+        self._by_scale = (
+            0.0 * holding if seen.known else holding / (max(holding.sum(), 1) * self.rho.mean_per_m * SCALE_STD)
+        )
+        self.scale = 0.0 if seen.known else float(self._by_scale @ at.inverse - 1.0 / SCALE_STD)
         self.known = np.zeros((0, 3))
         if seen.known is not None and at.frame is not None:
             self._places = (at.direction / at.inverse[:, None])[seen.known.feature]
@@ -436,7 +446,7 @@ class Linearised:
         # The prior of the inverse distances, and the scale.
         q = free + 2 + 3 * np.arange(features)
         h[q, q] += self.rho.std_per_m**-2
-        h[np.ix_(q, q)] += self._by_scale**2
+        h[np.ix_(q, q)] += np.outer(self._by_scale, self._by_scale)
         b[q] -= self.prior / self.rho.std_per_m + self.scale * self._by_scale
 
         # The known points, in their own frame.

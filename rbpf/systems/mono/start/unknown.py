@@ -21,7 +21,7 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, optimum
+from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, lowest
 from rbpf.systems.system import Revision
 
 WELL_KNOWN = 3.0  #: Times `depth_std_ratio`: enough where a later adjustment knows depths no better.
@@ -57,19 +57,24 @@ class UnknownStart(Kept):
         self._next = config.start.first_adjustment
         self._ratio = np.inf  # of depths' standard deviations to depths, by the last adjustment
 
-    def after_frame(self, filter_: Filter, usable: bool, lost: bool) -> tuple[Adjusted | None, str | None]:
+    def after_frame(
+        self, filter_: Filter, usable: bool, lost: bool, become: Callable[[Filter, bool], Adjusted | None] | None
+    ) -> tuple[Adjusted | None, str | None]:
         """Adjusts all frames so far if it is time.
 
         Args:
             filter_: after its step; a new one has its sensors and its random generator.
             usable: whether the frame may be the last of an adjustment.
             lost: whether the camera is lost: then there will be no adjustment any more.
+            become: begins a joint map from all frames so far, told whether the reversed shape is tried, too; None where there
+                is to be none, or it is not begun anew.
 
         Returns:
-            The resampled particles, None where they go on as they are; and what there is to say, None for nothing.
+            The resampled particles, or the filter on a joint map, None where all goes on as it is; and what there is to say,
+            None for nothing.
         """
-        first, count = self.first, len(self.first.seen)
-        self.over = self.over or lost
+        first, count, is_joint = self.first, len(self.first.seen), filter_.consolidation is not None
+        self.over = self.over or lost or (is_joint and become is None)
         if self.over or count < self._next or not usable:
             return None, None
         self._next = self.config.start.next_after(count)
@@ -77,16 +82,18 @@ class UnknownStart(Kept):
         if found is None:
             return None, None
         steps, names, seen, guess = found
-        best = optimum(seen, self.config, guess) if seen.is_connected() else None
-        if best is None:
-            self.over = True
-            return None, DISCONNECTED
         # As long as depths are not known, near and far exchanged may be as good, and another minimum.
         start, before, known = self.config.start, self._ratio, WELL_KNOWN * self.config.start.depth_std_ratio
-        other = None if before < known else optimum(seen, self.config, best.structure.reversed())
-        best = best if other is None or best.cost <= other.cost else other
+        best = lowest(seen, self.config, guess, before >= known) if seen.is_connected() else None
+        if best is None:
+            self.over = True
+            return None, None if is_joint else DISCONNECTED
         self._ratio = best.depth_std_ratio(np.isin(names, first.seen[-1].landmarks))
         self.over = self._ratio < start.depth_std_ratio or (count >= start.max_frames and before <= self._ratio < known)
+
+        # What is known so well one Gaussian holds better than particles; it is begun anew until the start is over.
+        if become is not None and (is_joint or self._ratio < known):
+            return become(filter_, before >= known), None
 
         # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
         stamps = np.array(first.stamps_ns)
