@@ -59,7 +59,7 @@ class InverseDepthConfig(Ranged):
 
 @dataclass(frozen=True)
 class StartConfig(Ranged):
-    """The first frames are adjusted in batch; without known points the particles are resampled from the result."""
+    """The first frames are adjusted in batch; without known points particles are resampled, or a map begins, there."""
 
     #: whether they are, without known points; else the particles go on with what the prior of depth has made of them.
     batch_adjust: Annotated[bool, Formerly("redraw")] = True
@@ -202,8 +202,8 @@ class MonoConfig(RunConfig):
     #: of a joint map: frames sampled, at most, before they are taken into it; fewer where the effective sample size falls
     #: below the threshold of resampling, which does not take place.
     window: Count = 2
-    #: of a joint map: particles have maps of their own until half of the depths in view were known in so many frames in a row;
-    #: with known points until an adjustment of the first frames knows them, and all are adjusted once more then.
+    #: of a joint map: it begins as soon as an adjustment of the first frames knows depths, and is begun anew once half of
+    #: those in view were known in so many frames in a row; until it begins particles have maps of their own.
     settled_frames: Count = 30
     #: of a joint map: landmarks beyond which a sub-map ends; those in view, and others up to half of these, go over into the
     #: next one, and old ones come back when they are in view. No point is dropped; rays that are left behind are.

@@ -3,7 +3,8 @@
 As long as the baseline is hardly known, what is seen depends on the product of baseline and depth, which is far from
 Gaussian: particles with maps of their own hold it. Once depths are known, all frames so far are adjusted in batch, with the
 camera if it calibrates itself, and the Gaussian about the optimum is the joint map: landmarks, pose, velocity and camera
-with what they have in common. From then on no particle forgets, for none has a past.
+with what they have in common. It is begun anew as long as later frames tell much more. No particle of it forgets, for none
+has a past.
 """
 
 from collections.abc import Sequence

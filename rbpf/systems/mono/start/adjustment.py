@@ -181,8 +181,8 @@ def gathered(
 ) -> tuple[np.ndarray, np.ndarray, Window, "Structure"] | None:
     """Numbers (T,) of `most` frames to adjust, names (F,) of features in the map that were seen often enough, what was seen.
 
-    The frames see something, with a stamp of their own, the first and the last among them. Features that are `known` take
-    part however seldom they were seen. Last, where path and features are as far as the particles know. None: too few frames.
+    The frames see something, with a stamp of their own, the first and the last among them. Last, where path and features are
+    as far as the particles know. None: too few frames.
     """
     stamps = np.array([frame.stamp_ns for frame in first.seen])
     fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in first.seen]

@@ -5,7 +5,7 @@ two motions look alike. Particles decide too early: each image alone tells littl
 and what later images say comes too late. All first images together tell it well. So while depths are unknown, the
 frames until now are adjusted in one piece now and then ({py:mod}`rbpf.systems.mono.start.adjustment`), whole paths are drawn
 from the Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
-S. Sénécal, 2006).
+S. Sénécal, 2006). From when depths are known to some percent on, a joint map begins in their place, if there is to be one.
 """
 
 from collections.abc import Callable, Sequence
