@@ -35,9 +35,8 @@ def random_elements(group: LieGroup, rng: np.random.Generator, shape: tuple[int,
 
 def matrix(group: SE2Group | SE3Group, a: np.ndarray) -> np.ndarray:
     """Homogeneous matrices (…, D + 1, D + 1) of rigid motions."""
-    n = group.point_dim
-    out = np.tile(np.eye(n + 1), (*a.shape[:-1], 1, 1))
-    out[..., :n, :n], out[..., :n, n] = group.rotation(a), group.translation(a)
+    out = np.tile(np.eye(group.point_dim + 1), (*a.shape[:-1], 1, 1))
+    out[..., :-1, :-1], out[..., :-1, -1] = group.rotation(a), group.translation(a)
     return out
 
 

@@ -53,8 +53,7 @@ def test_without_json_nothing_is_on_standard_output(log, tmp_path, capsys):
 
 def test_bad_input_is_exit_code_2_and_a_fault_is_1(tmp_path):
     def code(*arguments, prelude=""):
-        program = [sys.executable, "-c", f"{prelude}\n{_MAIN}", *arguments]
-        return subprocess.run(program, capture_output=True, text=True)
+        return subprocess.run([sys.executable, "-c", f"{prelude}\n{_MAIN}", *arguments], capture_output=True, text=True)
 
     refused = code("report", str(tmp_path / "nothing"))
     assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and "Traceback" not in refused.stderr
@@ -136,8 +135,7 @@ CAMERA = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
 def recordings(tmp_path_factory):
     """Arguments by system; enough particles that the kernels do run on several threads."""
     folder = tmp_path_factory.mktemp("rendered")
-    imaging = Imaging(noise_std=1.0)
-    simulate_images(TexturedDesk(frames=4, texel_m=0.003), imaging, CAMERA, folder / "desk", seed=1)
+    simulate_images(TexturedDesk(frames=4, texel_m=0.003), Imaging(noise_std=1.0), CAMERA, folder / "desk", seed=1)
     rig = RectifiedStereo(CAMERA, 0.12)
     simulate_images(TexturedRoom(frames=4, rate_hz=5.0), Imaging(known=0), rig, folder / "room", seed=1)
     simulate_robot(RobotWorld(20, 40), folder / "log", 0)

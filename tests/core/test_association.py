@@ -169,8 +169,7 @@ class Fixed(Resampler):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_descendants_inherit_the_association_of_their_parent(compiled):
     landmark_map = LandmarkMap(SE2, compiled=compiled)
-    resampler = Fixed([3, 3, 4, 4, 5, 5])
-    filter_ = Filter(OdometryMotion(SE2), Scripted(), landmark_map, resampler=resampler, n=6)
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), landmark_map, resampler=Fixed([3, 3, 4, 4, 5, 5]), n=6)
     mean = np.broadcast_to([[3.0, 0.6], [3.0, 0.7]], (6, 2, 2))
     landmark_map.add_records(Records(mean, np.broadcast_to(np.eye(2), (6, 2, 2, 2))), Point(2))
     ids = np.array([[0], [0], [0], [1], [1], [0]])

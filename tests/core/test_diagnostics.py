@@ -66,8 +66,7 @@ def test_nees_is_measured_in_the_chart_at_the_mean(space):
 
 
 def test_nees_leaves_out_what_is_known_exactly_and_effective_sample_sizes():
-    cov = np.diag([0.0, 4.0])
-    assert nees(PLANE, Estimate(np.zeros(2), cov), np.array([0.0, 2.0])) == pytest.approx(1.0)
+    assert nees(PLANE, Estimate(np.zeros(2), np.diag([0.0, 4.0])), np.array([0.0, 2.0])) == pytest.approx(1.0)
     assert effective_sample_size(np.full(8, 1 / 8)) == pytest.approx(8.0)
     assert effective_sample_size(np.eye(8)[3]) == 1.0
     assert effective_sample_size(np.array([0.5, 0.5, 0.0])) == pytest.approx(2.0)

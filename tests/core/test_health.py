@@ -59,8 +59,7 @@ def test_a_filter_that_has_diverged_says_so():
     with pytest.warns(HealthWarning) as caught:
         filter_ = driven(50, 100)
     assert findings(filter_) >= {"innovations", "copies"}
-    told = [str(warning.message) for warning in caught]
-    assert told == list(filter_.health.findings.values()), "each is told once"
+    assert [str(warning.message) for warning in caught] == list(filter_.health.findings.values()), "each is told once"
     assert "step 200: what is measured is " in filter_.health.findings["innovations"]
     assert "have had all the weight" in filter_.health.findings.get("weights", "have had all the weight")
 

@@ -18,6 +18,7 @@ from rbpf.motion.stereo_vo import (
     estimate_motion,
     fit,
     product,
+    trimming,
 )
 from rbpf.sensors.camera import RectifiedStereo
 from tests.motion import stereo_pairs as worlds
@@ -50,9 +51,11 @@ def adjusted_by_scipy(matches: Matches, start: np.ndarray):
 @pytest.mark.parametrize("world", [worlds.ROAD, worlds.ROOM, worlds.LEAP], ids=["road", "room", "leap"])
 def test_without_noise_the_motion_is_exact(world, points):
     before, now, delta = worlds.noiseless(world, 40, np.random.default_rng(0))
-    found = estimated(Matches.checked(world.camera, before, now, COV, COV), config=VoConfig(points, rule=STRICT))
+    matches, config = Matches.checked(world.camera, before, now, COV, COV), VoConfig(points, rule=STRICT)
+    found = estimated(matches, config=config)
     np.testing.assert_allclose(SE3.local(delta, found.previous_camera_from_camera), 0.0, atol=1e-7)
-    assert found.found and found.inliers.all()
+    left = fit(matches, found.previous_camera_from_camera, config).squared
+    assert found.found and found.inliers.all() and left < (3 * len(matches) - 6) * 1e-4**2
 
 
 @pytest.mark.parametrize("world", [worlds.ROAD, worlds.ROOM, worlds.LEAP], ids=["road", "room", "leap"])
@@ -103,6 +106,8 @@ def test_false_matches_are_found(world, fraction):
     assert off @ np.linalg.solve(found.cov, off) < 22.5  # χ²₆, 99.9 %
     assert found.inliers[wrong].sum() <= 1
     assert found.inliers[~wrong].mean() > 0.95
+    left = fit(matches.take(found.inliers), found.previous_camera_from_camera, VoConfig()).residual
+    assert 0.85 < np.sqrt(trimming(VoConfig().gate) * (left @ left) / (len(left) - 6)) < 1.1
     assert found.others == ()
 
 

@@ -204,8 +204,7 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
             off[name].append(ate(Trajectory(stamps, run.log.poses), Trajectory(stamps, run.truth.poses)).rmse)
     assert np.mean(off["usual"]) < 0.02 and np.median(off["usual"]) < 0.015
     assert np.mean(off["credulous"]) > 2.0 * np.mean(off["usual"])
-    # With windows of two frames one seed of nine, the first, is taken along: docs/adr/0016.md.
-    assert np.median(off["joint"]) < 0.015 and np.sort(off["joint"])[-2] < 0.025
+    assert np.mean(off["joint"]) < 0.025
 
 
 def test_what_is_often_missed_only_updates_the_map():
@@ -229,6 +228,12 @@ def test_what_is_often_missed_only_updates_the_map():
     assert table.trusted(rows, SEARCH.trusted_fraction).all()
     table.found[rows[:6]] = 10
     np.testing.assert_array_equal(table.trusted(rows, SEARCH.trusted_fraction), rows < 6)
+    # What was only begun has no vote on which matches agree, but where the others are too few.
+    table.attempts[[6, 7]], table.found[[6, 7]] = 1, 1
+    np.testing.assert_array_equal(table.trusted(rows, SEARCH.trusted_fraction), ALL[:8])
+    np.testing.assert_array_equal(table.voting(rows, SEARCH.trusted_fraction), rows < 6)
+    table.found[5] = 2
+    np.testing.assert_array_equal(table.voting(rows, SEARCH.trusted_fraction), rows != 5)
 
 
 # Tracking and losing: how much has to be found.

@@ -274,8 +274,7 @@ def test_a_fast_camera_keeps_its_scale_where_noise_is_stated_too_large(seed):
         tracked = slam.take(replace(frame, cov_z=100.0 * frame.cov_z))
         path = [*path, tracked.pose] if tracked.revision is None else list(tracked.revision.poses)
         begun += [slam.start.over] if slam.joint is not None else []
-    assert not begun[0] and begun[-1]
-    assert off(np.array(path), log.truth.poses, log.truth.stamps_ns) < 0.02
+    assert not begun[0] and begun[-1] and off(np.array(path), log.truth.poses, log.truth.stamps_ns) < 0.02
 
 
 @pytest.mark.slow

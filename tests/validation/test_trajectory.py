@@ -117,5 +117,4 @@ def test_planar_poses_become_turns_about_z():
     trajectory = Trajectory.from_planar(np.array([0, 1]), planar)
     np.testing.assert_allclose(trajectory.positions, [[1.0, 2.0, 0.0], [-4.0, 0.5, 0.0]])
     inside = SE3.matrix(trajectory.world_from_body)[:, :2][:, :, [0, 1, 3]]
-    expected = np.concatenate([SE2.rotation(planar), planar[:, 1:, None]], axis=2)
-    np.testing.assert_allclose(inside, expected, atol=1e-15)
+    np.testing.assert_allclose(inside, np.concatenate([SE2.rotation(planar), planar[:, 1:, None]], axis=2), atol=1e-15)

@@ -215,8 +215,8 @@ class ActiveSearch:
         which, nu, jac, cov = self._innovations(belief, result.features[hits], result.px[hits])
         factor = belief.prior.spread(belief.prior.mean)
         factor = np.asarray(factor[belief.mode if factor.shape[0] > 1 else 0])
-        trusted = self.table.trusted(result.features[hits[which]], self.config.trusted_fraction)
-        fit = self.gate.fit(nu, jac, cov, factor, trusted)
+        voting = self.table.voting(result.features[hits[which]], self.config.trusted_fraction)
+        fit = self.gate.fit(nu, jac, cov, factor, voting)
         found = np.zeros_like(result.found)
         found[hits[which[(fit.squared <= self.config.gate_chi2) & self._placed(cov)]]] = True
         result = replace(result, found=found)

@@ -118,7 +118,8 @@ class SearchConfig(Ranged):
     #: it is dropped from all particles when it was not found in more than this fraction.
     max_failure_ratio: Annotated[Fraction, Formerly("failure_ratio")] = 0.5
     #: a feature says where the camera is only while it has been found in this fraction of the attempts, (1 + found) /
-    #: (2 + attempts): what moves by itself is soon not where a thing at rest would be.
+    #: (2 + attempts): what moves by itself is soon not where a thing at rest would be. One that was only begun so far
+    #: is used, but other matches are not judged by it.
     trusted_fraction: Annotated[Fraction, Formerly("trusted_share")] = 0.6
     #: the camera is lost when fewer than this fraction of what was looked for is found …
     lost_fraction: Annotated[Fraction, Formerly("lost_share")] = 0.25

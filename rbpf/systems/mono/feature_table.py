@@ -100,6 +100,12 @@ class FeatureTable:
         trusted = (self.member[rows] >= 0) | (self.found_fraction(rows) >= min_fraction)
         return trusted if trusted.sum() >= ENOUGH_TRUSTED else np.ones(rows.size, dtype=bool)
 
+    def voting(self, rows: np.ndarray, min_fraction: float) -> np.ndarray:
+        """The trusted (k,) that were looked for since they began: they say how the camera moved. All, if these are few."""
+        trusted = self.trusted(rows, min_fraction)
+        known = trusted & ((self.member[rows] >= 0) | (self.attempts[rows] > 1))
+        return known if known.sum() >= ENOUGH_TRUSTED else trusted
+
     def nearest_appearance(
         self, rows: np.ndarray, position: np.ndarray, world_from_camera: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
