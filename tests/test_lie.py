@@ -164,8 +164,7 @@ def test_log_at_exactly_half_a_turn():
     np.testing.assert_allclose(np.linalg.norm(quarter[:3]), np.pi, rtol=1e-15)
     np.testing.assert_allclose(SE3.exp(quarter), [0.0, 0.6, 0.8, 0.0, 1.0, 2.0, 3.0], atol=1e-15)
     np.testing.assert_array_equal(SE3.log([0.0, 0.6, 0.8, -0.0, 1.0, 2.0, 3.0]), quarter)
-    flat = SE2.log([np.pi, 1.0, 2.0])
-    np.testing.assert_allclose(SE2.exp(flat), [np.pi, 1.0, 2.0], rtol=1e-15)
+    np.testing.assert_allclose(SE2.exp(SE2.log([np.pi, 1.0, 2.0])), [np.pi, 1.0, 2.0], rtol=1e-15)
 
 
 def test_log_takes_the_shorter_way_for_both_signs_of_the_quaternion(rng):

@@ -81,7 +81,8 @@ def finish_run(
     if rerun is not None:
         write_rerun(run, rerun)
     verdict = validate(out, "groundtruth") if (out / TRUTH).is_file() else write_report(out)
-    said = [*entries.get("remarks", ()), *verdict.said]
+    unsolved = [f"There is no batch optimum: {entries['batch_problem']}"] if "batch_problem" in entries else []
+    said = [*entries.get("remarks", ()), *verdict.said, *unsolved]
     return entries | {"path_grade": verdict.path.grade, "verdict": verdict.trust, "sentences": said}
 
 

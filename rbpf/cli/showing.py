@@ -28,7 +28,7 @@ def progress() -> Iterator[Callable[[str], OnProgress]]:
     bars = Progress(TextColumn("{task.description}"), *done, *left, said, console=CONSOLE)
 
     def bar(what: str) -> OnProgress:
-        task = bars.add_task(what, start=False, visible=False, words="")
+        task = bars.add_task(what, total=None, start=False, visible=False, words="")
 
         def report(done: int, total: int | None, words: str = "") -> None:
             bars.start()

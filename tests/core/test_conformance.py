@@ -256,8 +256,7 @@ ALONE: dict[str, Any] = {
 
 @pytest.mark.parametrize("sentence", [*MISTAKES, *ALONE])
 def test_findings(sentence):
-    model = (MISTAKES | ALONE)[sentence]
-    findings = check_model(model)
+    findings = check_model((MISTAKES | ALONE)[sentence])
     says(findings, sentence)
     assert len(findings) == 1 or sentence in MISTAKES
 

@@ -136,8 +136,7 @@ def test_the_evidence_is_unbiased(case):
 def test_the_estimate_of_a_mode_is_the_most_probable_one(rng):
     states = np.stack([np.arange(6.0), [2, 0, 0, 1, 1, 0]], axis=1)
     weights = np.array([0.35, 0.05, 0.1, 0.2, 0.21, 0.09])
-    space = Product(Euclidean(1), Finite(3))
-    mean = space.mean(states, weights)
+    mean = Product(Euclidean(1), Finite(3)).mean(states, weights)
     assert mean[1] == 1.0 and mean[0] == pytest.approx(weights @ states[:, 0])
     np.testing.assert_allclose(Finite(3).probabilities(states[:, 1:], weights), [0.24, 0.41, 0.35])
     filter_ = marginal(rng)

@@ -49,8 +49,7 @@ def planar_world(steps: int, landmarks: int = 12, seed: int = 0, clutter: float 
 
 
 def _sightings(pose: np.ndarray, points: np.ndarray, clutter: float, rng: np.random.Generator) -> FeatureFrame:
-    model = RangeBearing(SE2)
-    z = model.predict(pose, points)
+    z = RangeBearing(SE2).predict(pose, points)
     names = np.flatnonzero(z[:, 0] < MAX_RANGE)
     z = z[names] + STD_Z * rng.normal(size=(names.size, 2))
     false = rng.uniform([0.5, -np.pi], [MAX_RANGE, np.pi], size=(rng.poisson(clutter), 2))

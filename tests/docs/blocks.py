@@ -41,8 +41,7 @@ def blocks(page: Path) -> list[Block]:
         language, body, caption = match[2].strip(), match[3], ""
         if language.startswith("{code-block}"):
             language = language.split()[1]
-            options = _OPTION.match(body)
-            caption = dict(_OPTION.findall(body)).get("caption", "") if options else ""
+            caption = dict(_OPTION.findall(body)).get("caption", "") if _OPTION.match(body) else ""
             body = _OPTION.sub("", body).lstrip("\n")
         if not language.startswith("{") and language not in _SHOWN_ELSEWHERE:
             line = text[: match.start()].count("\n") + 1

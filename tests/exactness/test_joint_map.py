@@ -432,8 +432,7 @@ def test_without_tails_they_are_a_gaussian_beside_which_there_may_be_outliers():
 def test_nothing_but_outliers_updates_nothing(n):
     joint, state = six_held(n)
     mean, cov = joint.mean, joint.cov
-    group = replace(SOME, z=SOME.z + 40.0)
-    decided = joint.decided([group], belief(joint, state))
+    decided = joint.decided([replace(SOME, z=SOME.z + 40.0)], belief(joint, state))
     assert (decided[0].log_odds < 0.0).all()
     found = joint.information(state, decided, Prior.exactly(SPACE, state))
     density = joint.correct(state, np.zeros_like(state), decided).all

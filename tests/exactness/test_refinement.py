@@ -153,8 +153,7 @@ def test_terms_linearised_elsewhere_stay_in_the_priors_chart(space, rng):
     group = scene.observe(model, np.array([0, 2]))
     prior = Prior(space, scene.state, rng.normal(scale=0.2, size=(3, d)), scene.prior(d, False).factor, centred=False)
     at = prior.mean + rng.normal(scale=0.2, size=(3, d))
-    held = scene.map()
-    marginals = Marginals(space, [held])
+    marginals = Marginals(space, [scene.map()])
     for increment in (prior.mean, at):
         proposed = refined(prior, marginals.linearised(prior, [group])(increment))
         kalmans = [
@@ -174,8 +173,7 @@ def _chart_ekf(scene, group, factor, base, mean, at, particle) -> Kalman:
         steps = 1e-6 * np.eye(d)
         plus, minus = (model.predict(scene.space.retract(base, at + sign * steps), point) for sign in (1, -1))
         G = model.residual(plus, minus).T / 2e-6
-        state = scene.space.retract(base, at)
-        nu, jac = linearise(model, scene.space, z, state, point)
+        nu, jac = linearise(model, scene.space, z, scene.space.retract(base, at), point)
         slope = known(jac.landmark)
         spread = slope @ records.cov[particle, landmark] @ slope.T
         kalman.update(nu + G @ (at - mean), G, R + spread)

@@ -47,8 +47,7 @@ def measured() -> tuple[list[models.Frame], models.Kalman, list[tuple[np.ndarray
 
 
 def run(frames: list[models.Frame], n: int, rng: np.random.Generator, **options) -> Filter:
-    motion = models.LinearMotion(F, L)
-    filter_ = Filter(motion, models.Scripted(), n=n, rng=rng, **options)
+    filter_ = Filter(models.LinearMotion(F, L), models.Scripted(), n=n, rng=rng, **options)
     for frame, u in zip(frames, INPUTS, strict=True):
         filter_.step(frame, u)
     return filter_

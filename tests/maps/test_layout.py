@@ -192,8 +192,7 @@ def id_arrays(draw):
     """Ids (K,) or (N, K); a landmark may be named several times."""
     count = draw(st.integers(1, 4))
     one = st.sampled_from([NULL, NEW, *HELD])
-    per_particle = draw(st.booleans())
-    shape = (N, count) if per_particle else (count,)
+    shape = (N, count) if draw(st.booleans()) else (count,)
     flat = draw(st.lists(one, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))
     return np.array(flat).reshape(shape)
 

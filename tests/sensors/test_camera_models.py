@@ -280,8 +280,7 @@ def covariances(rays: Rays, var_q: float) -> np.ndarray:
 def terms(model: CameraRay, rays: Rays, z: np.ndarray, var_q: float) -> Information:
     nu, jac = linearise(model, SE3, z, rays.state[:, None], rays.mean, rays.const)
     cov = innovation_covariance(known(jac.landmark), covariances(rays, var_q), np.broadcast_to(R, (5, 2, 2)))
-    prior = Prior.exactly(SE3, rays.state)
-    return information(nu, known(jac.state), cov, Gaussian(), prior)
+    return information(nu, known(jac.state), cov, Gaussian(), Prior.exactly(SE3, rays.state))
 
 
 @every_camera

@@ -34,8 +34,7 @@ def test_stereo_measures_three_numbers():
 
 
 def test_a_covariance_may_be_singular_and_there_must_be_frames_in_order():
-    good = frame(0, 2)
-    exact = replace(good, cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
+    exact = replace(frame(0, 2), cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
     assert log(exact).frames == [exact]
     with refused("walk holds no frame, expected at least one image"):
         log()

@@ -159,8 +159,7 @@ def test_scores_of_patches_without_contrast_equal_numpys():
 
 def test_covariance_is_the_residual_over_the_slopes(image):
     noisy = Waves(1).image(SHAPE, noise=5.0, rng=np.random.default_rng(2))
-    template = window(noisy, (60, 45), 11)
-    px, score, _, cov = one(image, template, (60.0, 45.0))
+    px, score, _, cov = one(image, window(noisy, (60, 45), 11), (60.0, 45.0))
     around = interpolated(image, px, 13)
     w = unit(around[1:-1, 1:-1])
     norm = np.linalg.norm(around[1:-1, 1:-1] - around[1:-1, 1:-1].mean())

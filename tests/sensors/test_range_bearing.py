@@ -84,8 +84,7 @@ def test_invert_undoes_predict_and_jacobians_are_the_numeric_ones(model, scene):
 
 def test_planar_measurement_by_hand():
     # Robot at (1, 2) looking along +y; the point is 3 m ahead and 4 m to the left.
-    pose = np.array([np.pi / 2, 1.0, 2.0])
-    z = RangeBearing(SE2).predict(pose, np.array([-3.0, 5.0]))
+    z = RangeBearing(SE2).predict(np.array([np.pi / 2, 1.0, 2.0]), np.array([-3.0, 5.0]))
     np.testing.assert_allclose(z, [5.0, np.arctan2(4.0, 3.0)])
     # A first estimate has r·σ_yaw across the line of sight, along it σ_r.
     cov = np.diag([0.1, 0.02]) ** 2

@@ -207,6 +207,13 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     assert np.mean(off["joint"]) < 0.025
 
 
+def test_what_looks_like_nothing_else_counts_at_first_whatever_its_depth(monkeypatch):
+    """A camera that is fast at first, at which no feature is placed, before and after its depths are known."""
+    monkeypatch.setattr("rbpf.systems.mono.active_search.WIDEST", 0.0)
+    unknown, given = (filter_opened(open_mono(sequence(6), SMALL, *of)).log["found"] for of in ((), (known_points(),)))
+    assert unknown[1:].min() > 10 and not given[1:].any()
+
+
 def test_what_is_often_missed_only_updates_the_map():
     run = filter_opened(open_mono(sequence(8), SMALL, known_points()))
     sensor, belief, used = run.system.sensor, run.system.filter.belief(), run.system.measurement.used

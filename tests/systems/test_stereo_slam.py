@@ -117,8 +117,7 @@ class TestBadPairs:
         slam = StereoSlam(pairs(2).rig, CONFIG)
         with pytest.raises(InputError, match="the camera takes 320x240 px, the images have 100x50 px"):
             slam.track(*np.zeros((2, 50, 100), dtype=np.uint8), 0)
-        image = next(pairs(2).frames())
-        slam.take(image)
+        slam.take(next(pairs(2).frames()))
         with pytest.raises(InputError, match="is given a FeatureFrame, and takes ImageFrame"):
             slam.take(FeatureFrame(1, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))))
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from examples.studies.point_worlds import MONO, Measuring, RoomWorld, simulate_features
+from rbpf import MonoSlam
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import velocity_walk
 from rbpf.runs.recordings import filter_features as run
@@ -13,7 +14,7 @@ from rbpf.runs.recordings import filter_opened, open_mono
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
-from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, gathered, optimum
+from rbpf.systems.mono.start.adjustment import SCALE_STD, Linearised, Structure, Window, gathered, minima, optimum
 from rbpf.systems.mono.start.unknown import UnknownStart
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, off, rows, without_known
@@ -158,6 +159,24 @@ def test_exact_pixels_do_not_begin_with_near_for_far(seed):
     assert off(done.log.poses, known(log.truth).poses, done.log.stamps_ns) < 0.003
 
 
+def test_particles_hold_two_shapes_until_one_is_left(monkeypatch):
+    """A second minimum half a metre to the side, as likely in the first adjustment and by 10 nats less so in the next."""
+    less = iter([0.0, 10.0])
+
+    def two(*arguments):
+        best = minima(*arguments)[0]
+        path = best.structure.path.copy()
+        path[1:, 4] += 0.5
+        return [best, replace(best, structure=replace(best.structure, path=path), cost=best.cost + next(less))]
+
+    monkeypatch.setattr("rbpf.systems.mono.start.unknown.minima", two)
+    slam, aside = MonoSlam(known(LOG.camera), SMALL), []
+    for frame in LOG.frames[:8]:
+        slam.take(frame)
+        aside.append(np.mean(slam.particle_poses()[:, 4] > 0.25))
+    assert aside[4] == 0.0 and aside[5] == 0.5 and aside[7] == 0.0 and next(less, None) is None
+
+
 # The optimum: its derivatives, its minimum, and what is drawn around it.
 
 LENS = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, distortion=(0.05, -0.02, 0.001, 0.0, 0.0))
@@ -208,8 +227,7 @@ def walking(seed: int, expected: VelocityConfig, frames: int = 12, noise_px: flo
         walk = velocity_walk(expected.walk_std(), dt) @ rng.normal(size=12)
         path.append(SE3.retract(path[-1], dt * velocity + walk[:6]))
         velocity = velocity + walk[6:]
-    truth = scene(seed)[1]
-    return seen(replace(truth, path=np.array(path)), noise_px, rng)
+    return seen(replace(scene(seed)[1], path=np.array(path)), noise_px, rng)
 
 
 @pytest.mark.slow

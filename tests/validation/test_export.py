@@ -98,8 +98,7 @@ def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
 
 
 def test_maps_and_paths_are_whole_ply_files(tmp_path):
-    log = scene(frames=4, points=10)
-    estimate = estimate_of(log)
+    estimate = estimate_of(scene(frames=4, points=10))
     export_ply(estimate, tmp_path)
     vertices = read_ply(tmp_path / MAP)["vertex"]
     places = np.stack([vertices[axis] for axis in "xyz"], axis=1)

@@ -143,8 +143,7 @@ def test_a_variable_that_is_not_determined_is_named():
     m = world(2, "range_bearing")
     m = replace(m, start=SE2.identity(), robot_from_sensor=SE2.identity())
     path, points = initial_estimate(m)
-    name = int(m.landmarks[m.steps == 0][0])
-    at_the_sensor = InitialEstimate(path, {**points, name: np.zeros(2)})
+    at_the_sensor = InitialEstimate(path, {**points, int(m.landmarks[m.steps == 0][0]): np.zeros(2)})
     with (
         np.errstate(all="ignore"),
         pytest.raises(InputError, match=r"not determine everything near (landmark|the pose of step) \d+;"),

@@ -77,8 +77,7 @@ def test_a_small_curved_world_has_the_evidence_and_the_mean_of_quadrature():
     grid = np.linspace(-6.0, 6.0, 81)
     u, a, b = (x.ravel() for x in np.meshgrid(grid, grid, grid, indexing="ij"))
     pose = SE2.retract(SE2.compose(m.start, m.deltas[0]), np.sqrt(m.covs[0, 1, 1]) * u[:, None] * [0.0, 1.0, 0.0])
-    std = np.sqrt(np.diagonal(m.cov_z[0]))
-    first = m.z[0] + np.stack([a, b], axis=-1) * std
+    first = m.z[0] + np.stack([a, b], axis=-1) * np.sqrt(np.diagonal(m.cov_z[0]))
     point = model.invert(m.start, first)
     each = -0.5 * (u**2 + a**2 + b**2) + np.log(first[:, 0] / r)
     each += log_normal(model.residual(m.z[1], model.predict(pose, point)), m.cov_z[1])

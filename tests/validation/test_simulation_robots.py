@@ -151,15 +151,13 @@ def measured(odometer: WheelOdometer, seed: int = 0, frames: int | None = None) 
 def test_without_errors_dead_reckoning_is_the_path() -> None:
     truth = world_from_camera(TOUR.world_from_robot)
     found = measured(EXACT).world_from_camera(truth[0])
-    error = SE3.local(truth, found)
-    assert np.abs(error).max() < 2e-4
+    assert np.abs(SE3.local(truth, found)).max() < 2e-4
     assert np.abs(SE3.translation(truth)[:, 2] - 1.0).max() < 1e-12
 
 
 def test_wrong_wheels_err_as_they_should() -> None:
     odometer = replace(EXACT, scale=0.02, inequality=0.003, wheelbase_error=0.05)
-    found = measured(odometer)
-    steps = SE2.log(found.delta)
+    steps = SE2.log(measured(odometer).delta)
     way = TOUR.way_m[-1]
     half = 0.5 * 0.003 * 0.5 * odometer.wheelbase_m * TOUR.heading_rad[-1]
     np.testing.assert_allclose(steps[:, 1].sum(), 1.02 * way + half, atol=1e-9)

@@ -93,8 +93,7 @@ def spoil_version(folder):
 
 
 def spoil_truth_of_another_run(folder):
-    path = load(folder).path
-    write_truth(folder, RunTruth(np.array([500]), path.world_from_body[:1]))
+    write_truth(folder, RunTruth(np.array([500]), load(folder).path.world_from_body[:1]))
 
 
 def spoil_measurements(folder):

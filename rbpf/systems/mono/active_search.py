@@ -120,14 +120,21 @@ class ActiveSearch:
         self.features = features
         self.table, self.config = table, config
         self.gate = gate or RobustMotionGate()
+        self.is_fast = (
+            False  #: Whether the first frames had one whose matches mostly had too uncertain a depth to be placed.
+        )
 
     @property
     def noise(self) -> np.ndarray:
         """Covariance (2, 2) of a found place, px²; as learnt, but never less than stated: nothing is missed."""
         return max(self.features.noise_factor, 1.0) * self.config.noise_px**2 * np.eye(2)
 
-    def run(self, image: np.ndarray, belief: Belief) -> SearchResult:
-        """Looks for features in an image (H, W) uint8; what is found agrees with one motion of the camera."""
+    def run(self, image: np.ndarray, belief: Belief, starting: bool = False) -> SearchResult:
+        """Looks for features in an image (H, W) uint8; what is found agrees with one motion of the camera.
+
+        While the first frames of a fast camera are adjusted (`starting`), a feature of any depth counts that looks like one
+        place alone.
+        """
         pose = self.features.pose(belief)
         started = time.perf_counter()
         rows, in_view = self.choose(pose)
@@ -158,7 +165,7 @@ class ActiveSearch:
             result.px[chosen], result.score[chosen] = px[better], score[better]
             result.found[chosen], result.ambiguous[chosen] = found[better], ambiguous[better]
         if result.found.any():
-            result = self._agreeing(image, belief, templates, result)
+            result = self._agreeing(image, belief, templates, result, starting)
             if self.config.planes == "learnt":
                 self._learn_planes(image, pose, result.features[result.found], result.px[result.found])
         return result
@@ -209,7 +216,9 @@ class ActiveSearch:
         accepted = (matches.score >= config.min_correlation) & self.features.camera.inside(matches.px)
         return matches.px, matches.score, accepted, matches.ratio >= AMBIGUOUS
 
-    def _agreeing(self, image: np.ndarray, belief: Belief, templates: np.ndarray, result: SearchResult) -> SearchResult:
+    def _agreeing(
+        self, image: np.ndarray, belief: Belief, templates: np.ndarray, result: SearchResult, starting: bool
+    ) -> SearchResult:
         """Only matches that agree with one motion; what was mistaken is looked for again where the motion puts it."""
         hits = np.flatnonzero(result.found)
         which, nu, jac, cov = self._innovations(belief, result.features[hits], result.px[hits])
@@ -217,8 +226,12 @@ class ActiveSearch:
         factor = np.asarray(factor[belief.mode if factor.shape[0] > 1 else 0])
         voting = self.table.voting(result.features[hits[which]], self.config.trusted_fraction)
         fit = self.gate.fit(nu, jac, cov, factor, voting)
-        found = np.zeros_like(result.found)
-        found[hits[which[(fit.squared <= self.config.gate_chi2) & self._placed(cov)]]] = True
+        found, hits = np.zeros_like(result.found), hits[which]
+        agree, placed = fit.squared <= self.config.gate_chi2, self._placed(cov)
+        self.is_fast |= starting and 2 * int((agree & placed).sum()) < int(agree.sum())
+        if starting and self.is_fast:
+            placed |= ~result.ambiguous[hits]
+        found[hits[agree & placed]] = True
         result = replace(result, found=found)
         missed = np.flatnonzero(result.ambiguous & ~found)
         if found.sum() < MIN_AGREEING or not missed.size:

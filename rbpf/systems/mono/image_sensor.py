@@ -43,6 +43,7 @@ class Measurement:
     known_px: np.ndarray | None = None
     #: the prior of the pose is a place that was recognised beyond doubt: less has to be found to confirm it.
     recognised: bool = False
+    starting: bool = False  #: the first frames are adjusted still, as depths are not known.
     search: SearchResult = field(default_factory=SearchResult)  #: what was looked for.
     #: features that the filter was given; none where too little agreed to be trusted.
     used: FeatureFrame = field(default_factory=no_features)
@@ -172,7 +173,7 @@ class ImageSensor(Sensor):
             frame.used = self._features(frame.stamp_ns, rows, px)
         elif self.table.alive.any():
             if frame.image is not None:
-                frame.search = self.search.run(frame.image, belief)
+                frame.search = self.search.run(frame.image, belief, frame.starting)
             self.bad_frames = self.bad_frames + 1 if self._too_little(frame.search, frame.recognised) else 0
             found = frame.search.found & (not self.bad_frames)
             frame.used = self._features(frame.stamp_ns, frame.search.features[found], frame.search.px[found])
@@ -266,13 +267,17 @@ class ImageSensor(Sensor):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return self.table.arrays() | {"search/bad_frames": np.array(self.bad_frames)}
+        return self.table.arrays() | {
+            "search/bad_frames": np.array(self.bad_frames),
+            "search/is_fast": np.array(self.search.is_fast),
+        }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         group = self.features.group
         self.table.restore(arrays, 0 if group is None else group.names.size)
         self.bad_frames = int(read_one(arrays, "search/bad_frames", integers(least=0)))
+        self.search.is_fast = bool(read_one(arrays, "search/is_fast", truths()))
 
     def _too_little(self, search: SearchResult, recognised: bool) -> bool:
         """Whether so little agrees that it may be chance. Once lost, more has to agree: the pose prior is wide.

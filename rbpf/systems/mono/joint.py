@@ -41,7 +41,7 @@ from rbpf.systems.mono.start.adjustment import (
     Window,
     between,
     gathered,
-    lowest,
+    minima,
     optimum,
     residual_px,
     tangents,
@@ -157,7 +157,7 @@ class HandOver:
     ) -> Adjusted | None:
         """The filter on a joint map, from an adjustment of the frames so far; None where they do not yet determine one.
 
-        With `reverse` near and far exchanged are tried, too (`lowest`). With `if_known`, half of the depths in view must be
+        With `reverse` near and far exchanged are tried, too (`minima`). With `if_known`, half of the depths in view must be
         known there; if not, the next adjustment starts from this one.
         """
         assert self._rays is not None
@@ -207,7 +207,7 @@ class HandOver:
             away = np.linalg.norm(SE3.inverse_transform(world_from_first, given.positions[row]), axis=1)
             mean, std = self._rays.prior(away)
             config = replace(config, inverse_depth=replace(config.inverse_depth, mean_per_m=mean, std_per_m=std))
-        best = lowest(seen, config, start, reverse)
+        best = min(minima(seen, config, start, reverse), key=lambda each: each.cost, default=None)
         if best is not None and self.noise is not None:
             # That noise is less than stated the first frames do not tell: errors grow as the view changes.
             noise_px = residual_px(seen, config, best)

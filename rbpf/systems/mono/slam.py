@@ -227,7 +227,7 @@ class MonoSlam(System):
             if frame.image is None and problem is None:
                 problem = "there is no image"
             messages += [] if problem is None else [problem]
-            measured, is_empty = Measurement(stamp_ns, image), image is None
+            measured, is_empty = Measurement(stamp_ns, image, starting=not self.start.over), image is None
         self.filter.sensors = [sensor if isinstance(measured, Measurement) else self._named]
 
         # 2. The first frame places the known points.

@@ -245,8 +245,7 @@ def test_without_a_camera_one_has_to_be_given(tmp_path):
         bag.image("/cam/image_raw", 1, grey(10, SIZE))
     with pytest.raises(InputError, match="expected the camera of /cam/image_raw in /cam/camera_info, found no"):
         open_images(tmp_path / "walk.bag")
-    camera = write_camera(tmp_path, fx=22.0)
-    assert open_images(tmp_path / "walk.bag", camera).camera.fx == 22.0
+    assert open_images(tmp_path / "walk.bag", write_camera(tmp_path, fx=22.0)).camera.fx == 22.0
 
 
 @pytest.mark.parametrize(
@@ -275,8 +274,7 @@ def test_a_pair_that_has_to_be_rectified_is_where_its_cameras_say(tmp_path):
     assert sequence.rig.baseline_m == pytest.approx(0.12)
     assert "are not rectified; their images are, by the two CameraInfo" in sequence.notes[0]
     # The baseline lies along the left camera's rows: only the right one is turned.
-    left = sequence.truth.poses[0]
-    np.testing.assert_allclose(SE3.log(left)[:3], 0.0, atol=1e-6)
+    np.testing.assert_allclose(SE3.log(sequence.truth.poses[0])[:3], 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

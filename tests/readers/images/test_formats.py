@@ -71,8 +71,7 @@ every_format = pytest.mark.parametrize("name", FORMATS)
 @every_format
 def test_a_small_sequence(tmp_path, name):
     make, stamps = FORMATS[name]
-    path = make(tmp_path / "desk")
-    sequence = open_images(path)
+    sequence = open_images(make(tmp_path / "desk"))
     assert sequence.name == ("walk" if name == "video" else "desk")
     assert sequence.stamps_ns.dtype == np.int64 and sequence.stamps_ns[:3].tolist() == stamps
     camera = sequence.camera

@@ -65,8 +65,7 @@ def test_a_pair_of_which_one_image_cannot_be_read_is_survived(tmp_path, camera, 
         file.write_bytes(b"")
     else:
         folders.write_image(file, np.zeros((16, 30), np.uint8))
-    sequence = open_stereo(tmp_path)
-    frames = list(sequence.frames())
+    frames = list(open_stereo(tmp_path).frames())
     assert len(frames) == 3 and frames[0].problem is None and frames[2].problem is None
     assert camera in frames[1].problem
     assert (frames[1].image is None) == (camera == "cam0")

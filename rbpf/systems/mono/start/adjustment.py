@@ -32,6 +32,7 @@ MIN_FRAMES = 3
 MIN_SHARED = 6
 SCALE_STD = 1e-4  #: Standard deviation to which the scale is held.
 MAX_STEPS, MIN_GAIN = 30, 1e-4  #: Steps of the adjustment at most, and the fraction of the cost that ends it.
+SAME_COST = 10.0 * MIN_GAIN  #: Two minima whose costs differ by less than this fraction are one.
 #: Times the noise: residuals that a minimum is far from, and by how much less each time on the way to it.
 FAR, NEARER = 1.5, 3.0
 _HALF = CAUCHY_SCALE**2 / 2.0
@@ -258,6 +259,11 @@ class Optimum:
     def _factor(self) -> np.ndarray:
         return np.asarray(cholesky(self.information, lower=True))
 
+    @cached_property
+    def log_weight(self) -> float:
+        """Logarithm of how much of the posterior lies about this minimum, up to what all minima share (P. Laplace)."""
+        return -self.cost - float(np.log(np.diag(self._factor)).sum())
+
     def paths(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Paths (n, T, 7) drawn from the Gaussian about the minimum (P. Laplace's approximation)."""
         whitened = rng.standard_normal((self.information.shape[0], n))
@@ -299,11 +305,14 @@ def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | Non
     return _downhill(now)
 
 
-def lowest(seen: Window, config: MonoConfig, start: Structure, reverse: bool) -> Optimum | None:
-    """`optimum`, and with `reverse` that from its result with near and far exchanged, too: the one of the lower cost."""
+def minima(seen: Window, config: MonoConfig, start: Structure, reverse: bool) -> list[Optimum]:
+    """Likeliest first: `optimum`, and with `reverse` that from its result with near and far exchanged, if it is another."""
     best = optimum(seen, config, start)
     other = optimum(seen, config, best.structure.reversed()) if reverse and best is not None else None
-    return best if best is None or other is None or best.cost <= other.cost else other
+    found = [each for each in (best, other) if each is not None]
+    if len(found) == 2 and abs(found[1].cost - found[0].cost) < SAME_COST * (1.0 + found[0].cost):
+        del found[1]
+    return sorted(found, key=lambda each: -each.log_weight)
 
 
 def _downhill(now: "Linearised") -> Optimum | None:

@@ -4,8 +4,9 @@ Before a camera has moved, nothing tells the depth of what it sees, and of a sce
 two motions look alike. Particles decide too early: each image alone tells little, those that happen to fit it survive,
 and what later images say comes too late. All first images together tell it well. So while depths are unknown, the
 frames until now are adjusted in one piece now and then ({py:mod}`rbpf.systems.mono.start.adjustment`), whole paths are drawn
-from the Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
-S. Sénécal, 2006). From when depths are known to some percent on, a joint map begins in their place, if there is to be one.
+from the Gaussian about the minimum, or about both where two may be it, and each particle's map is that of its path (a block
+move: A. Doucet, M. Briers and S. Sénécal, 2006). From when one is left and knows depths to some percent on, a joint map
+begins in their place, if there is to be one.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +22,7 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, lowest
+from rbpf.systems.mono.start.adjustment import Adjusted, FirstFrames, between, gathered, minima
 from rbpf.systems.system import Revision
 
 WELL_KNOWN = 3.0  #: Times `depth_std_ratio`: enough where a later adjustment knows depths no better.
@@ -40,7 +41,12 @@ class UnknownStart(Kept):
     points and without a map.
     """
 
-    kept: ClassVar = {"over": truths(), "_next": integers(least=0), "_ratio": numbers(values="any")}
+    kept: ClassVar = {
+        "over": truths(),
+        "_next": integers(least=0),
+        "_ratio": numbers(values="any"),
+        "_is_open": truths(),
+    }
     prefix = "start/"
 
     def __init__(
@@ -55,6 +61,7 @@ class UnknownStart(Kept):
         #: Whether depths are known well enough, and the filter goes on alone.
         self.over = not (needed and config.start.batch_adjust)
         self._next = config.start.first_adjustment
+        self._is_open = False  # whether the particles hold two shapes, by the last adjustment
         self._ratio = np.inf  # of depths' standard deviations to depths, by the last adjustment
 
     def after_frame(
@@ -84,26 +91,37 @@ class UnknownStart(Kept):
         steps, names, seen, guess = found
         # As long as depths are not known, near and far exchanged may be as good, and another minimum.
         start, before, known = self.config.start, self._ratio, WELL_KNOWN * self.config.start.depth_std_ratio
-        best = lowest(seen, self.config, guess, before >= known) if seen.is_connected() else None
-        if best is None:
+        reverse = before >= known or self._is_open
+        shapes = minima(seen, self.config, guess, reverse) if seen.is_connected() else []
+        if not shapes:
             self.over = True
             return None, None if is_joint else DISCONNECTED
+        # Which of two shapes it is has been told once the likelier one has the lower cost, too: the weights hang on the noise.
+        lowest = min(shapes, key=lambda shape: shape.cost)
+        weights = np.exp([shape.log_weight - shapes[0].log_weight for shape in shapes])
+        shares = np.diff(np.rint(filter_.n * np.cumsum(weights) / weights.sum()).astype(int), prepend=0).tolist()
+        self._is_open = count < start.max_frames and (shares[0] < filter_.n or lowest is not shapes[0])
+        best = shapes[0] if self._is_open else lowest
         self._ratio = best.depth_std_ratio(np.isin(names, first.seen[-1].landmarks))
-        self.over = self._ratio < start.depth_std_ratio or (count >= start.max_frames and before <= self._ratio < known)
+        is_known = self._ratio < start.depth_std_ratio
+        self.over = not self._is_open and (is_known or (count >= start.max_frames and before <= self._ratio < known))
 
         # What is known so well one Gaussian holds better than particles; it is begun anew until the start is over.
-        if become is not None and (is_joint or self._ratio < known):
-            return become(filter_, before >= known), None
+        if become is not None and (is_joint or (self._ratio < known and not self._is_open)):
+            return become(filter_, reverse), None
 
-        # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
+        # Whole paths are drawn from the Gaussians about the minima, from each by its weight, and a filter follows them.
         stamps = np.array(first.stamps_ns)
-        drawn = best.paths(filter_.n, filter_.rng)
-        paths = between(stamps[steps], drawn, stamps)
+        parts = zip(shapes, shares, strict=True) if self._is_open else [(best, filter_.n)]
+        drawn = [shape.paths(share, filter_.rng) for shape, share in parts if share]
+        paths = between(stamps[steps], np.concatenate(drawn), stamps)
         filter_ = self._along(paths, set(steps.tolist()), filter_, first.seen)
         equal = uniform_log_weights(paths.shape[1])
         means = [mixture_estimate(Prior.exactly(SE3, poses), None, equal) for poses in paths]
         poses, covs = np.array([each.mean for each in means]), np.array([each.cov for each in means])
         first.path, first.last = list(poses), poses[-1]
+        if self._is_open:  # the mean of two shapes is none
+            first.path = list(between(stamps[steps], best.structure.path[None], stamps)[:, 0])
         seen_first = first.seen_first(paths[:, filter_.belief().mode])
         return Adjusted(filter_, Revision(stamps, poses, covs), seen_first), None
 
