@@ -81,8 +81,9 @@ def finish_run(
     if rerun is not None:
         write_rerun(run, rerun)
     verdict = validate(out, "groundtruth") if (out / TRUTH).is_file() else write_report(out)
-    unsolved = [f"There is no batch optimum: {entries['batch_problem']}"] if "batch_problem" in entries else []
-    said = [*entries.get("remarks", ()), *verdict.said, *unsolved]
+    why = entries.get("batch_problem")
+    alone = [] if why is None else [f"It is not compared with a batch optimum: {why}"]
+    said = [*entries.get("remarks", ()), *verdict.said, *alone]
     return entries | {"path_grade": verdict.path.grade, "verdict": verdict.trust, "sentences": said}
 
 

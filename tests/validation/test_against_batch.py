@@ -286,3 +286,7 @@ def test_the_batch_is_moved_as_the_filter_is(moved_run):
     assert np.abs(lines["filter"][truth.rows] - lines["truth"]).max() < 1.0
     assert "truth's world" in figure.get_suptitle()
     assert len(read_tum(moved_run / "batch.tum")) == truth.rows.size
+    for part in (batch, batch.take(np.arange(3))):  # of which the few fit anywhere
+        write_tum(moved_run / "batch.tum", part)
+        figures = compare_with_truth(load(moved_run), truth_errors(load(moved_run))).figures
+        assert ("batch_position_rmse_m" in figures) == (part is batch)

@@ -120,9 +120,8 @@ class ActiveSearch:
         self.features = features
         self.table, self.config = table, config
         self.gate = gate or RobustMotionGate()
-        self.is_fast = (
-            False  #: Whether the first frames had one whose matches mostly had too uncertain a depth to be placed.
-        )
+        #: Whether a frame of the start had matches of which most had a depth too uncertain to be placed.
+        self.is_fast = False
 
     @property
     def noise(self) -> np.ndarray:
