@@ -174,8 +174,7 @@ def test_a_search_finds_a_pose_that_no_gradient_leads_to(off):
     start = SE2.retract(np.zeros((2, 3)), np.array(off))
     std = np.array([0.2, 0.2, 0.2])
     proposed, fit = grid.match(Prior(SE2, start, np.zeros((1, 3)), np.diag(std)[None]), beams)
-    found = SE2.retract(start, proposed.mean * std)
-    assert abs(found).max() < 0.02 and fit.min() > 0.9
+    assert abs(SE2.retract(start, proposed.mean * std)).max() < 0.02 and fit.min() > 0.9
 
 
 def test_weights_and_posterior_are_those_of_the_integral_over_the_pose():

@@ -200,8 +200,7 @@ def id_arrays(draw):
 @given(st.lists(id_arrays(), min_size=1, max_size=3))
 def test_every_row_appears_once_and_overlaps_are_stacked(all_ids):
     plan = make_plan([group(ids) for ids in all_ids], N, kinds, PLAIN)
-    count = max(ids.shape[-1] for ids in all_ids)
-    found = matrix(rows_of(plan), count, len(all_ids))
+    found = matrix(rows_of(plan), max(ids.shape[-1] for ids in all_ids), len(all_ids))
     for g, ids in enumerate(all_ids):
         expected = np.broadcast_to(np.where(ids >= 0, ids, NULL), (N, ids.shape[-1]))
         np.testing.assert_array_equal(found[g, :, : ids.shape[-1]], expected)

@@ -313,8 +313,7 @@ def test_what_is_left_is_the_distance_from_the_line(camera):
     along = known(full.landmark)[..., 2]
     normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.linalg.norm(along, axis=-1)[..., None]
     y = (normal * CameraRay(camera).innovation(z, *at)).sum(axis=-1)
-    found = EpipolarRay(camera).innovation(z, *at)
-    np.testing.assert_allclose(found, y[..., None] * normal, atol=1e-9)
+    np.testing.assert_allclose(EpipolarRay(camera).innovation(z, *at), y[..., None] * normal, atol=1e-9)
     projected = known(EpipolarRay(camera).jacobians(*at))
     np.testing.assert_allclose(known(projected.landmark)[..., 2], 0.0, atol=1e-9)
     row = (normal[..., None, :] @ known(full.state))[..., 0, :]

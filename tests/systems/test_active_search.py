@@ -17,7 +17,7 @@ from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.active_search import CAUCHY_SCALE, ROUNDS, ActiveSearch, RobustMotionGate, SearchResult
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX
-from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.image_sensor import ImageSensor, inside_bars
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
@@ -205,6 +205,17 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     assert np.mean(off["usual"]) < 0.02 and np.median(off["usual"]) < 0.015
     assert np.mean(off["credulous"]) > 2.0 * np.mean(off["usual"])
     assert np.mean(off["joint"]) < 0.025
+
+
+def test_no_feature_begins_at_a_bar():
+    """A letterbox, with noise as compression leaves it: where things end at its bars, corners slide along them."""
+    noise = np.random.default_rng(0).integers(0, 8, (240, 320), dtype=np.uint8)
+    is_picture = (np.arange(240) >= 30)[:, None] & (np.arange(320) < 280)
+    images = sequence(6, lambda t, image: np.where(is_picture, image, noise))
+    px = filter_opened(open_mono(images, SMALL)).system.sensor.table.first_px
+    least = PATCH_HALF_PX + 1
+    assert len(px) > 20 and px[:, 1].min() >= 30 + least and px[:, 0].max() < 280 - least
+    assert inside_bars(np.zeros((9, 9), dtype=np.uint8), 2, None).all() and inside_bars(noise * 30, 2, None) is None
 
 
 def test_what_looks_like_nothing_else_counts_at_first_whatever_its_depth(monkeypatch):

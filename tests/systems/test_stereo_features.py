@@ -71,8 +71,7 @@ def nees_of(run: Run) -> float:
 
 def test_beside_the_batch(log, run):
     """The filter sees the past only, the batch all of it; the odometry forgets."""
-    start = InitialEstimate(run.log.poses, {})
-    batch = solve_features(log, start, marginals=False).world_from_body
+    batch = solve_features(log, InitialEstimate(run.log.poses, {}), marginals=False).world_from_body
     batch = SE3.between(batch[0], batch)
     ours, best, alone = (rmse(log, poses) for poses in (run.log.poses, batch, run.log["odometry"]))
     assert ours < 2.5 * best

@@ -202,8 +202,7 @@ def scene(seed: int = 0, noise_px: float = 0.5) -> tuple[Window, Structure]:
     direction = np.append(rng.uniform(-0.4, 0.4, (FEATURES, 2)), np.ones((FEATURES, 1)), axis=1)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     moved = np.linspace(0.0, 1.0, FRAMES)[:, None] * [0.05, -0.1, 0.02, 0.15, 0.05, 0.03]
-    path = SE3.retract(SE3.identity(), moved)
-    return seen(Structure(path, direction, inverse), noise_px, rng)
+    return seen(Structure(SE3.retract(SE3.identity(), moved), direction, inverse), noise_px, rng)
 
 
 def test_a_camera_that_seems_to_stand_still_is_found_to_have_moved():

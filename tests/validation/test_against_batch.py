@@ -104,8 +104,7 @@ def test_known_points_make_one_world_of_filter_and_batch():
 def camera_problem():
     """A log without known points, and its optimum as if a filter had found it, in another scale."""
     log = replace(scene(frames=7, points=18, known=0, seed=3), known=None)
-    optimum = solve_problem(log, log.truth.poses)
-    return log, optimum.estimate
+    return log, solve_problem(log, log.truth.poses).estimate
 
 
 def scaled_by(estimate, scale):
@@ -143,8 +142,7 @@ def test_without_known_points_neither_the_scale_nor_its_uncertainty_matters(std_
 
 def test_a_covariance_is_carried_to_the_chart_at_the_other_pose():
     _, estimate = camera_problem()
-    far = np.array([0.4, -0.3, 0.5, 0.2, 0.1, -0.3])
-    there = SE3.retract(estimate.world_from_body[-1:], far)
+    there = SE3.retract(estimate.world_from_body[-1:], np.array([0.4, -0.3, 0.5, 0.2, 0.1, -0.3]))
     cov = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
     estimate = replace(estimate, cov_poses=np.repeat(cov[None], 7, axis=0))
     other = replace(estimate, world_from_body=np.concatenate([estimate.world_from_body[:-1], there]))

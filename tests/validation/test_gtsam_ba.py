@@ -38,8 +38,7 @@ def test_the_start_is_known_and_a_robot_that_cannot_slip_does_not():
     np.testing.assert_array_equal(found.cov_poses[0], np.zeros((3, 3)))
     np.testing.assert_allclose(found.world_from_body[0], m.start, atol=1e-12)
     predicted = m.space.compose(found.world_from_body[:-1], m.deltas)
-    slip = np.linalg.eigh(m.covs[0])[1][:, 0]
-    slipped = m.space.local(predicted, found.world_from_body[1:]) @ slip
+    slipped = m.space.local(predicted, found.world_from_body[1:]) @ np.linalg.eigh(m.covs[0])[1][:, 0]
     assert np.abs(slipped).max() < 1e-9
 
 

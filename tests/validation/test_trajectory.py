@@ -28,8 +28,7 @@ def rows(trajectory: Trajectory) -> list[int]:
 
 def test_each_pose_takes_the_nearest_and_a_contested_one_goes_to_the_nearest():
     estimate = at_times([0, 30, 33, 60, 200])
-    reference = at_times([4, 31, 50, 65, 100])
-    left, right = associate(estimate, reference)
+    left, right = associate(estimate, at_times([4, 31, 50, 65, 100]))
     assert rows(left) == [0, 1, 3]
     assert rows(right) == [0, 1, 3]
 

@@ -33,6 +33,20 @@ def no_features(stamp_ns: int = 0) -> FeatureFrame:
     return FeatureFrame(stamp_ns, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
+def inside_bars(image: np.ndarray, border_px: int, within: np.ndarray | None) -> np.ndarray | None:
+    """What of a mask (H, W), or of everywhere, is so far from uniform bars at an image's edges (H, W), as of a letterbox."""
+    if all(np.ptp(line) > UNIFORM for line in (image[0], image[-1], image[:, 0], image[:, -1])):
+        return within
+    inside = np.ones(image.shape, dtype=bool) if within is None else within.copy()
+    for axis, across in ((1, inside), (0, inside.T)):
+        lines = np.flatnonzero(np.ptp(image, axis=axis) > UNIFORM)
+        if lines.size and lines[0] > 0:
+            across[: lines[0] + border_px] = False
+        if lines.size and lines[-1] < len(across) - 1:
+            across[lines[-1] + 1 - border_px :] = False
+    return inside
+
+
 @dataclass
 class Measurement:
     """One image on its way through the filter's step: what the sensor is given, and what it has found."""
@@ -58,6 +72,7 @@ class Measurement:
         return FeatureFrame(self.stamp_ns, *map(np.concatenate, pairs))
 
 
+UNIFORM = 12  #: Grey levels between which all of a row or column of a bar are, whatever the compression left.
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)  #: What a checkpoint holds where there was none.
 
 
@@ -325,7 +340,8 @@ class ImageSensor(Sensor):
         if room <= 0:
             return no_features(frame.stamp_ns)
         occupied, border_px = np.concatenate([used.z, in_view]), PATCH_HALF_PX + 1.0
-        found = self.detector.detect(image, room, occupied, config.spacing_px, border_px, self._within)
+        within = inside_bars(image, int(border_px), self._within)
+        found = self.detector.detect(image, room, occupied, config.spacing_px, border_px, within)
         px = found.px
         px = px[np.isfinite(self.camera.unproject(px)).all(axis=1)]
         if not px.shape[0]:

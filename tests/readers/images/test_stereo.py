@@ -194,6 +194,5 @@ def test_what_a_wide_pair_does_not_see_is_black():
     columns, rows = rectification(WIDE_LEFT, WIDE_RIGHT, turned, "here")[2][1]
     np.testing.assert_array_equal(columns == OUTSIDE, rows == OUTSIDE)
     assert 0.02 < (columns == OUTSIDE).mean() < 0.5
-    white = np.full((120, 160), 255, np.uint8)
-    image = cv2.remap(white, columns, rows, cv2.INTER_LINEAR)
+    image = cv2.remap(np.full((120, 160), 255, np.uint8), columns, rows, cv2.INTER_LINEAR)
     assert (image[columns == OUTSIDE] == 0).all() and image[60, 80] == 255
