@@ -82,8 +82,8 @@ def finish_run(
         write_rerun(run, rerun)
     verdict = validate(out, "groundtruth") if (out / TRUTH).is_file() else write_report(out)
     why = entries.get("batch_problem")
-    alone = [] if why is None else [f"It is not compared with a batch optimum: {why}"]
-    said = [*entries.get("remarks", ()), *verdict.said, *alone]
+    uncompared = [] if why is None else [f"It is not compared with a batch optimum: {why}"]
+    said = [*entries.get("remarks", ()), *verdict.said, *uncompared]
     return entries | {"path_grade": verdict.path.grade, "verdict": verdict.trust, "sentences": said}
 
 

@@ -130,7 +130,7 @@ def reproduce_e06(figures: dict[str, float]) -> None:
     assert of("observations per frame") > 20
     assert of("frames in which the camera was lost") == 0
     assert of("epipolar lines longer than 2 px") >= 3
-    assert of("distance of what is found from its epipolar line") < 3.0
+    assert of("distance of what is found from its epipolar line") < 1.0
     assert of("epipolar constraint against none") < 0.5
     assert of("first observation: divergence") > 5.0  # half the resolution sees half the parallax
 

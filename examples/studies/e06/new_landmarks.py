@@ -61,7 +61,8 @@ def line_lengths(observation: Mapping[str, np.ndarray]) -> np.ndarray:
 @cache
 def round_a_desk(setting: Setting) -> tuple[ImageSequence, Run, Shown]:
     """The sequence of figures 5, 7 and 8, its run, and the frame with most epipolar lines with the map of that moment."""
-    world = LoopOverDesk(frames=50, texel_m=0.003) if setting.quick else LoopOverDesk()
+    # A part of the loop, at the pace of all of it.
+    world = LoopOverDesk(frames=50, laps=0.12, texel_m=0.003) if setting.quick else LoopOverDesk()
     sequence, known = setting.sequence("loop", world)
     best: list[Shown] = []
 

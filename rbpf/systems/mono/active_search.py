@@ -15,7 +15,6 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.models import Belief
 from rbpf.kernels.dense import fit_robustly
-from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
@@ -224,10 +223,8 @@ class ActiveSearch:
         which, nu, jac, cov = self._innovations(belief, result.features[hits], result.px[hits])
         factor = belief.prior.spread(belief.prior.mean)
         factor = np.asarray(factor[belief.mode if factor.shape[0] > 1 else 0])
-        # Particles with maps of their own outvote what begins on a thing that moves; one Gaussian is taken along.
-        voting = self.table.voting if isinstance(belief.map, JointMap) else self.table.trusted
-        by = voting(result.features[hits[which]], self.config.trusted_fraction)
-        fit = self.gate.fit(nu, jac, cov, factor, by)
+        voting = self.table.voting(result.features[hits[which]], self.config.trusted_fraction)
+        fit = self.gate.fit(nu, jac, cov, factor, voting)
         found, hits = np.zeros_like(result.found), hits[which]
         agree, placed = fit.squared <= self.config.gate_chi2, self._placed(cov)
         self.is_fast |= starting and 2 * int((agree & placed).sum()) < int(agree.sum())

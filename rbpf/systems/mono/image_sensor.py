@@ -25,6 +25,7 @@ from rbpf.systems.mono.feature_table import PATCH_HALF_PX, FeatureTable, view_ch
 #: Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped.
 MIN_FIXED = 4
 MIN_CONTRAST = 10  #: Grey levels that are all nearer to each other are those of a lens cap.
+UNIFORM = 12  #: Grey levels between which all of a row or column of a bar are, whatever the compression left.
 MAX_REPEATS = 5  #: Times that an image may come again: drivers repeat single images when the camera is late.
 
 
@@ -72,7 +73,6 @@ class Measurement:
         return FeatureFrame(self.stamp_ns, *map(np.concatenate, pairs))
 
 
-UNIFORM = 12  #: Grey levels between which all of a row or column of a bar are, whatever the compression left.
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)  #: What a checkpoint holds where there was none.
 
 
