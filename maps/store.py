@@ -234,19 +234,20 @@ class SharedStore:
         """Stores new columns (K, fields, N) and returns their ids (K,): those given, none of them alive, or new ones."""
         self._checked(records)
         ids = self.columns.add(len(records), ids)
-        self._occupy(ids, records)
+        self._occupy(ids, self.columns.rows(ids), records)
         return ids
 
     def remove(self, columns: np.ndarray) -> None:
         gone = np.unique(columns)
-        self._vacate(gone)
+        self._vacate(gone, self.columns.rows(gone))
         self.columns.remove(gone)
 
     def replace(self, columns: np.ndarray, records: np.ndarray) -> None:
         """Overwrites columns (K,), each once, in all particles (K, fields, N); the record size may change."""
         self._checked(records)
-        self._vacate(columns)
-        self._occupy(columns, records)
+        rows = self.columns.rows(columns)
+        self._vacate(columns, rows)
+        self._occupy(columns, rows, records)
 
     def read(self, column: int, particles: np.ndarray | slice = ALL) -> np.ndarray:
         """Records of all or some particles, (fields, N)."""
@@ -282,7 +283,9 @@ class SharedStore:
 
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
-        at = self.columns.rows(columns)
+        return self._opened(columns, self.columns.rows(columns))
+
+    def _opened(self, columns: np.ndarray, at: np.ndarray) -> Access:
         slabs = self.columns.slab[at]
         if slabs.min() < 0:
             cold = np.unique(columns[slabs < 0])
@@ -302,16 +305,15 @@ class SharedStore:
 
         A column named twice is read again from where it was first written.
         """
-        access = self.access(columns)
-        now = self.lineage.generation
-        at = self.columns.rows(columns)
-        generations = self.columns.generation[at]
-        if (generations == now).all():
+        at, now = self.columns.rows(columns), self.lineage.generation
+        access, generations = self._opened(columns, at), self.columns.generation[at]
+        is_stale = generations != now
+        if not is_stale.any():
             return access, access.slabs
-        named = columns.tolist()
-        past = dict(sorted(zip(named, generations.tolist(), strict=True)))
+        past = dict(zip(columns.tolist(), generations.tolist(), strict=True))
         stale = [column for column, generation in past.items() if generation != now]
-        rows, pool = self.columns.rows(np.array(stale)), self._pool(int(at[0]))
+        is_distinct = len(past) == columns.size
+        rows, pool = at[is_stale] if is_distinct else self.columns.rows(np.array(stale)), self._pool(int(at[0]))
         old = self.columns.slab[rows].copy()
         self.columns.slab[rows] = pool.take(len(stale))
         pool.give(old)
@@ -321,7 +323,7 @@ class SharedStore:
         self.columns.generation[rows] = now
         self._join(stale, now)
         targets = self.columns.slab[at]
-        if len(past) == columns.size:
+        if is_distinct:
             return access._replace(pool=pool.data), targets
         _, first = np.unique(columns, return_index=True)
         again = np.ones(columns.size, dtype=bool)
@@ -418,10 +420,9 @@ class SharedStore:
         if records.ndim != 3 or records.shape[1] == 0 or records.shape[2] != self.n:
             raise InputError(f"landmark records must be (K, fields, {self.n}), got {records.shape}")
 
-    def _occupy(self, columns: np.ndarray, records: np.ndarray) -> None:
+    def _occupy(self, columns: np.ndarray, rows: np.ndarray, records: np.ndarray) -> None:
         if not columns.size:
             return
-        rows = self.columns.rows(columns)
         self.columns.fields[rows], self.columns.generation[rows] = records.shape[1], self.lineage.generation
         self._fill(rows, records)
         self._join(columns.tolist(), self.lineage.generation)
@@ -431,8 +432,8 @@ class SharedStore:
         self.columns.slab[rows] = slabs = pool.take(rows.size)
         pool.data[slabs] = records
 
-    def _vacate(self, columns: np.ndarray) -> None:
-        for column, row in zip(columns.tolist(), self.columns.rows(columns).tolist(), strict=True):
+    def _vacate(self, columns: np.ndarray, rows: np.ndarray) -> None:
+        for column, row in zip(columns.tolist(), rows.tolist(), strict=True):
             self._leave(int(self.columns.generation[row]), [column])
             if self._cold.pop(column, None) is None:
                 self._pool(row).give(self.columns.slab[row : row + 1])
