@@ -72,9 +72,9 @@ def test_construction(message):
 
 ODOMETRY = [
     (np.zeros(2), np.eye(3), r"odometry needs delta \(3,\) and cov \(3, 3\), got \(2,\)"),
-    (np.zeros(3), -np.eye(3), "the covariance of the odometry is not one: .*negative eigenvalue"),
-    (np.zeros(3), np.triu(np.ones((3, 3))), "the covariance of the odometry is not one: .*not symmetric"),
-    (np.zeros(3), np.full((3, 3), np.nan), "the covariance of the odometry is not one: .*not finite"),
+    (np.zeros(3), -np.eye(3), "the covariance of the odometry is not valid: .*negative eigenvalue"),
+    (np.zeros(3), np.triu(np.ones((3, 3))), "the covariance of the odometry is not valid: .*not symmetric"),
+    (np.zeros(3), np.full((3, 3), np.nan), "the covariance of the odometry is not valid: .*not finite"),
     (np.array([0.0, np.nan, 0.0]), np.eye(3), "the odometry increment .* holds NaN or infinity"),
 ]
 
@@ -100,7 +100,7 @@ class TestMeasurements:
         [
             ([[np.nan]], None, "a measurement of Curved or its covariance is not finite"),
             ([[1.0]], [[[np.inf]]], "a measurement of Curved or its covariance is not finite"),
-            ([[1.0]], [[[-1.0]]], "the noise of Curved has no covariance: .*negative eigenvalue"),
+            ([[1.0]], [[[-1.0]]], "the noise covariance of Curved is not valid: .*negative eigenvalue"),
             ([[1.0, 2.0]], None, r"Curved measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)"),
             ([[1.0]], [[1.0]], r"got \(1, 1\) and \(1, 1\)"),
         ],
@@ -230,7 +230,7 @@ class TestLandmarks:
         for changed, match in (
             ({"mask": np.ones((N, 1), dtype=bool)}, "only need a map with evidence=True"),
             ({"z": np.array([[np.nan, 0.0]])}, "a new Point has a mean or covariance that is not finite"),
-            ({"model": Bearing(SE2)}, r"Bearing cannot start landmarks: override invert or"),
+            ({"model": Bearing(SE2)}, r"Bearing cannot initialise landmarks: override invert or"),
         ):
             with pytest.raises(InputError, match=match):
                 held.add(replace(new, **changed), filter_.particles.state)

@@ -97,7 +97,7 @@ def test_evidence_that_collapses(proposal):
     assert not filter_.health.findings
     with pytest.warns(HealthWarning):
         follow(filter_, np.linspace(40.0, 400.0, 30))
-    assert "the log-evidence of one number fell from" in filter_.health.findings["evidence"]
+    assert "the log-evidence per component fell from" in filter_.health.findings["evidence"]
 
 
 def test_sound_filters_are_not_suspected():

@@ -309,7 +309,7 @@ def test_what_a_joint_map_does_not_take(world):
     with pytest.raises(InputError, match=r"holds Point\(2\)"):
         plane(Consolidation(1)).step(Frame([], [NewLandmarks(z, covs, Relative(), Point(3))]))
     space = Euclidean(2)
-    with pytest.raises(InputError, match="LandmarkMap cannot take in"):
+    with pytest.raises(InputError, match="LandmarkMap cannot be consolidated"):
         Filter(Walk(), Scripted(), LandmarkMap(space), n=5, consolidation=Consolidation(1)).step(Frame())
     with pytest.raises(InputError, match="window must be a whole number"):
         Consolidation(window=0)
