@@ -145,7 +145,7 @@ class PairConfig(Ranged):
     def noise(self, scale: np.ndarray, place: np.ndarray | None = None) -> np.ndarray:
         """Covariances (K, 3, 3) of (u_left, v, u_right) for keypoints of scales (K,), px².
 
-        place` (K, 2, 2) is the covariance of the left pixels, by default that of a keypoint of this scale.
+        `place` (K, 2, 2) is the covariance of the left pixels, by default that of a keypoint of this scale.
         """
         if place is None:
             place = (self.place_px**2 + (self.place_per_scale * scale) ** 2)[:, None, None] * np.eye(2)

@@ -212,7 +212,7 @@ class Filter:
             self.lineage.advance(ancestors)
             self.marginals.resample(ancestors)
             if self._draws and proposed.nis is None:
-                # MotionModel.sample` did not depend on the observations: each descendant draws its own sample.
+                # `MotionModel.sample` did not depend on the observations: each descendant draws its own sample.
                 self.particles = Particles(take(self.particles.state, ancestors), log_weights)
                 prior = self._predict(control, dt)
             else:

@@ -60,7 +60,7 @@ def test_a_filter_that_has_diverged_says_so():
         filter_ = driven(50, 100)
     assert findings(filter_) >= {"innovations", "copies"}
     assert [str(warning.message) for warning in caught] == list(filter_.health.findings.values()), "each is told once"
-    assert "step 200: what is measured is " in filter_.health.findings["innovations"]
+    assert "step 200: squared innovations are " in filter_.health.findings["innovations"]
     assert "have had all the weight" in filter_.health.findings.get("weights", "have had all the weight")
 
 

@@ -299,7 +299,7 @@ def test_what_a_joint_map_does_not_take(world):
     refused = {
         "one association for all particles": replace(group, ids=np.zeros((12, 1), dtype=np.int64)),
         "update state and landmarks": replace(group, updates=frozenset({Part.STATE})),
-        "holds no landmark 7": replace(group, ids=one + 7),
+        "has no landmark 7": replace(group, ids=one + 7),
     }
     for words, wrong in refused.items():
         filter_ = plane(Consolidation(1))

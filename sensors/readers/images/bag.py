@@ -441,7 +441,7 @@ def _stamps_and_first(bag: Bag, topic: str) -> tuple[np.ndarray, tuple[int, int]
 class BagImages(Source):
     """Images of one topic, or pairs of two topics, left first, of height and width `shape`, at times (T,).
 
-    rows` (T,) are, for each topic, the increasing indices of the messages used.
+    `rows` (T,) are, for each topic, the increasing indices of the messages used.
     """
 
     path: Path
