@@ -108,8 +108,8 @@ def test_an_option_that_is_out_of_its_range(capsys, arguments, words):
         ("a: " + "[" * 5000 + "\n", "line 1: .* nested"),
         ("particles: !!python/object/apply:os.system ['touch pwned']\n", "line 1: expected plain values"),
         ("a: &a [x]\nb: [*a, *a]\n", "alias"),
-        ("particles: !!timestamp x\n", "none of its type"),
-        ("particles: 2001-99-99\n", "none of its type"),
+        ("particles: !!timestamp x\n", "does not fit its type"),
+        ("particles: 2001-99-99\n", "does not fit its type"),
         ("#" * (2 << 20), "larger than 1 MiB"),
     ],
 )
