@@ -67,7 +67,7 @@ class MarginalVelocity(MotionModel):
         coupling, factor = dt * np.eye(6)[None], velocity_walk(self.std_walk, dt)
         keeps = np.eye(6)[None]
         if control is not None:
-            state, factor = _placed(state, control), _with_prior(factor, control)
+            state, factor = _reset_pose(state, control), _with_prior(factor, control)
             coupling = np.zeros((1, 6, 6))
             keeps = keeps if control.std_velocity is None else np.zeros((1, 6, 6))
         if k := self.constants:
@@ -104,7 +104,7 @@ class SampledVelocity(MotionModel):
         placed, velocity = state[:, :7], state[:, 7:]
         if control is not None:
             stopped = control.std_velocity is not None
-            mean = np.concatenate([_placed(placed, control), 0.0 * velocity if stopped else velocity], axis=1)
+            mean = np.concatenate([_reset_pose(placed, control), 0.0 * velocity if stopped else velocity], axis=1)
             factor = _with_prior(np.zeros((12, 12)), control)
             if not stopped:
                 factor[6:, 6:] = np.diag(self.std_start)
@@ -115,7 +115,7 @@ class SampledVelocity(MotionModel):
         return Transition(np.concatenate([SE3.retract(placed, step), velocity], axis=1), factor)
 
 
-def _placed(state: np.ndarray, prior: PosePrior) -> np.ndarray:
+def _reset_pose(state: np.ndarray, prior: PosePrior) -> np.ndarray:
     if prior.mean.shape not in ((7,), state.shape) or prior.cov.shape != (6, 6) or not np.isfinite(prior.mean).all():
         raise InputError(f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {prior.mean} and {prior.cov.shape}")
     return np.broadcast_to(SE3.normalise(prior.mean), state.shape).copy()

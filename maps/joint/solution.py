@@ -214,7 +214,7 @@ def solve(
     place = {landmark: row for row, landmark in enumerate(ids.tolist())}
     first = d * len(maps)
     size = first + dim * ids.size + k
-    common, parts, loose = np.arange(size - k, size), [], _looser(space, maps, starts)
+    common, parts, loose = np.arange(size - k, size), [], _added_covariances(space, maps, starts)
     for number, each in enumerate(maps):
         rows = np.array([row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64)
         own = each.columns(rows)
@@ -281,7 +281,9 @@ def solve(
     return Solution(ids, world, starts, constants, factors, eliminated, is_whole=off > 0.0)
 
 
-def _looser(space: RigidSpace, maps: list[SubMap], starts: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _added_covariances(
+    space: RigidSpace, maps: list[SubMap], starts: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Covariances to add to each sub-map's landmarks (M, D, D), and to those of its prior (K, D, D).
 
     They are the landmarks' later random walk, Mathematics (passed-on-walk), and a minimum for the driving substate.

@@ -485,11 +485,11 @@ class SubMaps:
         if asked is not None:
             wanted |= np.isin(ids, last) | np.isin(ids, asked)
             far = np.linalg.norm(self.space.inverse_transform(self.start, self.guess(ids)), axis=1)
-            order = np.lexsort((far, -self._beside(ids, asked)))
+            order = np.lexsort((far, -self._co_observed(ids, asked)))
             wanted[order[: max(self.most - last.size, 0)]] = True
         return ids[wanted]
 
-    def _beside(self, ids: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    def _co_observed(self, ids: np.ndarray, asked: np.ndarray) -> np.ndarray:
         """For each landmark (K,) the most `asked` ones in a sub-map with it: those seen together are likely seen next."""
         most = np.zeros(ids.size, dtype=np.int64)
         for each in self.maps:
@@ -537,7 +537,7 @@ class SubMaps:
         seen = self.space.inverse_transform(self.start, solution.world)
         last = np.isin(ids, self.maps[-1].ids) | np.isin(ids, asked)
         far = np.where(last, -1.0, np.linalg.norm(seen, axis=1))
-        order = np.lexsort((far, -self._beside(ids, asked), ~last))
+        order = np.lexsort((far, -self._co_observed(ids, asked), ~last))
         kept = order[: max(self.most, int(last.sum()))]
         kept = kept[last[kept] | (ids[kept] >= 0)]
         points, cov = solution.seen_from(self.space, len(self.maps), kept)

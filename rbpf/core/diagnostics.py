@@ -133,7 +133,7 @@ class Health:
             self._ratios.append(nis / rows)
             ratio = _lasting(self._ratios, step)
             if ratio > LARGE:
-                self._tell(
+                self._warn_once(
                     "innovations",
                     f"step {step}: squared innovations are {ratio:.0f} times as large as the noise explains, and have "
                     f"been for {WINDOW} steps. The filter has probably diverged: check the noise of motion and measurements, "
@@ -152,7 +152,7 @@ class Health:
         self._ess.append(-ess)
         few = -_lasting(self._ess, step)
         if few < self._few:
-            self._tell(
+            self._warn_once(
                 "weights",
                 f"step {step}: {few:.1f} of {self.n} particles have had all the weight for {WINDOW} steps, too few "
                 "to represent the uncertainty of the state: use more particles or a proposal that uses the "
@@ -175,7 +175,7 @@ class Health:
             sigma = max(math.sqrt(squares / number), 0.1)
             best = sorted(self._recent)[3 * WINDOW // 4]
             if best < mean - EVIDENCE_SIGMA * sigma:
-                self._tell(
+                self._warn_once(
                     "evidence",
                     f"step {step}: the measurements have become improbable, the log-evidence per component fell from "
                     f"{mean:.1f} ± {sigma:.1f} to {best:.1f} and stayed there. The filter has probably diverged: check its "
@@ -187,7 +187,7 @@ class Health:
         self._parents.append(-float(np.count_nonzero(np.bincount(ancestors, minlength=self.n))))
         few = -_lasting(self._parents, step)
         if few < self._few:
-            self._tell(
+            self._warn_once(
                 "ancestors",
                 f"step {step}: all {self.n} particles descend from {few:.0f} of those before, step after step: they share "
                 "one past, which makes the covariance too small; use more particles, or marginalise what is sampled",
@@ -202,14 +202,14 @@ class Health:
         self._most = distinct if self._most is None else np.maximum(self._most, distinct)
         lost = np.flatnonzero(self._continuous & (self._most >= self.n / 2) & (distinct <= self._few) & (self.n > 4))
         if lost.size:
-            self._tell(
+            self._warn_once(
                 "copies",
                 f"step {step}: component {lost[0]} of the state has {distinct[lost[0]]} values left among {self.n} particles. "
                 "It has no noise that separates copies of a particle, so it can no longer be corrected: marginalise it "
                 "(KalmanSubstate), or give it some noise",
             )
 
-    def _tell(self, kind: str, sentence: str) -> None:
+    def _warn_once(self, kind: str, sentence: str) -> None:
         if kind not in self.findings:
             self.findings[kind] = sentence
             if not self.silent:

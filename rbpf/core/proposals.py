@@ -26,11 +26,11 @@ class PriorProposal(Proposal):
     """The bootstrap filter's: q is the motion model, w₁ = 1, w₂ = p(z | x) (S05 §II-A)."""
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
-        return _as_before(prior.factor.shape[2])
+        return _unrefined(prior.factor.shape[2])
 
 
 @lru_cache
-def _as_before(rank: int) -> Proposed:
+def _unrefined(rank: int) -> Proposed:
     held = np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1)
     for array in held:  # shared by all filters
         array.flags.writeable = False

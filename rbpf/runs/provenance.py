@@ -22,7 +22,7 @@ CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"  #: Libraries whose version may change a run's results.
 _FILES = "recording", "known_points", "calibration", "known_map"  #: Entries that name input files or folders.
 _FLAGS = ("localize",)
-_MADE = "video", "batch"  #: Optional outputs of a run.
+_OUTPUTS = "video", "batch"  #: Optional outputs of a run.
 _HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
 _INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
 #: Settings that do not affect the results, and may differ on resuming; all others must be equal.
@@ -163,11 +163,11 @@ def _options(entries: Mapping[str, Any]) -> list[str]:
     """Further options of a run: an entry of config.yaml has the option's name, possibly with a unit."""
     words = list[str]()
     for name in HEADER:
-        if name in entries and name not in (*_HEAD, *_FLAGS, *_MADE):
+        if name in entries and name not in (*_HEAD, *_FLAGS, *_OUTPUTS):
             option = "map" if name == "known_map" else re.sub(r"_(m|s|px)$", "", name).replace("_", "-")
             words += [f"--{option}", str(entries[name])]
     words += [f"--{name}" for name in _FLAGS if entries.get(name)]
-    return words + [f"--no-{name}" for name in _MADE if entries.get(name) is False]
+    return words + [f"--no-{name}" for name in _OUTPUTS if entries.get(name) is False]
 
 
 def command_of(entries: Mapping[str, Any], *defaults: Mapping[str, Any]) -> list[str]:

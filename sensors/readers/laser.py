@@ -126,7 +126,7 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
     whole = path.resolve()
     name = whole.name if whole.is_dir() else whole.name.removesuffix(".gz").rpartition(".")[0] or whole.name
     log = LaserLog(name, scanner, read.stamps_ns, ranges, odometry)
-    _tell_mirrored(path, log)
+    _warn_if_mirrored(path, log)
     return log
 
 
@@ -137,7 +137,7 @@ def _chosen(path: Path, what: str, names: Sequence[str], given: str | None = Non
     return given or names[0]
 
 
-def _tell_mirrored(path: Path, log: LaserLog) -> None:
+def _warn_if_mirrored(path: Path, log: LaserLog) -> None:
     """Warns if the scans before and after rotations match each other only with mirrored angles."""
     if log.odometry is None:
         return  # without rotations the mirrored scans are equally consistent

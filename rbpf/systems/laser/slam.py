@@ -124,7 +124,7 @@ class LaserSlam(Kept, System):
                 state = TrackingState.LOST
                 messages.append(f"the scan hardly fits the map ({100 * fit:.0f} %): the robot is not localised")
         # Between two steps the pose is the last one moved by the odometry.
-        now = Odometry(self._pose, self._cov).then(self._moved_since(), SE2)
+        now = Odometry(self._pose, self._cov).then(self._motion_since_step(), SE2)
         nothing = {"log_evidence": float("nan"), "nis": float("nan"), "nis_dof": 0.0}
         own = {"fit": fit, "beams": len(beams), "odometry": self._odometry}
         values = {"ess": self._ess, "resampled": resampled, **nothing, **own}
@@ -200,7 +200,7 @@ class LaserSlam(Kept, System):
         self._measured = now
         self._since, self._odometry = SE2.compose(self._since, delta), SE2.compose(self._odometry, delta)
 
-    def _moved_since(self) -> Odometry:
+    def _motion_since_step(self) -> Odometry:
         """The motion since the last step."""
         way, turned, without = self._moved.tolist()
         if not self._moved.any():
@@ -211,7 +211,7 @@ class LaserSlam(Kept, System):
     def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
         """A step of the filter; returns whether it resampled."""
         last_ns, before = self.filter.stamp_ns, self._pose
-        moved = None if last_ns is None and not self._moved.any() else self._moved_since()
+        moved = None if last_ns is None and not self._moved.any() else self._motion_since_step()
         if proposal is None or not self._moved.any():  # no motion, nothing to match
             proposal = PriorProposal()
         report = self.filter.step(beams, moved, stamp_ns, proposal)

@@ -225,7 +225,7 @@ class ActiveSearch:
         voting = self.table.voting(result.features[hits[which]], self.config.trusted_fraction)
         fit = self.gate.fit(nu, jac, cov, factor, voting)
         found, hits = np.zeros_like(result.found), hits[which]
-        agree, placed = fit.squared <= self.config.gate_chi2, self._placed(cov)
+        agree, placed = fit.squared <= self.config.gate_chi2, self._well_predicted(cov)
         self.is_fast |= starting and 2 * int((agree & placed).sum()) < int(agree.sum())
         if starting and self.is_fast:
             placed |= ~result.ambiguous[hits]
@@ -236,7 +236,7 @@ class ActiveSearch:
             return result
 
         which, nu, jac, cov = self._innovations(belief, result.features[missed], result.mean[missed])
-        placed = self._placed(cov)
+        placed = self._well_predicted(cov)
         missed, nu, jac, cov = missed[which[placed]], nu[placed], jac[placed], cov[placed]
         if missed.size:
             mean = result.mean[missed] - nu + jac @ fit.increment
@@ -292,7 +292,7 @@ class ActiveSearch:
         which, nu, jac, cov = self.features.innovations(belief, rows, px)
         return which, nu, jac, cov + self.noise
 
-    def _placed(self, cov: np.ndarray) -> np.ndarray:
+    def _well_predicted(self, cov: np.ndarray) -> np.ndarray:
         """Mask of features (K,) whose prediction given the camera's motion is precise relative to the search range.
 
         A feature of more uncertain depth, cov (K, 2, 2) given the camera, agrees with every motion: several similar positions

@@ -146,7 +146,7 @@ class PlaceRecognition:
         else:
             found = [
                 (number, self._look(filter_, joint, image, number))
-                for number in self._ask(joint, image)
+                for number in self._vote(joint, image)
                 if np.isin(seen.landmarks, joint.old.maps[number].ids).sum() < MIN_FITTED
             ]
         for number, sighting in found:
@@ -156,7 +156,7 @@ class PlaceRecognition:
             filter_.consolidate()
             prior = joint.old.relative(number, joint.finished())
             # Names are taken as certain.
-            again = self._judged(joint, Place.of(joint, number), sighting, prior, 1.0 if image is None else RISK)
+            again = self._verified(joint, Place.of(joint, number), sighting, prior, 1.0 if image is None else RISK)
             if again is not None:
                 self._close(joint, again, tied=True)
                 return True
@@ -175,13 +175,15 @@ class PlaceRecognition:
             return self._odds(joint, present, attempt.sighting, prior)[0] >= -np.log(RISK_LOST), None
         # Try old sub-maps; on success a new sub-map starts there.
         y = SE3.between(joint.world(SE3.identity((1,)), slice(1))[0], lost.mean)
-        for number in self._ask(joint, image) if joint.old.maps else []:
+        for number in self._vote(joint, image) if joint.old.maps else []:
             sighting = self._look(filter_, joint, image, number)
             if sighting is None:
                 continue
             frame, turn = joint.old.relative(number, joint.finished()), SE3.adjoint(SE3.inverse(y))
             prior = Estimate(SE3.compose(frame.mean, y), turn @ frame.cov @ turn.T + FURTHER**2 * lost.cov)
-            again = self._judged(joint, Place.of(joint, number), sighting, prior, RISK_LOST, self.config.std_inflation)
+            again = self._verified(
+                joint, Place.of(joint, number), sighting, prior, RISK_LOST, self.config.std_inflation
+            )
             if again is not None:
                 joint.consolidate(Particles(SE3.identity((filter_.n,)), filter_.particles.log_weights))
                 self._close(joint, again, tied=False)
@@ -228,7 +230,7 @@ class PlaceRecognition:
         among = place.held.ids, SE3.transform(place.world_from_place, place.held.points)
         return self.relocaliser.find(filter_.belief(), image, place.world_from_place, None, among).sighting
 
-    def _ask(self, joint: JointMap, image: np.ndarray) -> np.ndarray:
+    def _vote(self, joint: JointMap, image: np.ndarray) -> np.ndarray:
         """Numbers of the old sub-maps similar to an image, the best first.
 
         Each corner votes for the one with the most similar landmark, weighted by the difference to the best landmark of
@@ -257,7 +259,7 @@ class PlaceRecognition:
         every = np.concatenate([joint.old.places()[1], SE3.transform(place.world_from_place, place.held.points)])
         return log_odds(self.features.camera, pose, *place.at(names), px, prior, np.ptp(every, axis=0))
 
-    def _judged(
+    def _verified(
         self, joint: JointMap, place: Place, sighting: Sighting, prior: Estimate, risk: float, wider: float = 1.0
     ) -> Given | None:
         """The sighting of an old sub-map's landmarks relative to the camera, if it is that place up to a risk."""

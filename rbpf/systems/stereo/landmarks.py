@@ -449,7 +449,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         k, m = self.gate.pairs(features, expected)
         found = match_pairs(features.descriptors, held.descriptors, (k, held.rows(ids)[m]), limits)
         taken = held.names[found.second]
-        agreed = self._agreed(
+        agreed = self._accepted(
             expected.take(np.searchsorted(ids, taken)), features.take(found.first), pair.uncertain, belief.rng
         )
         out[rows[found.first[agreed]]] = taken[agreed]
@@ -480,7 +480,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         taken = held.names[at[found.second]]
         far = np.flatnonzero(~np.isin(taken, joint.old.about.ids))
         agreed = np.ones(len(found), dtype=bool)
-        agreed[far] = self._agreed(expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng)
+        agreed[far] = self._accepted(
+            expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng
+        )
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
@@ -533,7 +535,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if self.noise is not None:
             self.noise.restore(arrays)
 
-    def _agreed(
+    def _accepted(
         self, expected: Expected, features: StereoFeatures, uncertain: bool, rng: np.random.Generator
     ) -> np.ndarray:
         """Mask (k,) of accepted matches: all, unless predictions are too uncertain for the gate to be selective."""

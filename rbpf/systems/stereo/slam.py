@@ -236,7 +236,7 @@ class StereoSlam(System):
             for_map[motion.rows[1][motion.moving]] = False
             view = replace(pair, for_map=for_map, uncertain=uncertain)
             if uncertain:
-                control, message = self._found_again(view, at)
+                control, message = self._recovered_motion(view, at)
                 messages += filter(None, (message,))
             if control is not None:
                 begun = time.perf_counter()
@@ -443,7 +443,7 @@ class StereoSlam(System):
         at = before.moved(stamp_ns, step, velocity, cross=cross, noise=noise, left_over=left_over)
         return pair, _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
 
-    def _found_again(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
+    def _recovered_motion(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
         """The motion by which particles are moved after an assumed motion, or None, and a message.
 
         An assumed motion is a wide Gaussian that grows with every pair, and no particle is drawn from it before the camera is

@@ -297,11 +297,11 @@ def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | Non
     now = Linearised(seen, config, start)
     noise_px = min(now.spread_px(), float(seen.camera.width))
     while noise_px > FAR * seen.noise_px:
-        nearer = _downhill(Linearised(replace(seen, noise_px=noise_px), config, now.at))
+        nearer = _levenberg_marquardt(Linearised(replace(seen, noise_px=noise_px), config, now.at))
         if nearer is None:
             return None
         now, noise_px = Linearised(seen, config, nearer.structure), noise_px / NEARER
-    return _downhill(now)
+    return _levenberg_marquardt(now)
 
 
 def minima(seen: Window, config: MonoConfig, start: Structure, reverse: bool) -> list[Optimum]:
@@ -314,7 +314,7 @@ def minima(seen: Window, config: MonoConfig, start: Structure, reverse: bool) ->
     return sorted(found, key=lambda each: -each.log_weight)
 
 
-def _downhill(now: "Linearised") -> Optimum | None:
+def _levenberg_marquardt(now: "Linearised") -> Optimum | None:
     """Levenberg-Marquardt on the normal equations."""
     damping = DAMPING
     for _ in range(MAX_STEPS):
