@@ -1,4 +1,4 @@
-"""Points whose places are known in a frame of their own: one landmark, because what is known correlates them."""
+"""Points of known positions in a group frame, as one landmark, because their uncertainty is correlated."""
 
 from typing import final
 
@@ -10,27 +10,26 @@ from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 
-MOST = 30  #: Points of one; a record's covariance grows with the square of their number.
-#: Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors, of the points' means
+MOST = 30  #: Maximum number of points; a record's covariance grows with its square.
+#: Maximum Gauss-Newton steps to the frame; they start from the closed-form solution for equal errors, of the points' means
 #: over the particles.
 ROUNDS = 20
-#: Length of the last step, radians and metres: what is left after it is a hundredth of it, even where points fit badly.
+#: Norm of the last step, radians and metres: the remaining error is a hundredth of it, even for a bad fit.
 SETTLED = 1e-6
 LEAST = 1e-12  #: Variance, m², of exact points, which keeps the fit defined.
 
 
 @final
 class Constellation(Landmark):
-    """M points, given in a frame of their own, exactly or up to Gaussian errors; where they are in the world is estimated.
+    """M points given in a group frame, exactly or with Gaussian errors, whose world positions are estimated.
 
-    The record's mean is (p_1, …, p_M), where the points are in the world, with their joint covariance: the shape that
-    is given correlates them. What a camera measures is nearly linear in where the points are, however uncertain the
-    frame. With the frame and an error of each point as the record it is not, and the error of second order is
-    larger than a pixel. The frame follows from the points: p_m = T (k_m + e_m), so that given the points T is the fit
-    of the shape to them.
+    The record's mean is (p_1, …, p_M), the points' world positions, with their joint covariance, which holds the correlation
+    by the given shape. A camera's measurement is nearly linear in the points, however uncertain the frame. It is not if the
+    record has the frame and an error of each point: the second-order error then exceeds a pixel. The frame follows from the
+    points: p_m = T (k_m + e_m), so T is the fit of the shape to them.
 
     Args:
-        points: (M, 3) where the points are given, k_m, in the group's frame, metres.
+        points: (M, 3) given positions k_m in the group's frame, metres.
         cov_points: (M, 3, 3) covariances of their errors e_m.
 
     Raises InputError: there are too many points.
@@ -50,7 +49,7 @@ class Constellation(Landmark):
         return np.concatenate([centre, np.ones((*centre.shape[:-1], 1))], axis=-1)
 
     def started(self, n: int, points: np.ndarray, cov: np.ndarray) -> Records:
-        """First records (n, 1, …): the points (M, 3) in the world, covariance (3M, 3M)."""
+        """Initial records (n, 1, …): the points (M, 3) in the world, covariance (3M, 3M)."""
         shape = (n, 1, self.dim)
         return Records(np.broadcast_to(points.ravel(), shape), np.broadcast_to(cov, (*shape, self.dim)))
 
@@ -77,16 +76,16 @@ class Constellation(Landmark):
         return mean.reshape(*mean.shape[:-1], -1, 3)
 
     def _fit(self, records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The frame (N, 7) that fits the shape to the points: Gauss-Newton on r_m = T⁻¹ p_m − k_m, weighed as e_m.
+        """The frame (N, 7) that fits the shape to the points: Gauss-Newton on r_m = T⁻¹ p_m − k_m, weighted by cov e_m.
 
-        Further its derivative by all points (N, 6, 3M), and its covariances (N, 6, 6): given the points, and of all.
+        Also its derivative by all points (N, 6, 3M), and its covariances (N, 6, 6): given the points, and in total.
         """
         world, given, weight = self.in_world(records), np.asarray(self.points), np.asarray(self._info_points)
         n = len(world)
         frame = np.repeat(SE3.closest(given, world.mean(axis=0)[None]), n, axis=0)
         for _ in range(ROUNDS):
             local = SE3.inverse_transform(frame[:, None], world)
-            # All points below one another: many small products take longer than one.
+            # All points stacked: one product is faster than many small ones.
             moved = -SE3.transform_jacobian(local).reshape(n, -1, 6)
             weighed = weight @ moved
             info, pull = np.swapaxes(weighed, 1, 2) @ moved, (local - given).reshape(n, 1, -1) @ weighed

@@ -1,12 +1,12 @@
-"""Occupancy of the plane in cells, one grid per particle, in tiles that particles share and copy when they write.
+"""Occupancy grids in the plane, one per particle, in tiles that particles share and copy on write.
 
-Each cell holds the log-odds that it is occupied (H. Moravec and A. Elfes 1985), given the particle's path, and the mean place
-of the beams that ended in it, which is finer than the cell. What a scan says of the state is the likelihood field of
-S. Thrun, W. Burgard, D. Fox 2005, §6.4: a beam's end is as likely as it is near to what is occupied.
+Each cell holds the log-odds that it is occupied (H. Moravec and A. Elfes 1985), given the particle's path, and the mean
+position of the beams that ended in it, which is finer than the cell. A scan's likelihood is the likelihood field of S. Thrun,
+W. Burgard, D. Fox 2005, §6.4, by the distance of each beam's end from the nearest obstacle.
 
     log p(z | x, m) = Σ_k w_k log(1 + ρ exp(−d_k² / 2σ²)) + const
 
-with the distance d_k from the end of beam k to the nearest occupied cell's mean place, and the ratio ρ of a hit's density
+with the distance d_k from the end of beam k to the nearest occupied cell's mean position, and the ratio ρ of a hit's density
 at d = 0 to that of an end anywhere. The weights w_k ≤ 1 are the sensor's: neighbouring beams are not independent.
 """
 
@@ -27,34 +27,34 @@ from rbpf.maps import grid_kernels as cells
 from rbpf.ranges import Positive, Range, Ranged, require_memory
 
 _FIRST_TILES = 256
-_EVERY = 2  #: Of so many beams one is looked at on the lattice of a search,
-_APART = 16  #: of these first each so many-th, then those beside them, and so on.
-GRID = Part("occupancy grid")  #: Its name in a filter.
+_EVERY = 2  #: The lattice search uses every such beam,
+_APART = 16  #: in an order that starts with every such one of these.
+GRID = Part("occupancy grid")  #: Name of the grid in a filter.
 
 
 @dataclass(frozen=True)
 class GridConfig(Ranged):
-    """Cells and the likelihood field."""
+    """Settings of the cells and of the likelihood field."""
 
     cell_m: Annotated[float, Range(ge=0.005, le=1.0)] = 0.05  #: side of a cell.
     hit: Positive = 0.85  #: added to the log-odds of a cell in which a beam ends; p = 0.7.
     miss: Positive = 0.4  #: subtracted where one passes; p = 0.4.
-    bound: Positive = 4.0  #: of the log-odds, so that what moves away is forgotten.
-    #: σ, of a beam's end about what is occupied: the scanner's noise, the map's, and the cells'.
+    bound: Positive = 4.0  #: of the log-odds, so that removed objects are forgotten.
+    #: σ of a beam's end about an obstacle: noise of the scanner and the map, and the cell size.
     sigma_m: Positive = 0.05
-    hit_ratio: Positive = 20.0  #: ρ, how much likelier an end is at what is occupied than anywhere.
+    hit_ratio: Positive = 20.0  #: ρ, likelihood ratio of an end at an obstacle to one anywhere.
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One particle's grid: log-odds (H, W), row 0 at the lowest y, 0 where nothing is known; its corner's place [m]."""
+    """One particle's grid: log-odds (H, W), row 0 at the lowest y, 0 for unknown; and its corner [m]."""
 
     log_odds: np.ndarray
     cell_m: float
     corner: np.ndarray  #: (2,) x and y of the outer corner of cell [0, 0].
 
     def walls(self) -> np.ndarray:
-        """(M, 2) the middles of the cells in which something is, m."""
+        """(M, 2) centres of the occupied cells, m."""
         return self.corner + self.cell_m * (np.argwhere(self.log_odds > 0.0)[:, ::-1] + 0.5)
 
 
@@ -67,9 +67,9 @@ class GridMap(Conditional):
     def __init__(self, config: GridConfig | None = None) -> None:
         self.config = config or GridConfig()
         side, sigma = self.config.cell_m, self.config.sigma_m
-        # As far as a hit is a twentieth as likely as an end anywhere.
+        # Range up to which a hit is at least a twentieth as likely as an end anywhere.
         half = int(np.ceil(sigma * np.sqrt(2.0 * np.log(20.0 * max(self.config.hit_ratio, 1.0))) / side))
-        # What an occupied cell whose mean place is at ((i + ½)/8, (j + ½)/8) gives the centres of the cells near it.
+        # Values at nearby cell centres of an occupied cell with mean position ((i + ½)/8, (j + ½)/8).
         place = (np.arange(cells.FINE) + 0.5) / cells.FINE - 0.5
         square = ((np.arange(-half, half + 1) - place[:, None]) * side) ** 2
         distance = square[:, None, :, None] + square[None, :, None, :]
@@ -77,7 +77,7 @@ class GridMap(Conditional):
         self._stamps = stamps.astype(np.float32)
         self._marks, self._fields = np.zeros((0, 0, 0), dtype=bool), np.zeros((0, 0, 0), dtype=np.float32)
         self._change = np.array([self.config.hit, self.config.miss, self.config.bound])
-        # Differences over these see the field's shape, not single cells: one σ, and so much at four metres.
+        # Steps for differences of the field, wider than single cells: one σ, and the angle of one σ at four metres.
         self._steps = np.array([sigma / 4.0, sigma, sigma]) / 2.0
 
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -89,20 +89,20 @@ class GridMap(Conditional):
 
     @property
     def tiles(self) -> int:
-        """Tiles in use."""
+        """Number of tiles in use."""
         return int(np.count_nonzero(self.users))
 
     def match(self, prior: Prior, beams: np.ndarray, most: int = 20_000) -> tuple[Proposed, np.ndarray]:
-        """The Gaussian about the increment at which prior times likelihood of a scan (K, 5) is highest, and how well it fits.
+        """Scan matching: the Gaussian at the increment that maximises prior times likelihood of a scan (K, 5), and its fit.
 
-        Its covariance is that of the prior and of the field's curvature there; its look-ahead weight Laplace's integral. The
-        lattice of the search spans three standard deviations of the prior; with more than `most` points it is made wider.
-        The fit (N,) is the likelihood's logarithm over that of a scan all of whose beams end at occupied places' very middle.
+        Its covariance is from the prior and the field's curvature there; its look-ahead weight is Laplace's integral. The
+        lattice of the search spans three standard deviations of the prior; with more than `most` points its spacing is
+        increased. The fit (N,) is the log-likelihood relative to that of a scan whose beams all end exactly at obstacles.
 
-        Raises InputError: the prior's increment has a mean of its own, as of a motion that a substate drives.
+        Raises InputError: the prior's increment has a nonzero mean, as for a motion driven by a substate.
         """
         if not prior.centred:
-            raise InputError("scans are matched about a motion of mean zero, not one that a substate drives")
+            raise InputError("scan matching needs an increment of mean zero, not one driven by a substate")
         n = prior.base.shape[0]
         cov = (prior.factor @ np.swapaxes(prior.factor, -1, -2)).mean(axis=0)
         radius = 3.0 * np.sqrt(np.diag(cov)) + 1e-9
@@ -115,14 +115,14 @@ class GridMap(Conditional):
         info = np.linalg.inv(cov + 1e-12 * np.eye(3))
         found, value, hessian = np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3))
         place = self._place(prior.base, beams, slack)
-        # Neighbours tell the same: beams far apart come first, each with what it and all after it can add at most.
+        # Neighbouring beams are redundant: distant ones come first, with the most that the rest of the scan can add.
         few = beams[::_EVERY] * [1.0, 1.0, 1.0, 1.0, _EVERY]
         few = few[np.argsort(np.arange(len(few)) % _APART, kind="stable")]
         rest = np.ascontiguousarray(few[::-1, 4].cumsum()[::-1]) * float(self._stamps.max())
         lattice = info, radius, spacing, self._steps, few, rest
         cells.search(len(self._fields), *place, *lattice, found, value, hessian)
         factor = np.broadcast_to(prior.factor, (n, *prior.factor.shape[1:]))
-        # What falls off about the maximum, as information; in units in which the steps weigh the same.
+        # Negative curvature at the maximum, as information; scaled so that the steps have equal weight.
         unit = self._steps
         curve, axes = np.linalg.eigh(-hessian * unit[:, None] * unit)
         scaled = axes / unit[:, None]
@@ -133,7 +133,7 @@ class GridMap(Conditional):
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         log_w1 = value - 0.5 * (u * u).sum(axis=1) - log_det
         fit = value / max(float(beams[:, 4].sum()) * np.log1p(self.config.hit_ratio), 1e-9)
-        # A field has no innovation, whose square would be a χ².
+        # The field has no innovation with a χ²-distributed square.
         unknown = np.full(n, np.nan)
         return Proposed(u, np.swapaxes(np.linalg.inv(root), -1, -2), log_w1, unknown, np.zeros(n)), fit
 
@@ -145,7 +145,7 @@ class GridMap(Conditional):
         return value
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """The likelihood at the states; then the beams are written."""
+        """The likelihood at the states; then the scan is inserted."""
         scans = [beams_of(group) for group in groups]
         total = sum((self.log_likelihood(state, beams) for beams in scans), np.zeros(state.shape[0]))
         for beams in scans:
@@ -153,14 +153,14 @@ class GridMap(Conditional):
         return LogDensities(total, np.zeros_like(total))
 
     def insert(self, state: np.ndarray, beams: np.ndarray) -> None:
-        """Writes a scan (K, 5) at the states (N, 3)."""
+        """Inserts a scan (K, 5) at the states (N, 3)."""
         if not beams.shape[0]:
             return
         self._cover(state, beams)
         touched = np.zeros(self.index.shape, dtype=bool)
         side = self.config.cell_m
         cells.touch(state, beams, side, self.origin, touched)
-        # As many at most: what is shared, or not there, in what is written.
+        # Upper bound of new tiles: those to be written that are shared or missing.
         count = int(np.count_nonzero(touched & ((self.index < 0) | (self.users[self.index] > 1))))
         lacking = count - int(np.count_nonzero(self.users == 0))
         if lacking > 0:
@@ -168,7 +168,7 @@ class GridMap(Conditional):
             total = self.users.size + more
             require_memory(4.0 * total * self.pool[0].size, f"{total} tiles of the map")
             held, self.pool = self.pool, np.zeros((total, *self.pool.shape[1:]), dtype=np.float32)
-            self.pool[: len(held)] = held  # what is not used yet needs no memory
+            self.pool[: len(held)] = held  # untouched memory is not allocated
             self.users = np.concatenate([self.users, np.zeros(more, dtype=np.int64)])
         cells.own(touched, self.index, self.users, self.pool, np.flatnonzero(self.users == 0))
         cells.insert(len(state), state, beams, side, self.origin, self.index, self.pool, self._change)
@@ -179,7 +179,7 @@ class GridMap(Conditional):
         self.users = np.bincount(used, minlength=self.users.size).astype(np.int64)
 
     def picture(self, particle: int) -> Picture:
-        """The grid of one particle, cut to what is known."""
+        """The grid of one particle, cropped to the known area."""
         tile, index = cells.TILE, self.index[particle]
         held = np.argwhere(index >= 0)
         low, high = (held.min(axis=0), held.max(axis=0) + 1) if held.size else (np.zeros(2, int), np.ones(2, int))
@@ -191,7 +191,7 @@ class GridMap(Conditional):
         return Picture(log_odds, self.config.cell_m, corner)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        # In the order in which the particles come by them, which does not depend on where in the pool they lie.
+        # In the order of the particles' indices, which is independent of their positions in the pool.
         tiles, first = np.unique(self.index[self.index >= 0], return_index=True)
         used = tiles[np.argsort(first)]
         number = np.full(self.users.size + 1, -1)
@@ -214,7 +214,7 @@ class GridMap(Conditional):
         return {"grid": repr(self.config)}
 
     def _place(self, state: np.ndarray, beams: np.ndarray, slack: float = 0.0) -> tuple:
-        """What the kernels of the field need; the window reaches `slack` [m] beyond the beams."""
+        """Arguments of the field's kernels; the window extends `slack` [m] beyond the beams."""
         side = self.config.cell_m
         reach = float(np.hypot(beams[:, 2], beams[:, 3]).max(initial=0.0)) + slack + self._stamps.shape[2] * side
         tiles = 2 * int(np.ceil(reach / (side * cells.TILE))) + 3
@@ -228,7 +228,7 @@ class GridMap(Conditional):
         return (np.ascontiguousarray(state), beams, side, self.origin, self.index, self.pool, self._stamps, *fields)
 
     def _cover(self, state: np.ndarray, beams: np.ndarray) -> None:
-        """Makes the index reach as far as the beams do."""
+        """Extends the index to cover the beams."""
         pitch = self.config.cell_m * cells.TILE
         reach = float(np.hypot(beams[:, [0, 2]], beams[:, [1, 3]]).max()) + pitch
         low = np.floor((state[:, :0:-1].min(axis=0) - reach) / pitch).astype(np.int64)
@@ -247,8 +247,8 @@ class GridMap(Conditional):
 
 
 def beams_of(group: Observations) -> np.ndarray:
-    """The beams (K, 5) of a group. Raises InputError: the data are something else, or not finite."""
+    """The beams (K, 5) of a group. Raises InputError: the data are of another type, or not finite."""
     beams = numbers_of(np.asarray(group.data), "a scan")
     if beams.ndim != 2 or beams.shape[1] != 5 or not np.isfinite(beams).all():
-        raise InputError(f"a scan for a grid is finite beams (K, 5): beginnings, ends, weights; got {beams.shape}")
+        raise InputError(f"a scan for a grid needs finite beams (K, 5): starts, ends, weights; got {beams.shape}")
     return beams

@@ -1,8 +1,8 @@
-"""Numba only: beams written into the cells of many particles' grids, and the likelihood field of a scan.
+"""Numba only: insertion of beams into the grids of many particles, and the likelihood field of a scan.
 
-A grid is an index (N, H, W) of tiles, −1 where a particle has none, and a pool (tiles, PLANES, TILE, TILE) of their cells.
+A grid is an index (N, H, W) of tiles, −1 for none, and a pool (tiles, PLANES, TILE, TILE) of their cells.
 Cell (x, y) of the world is floor(position / side); `origin` is the tile of index[:, 0, 0], as (y, x). A scan is `beams`
-(K, 5): where each begins and ends in the robot's frame [m], and its weight. States are (N, 3) elements of SE(2), [θ, x, y].
+(K, 5): start and end point in the robot's frame [m], and weight. States are (N, 3) elements of SE(2), [θ, x, y].
 """
 
 import math
@@ -12,10 +12,10 @@ from numba import boolean, float32, float64, int32, njit, types, void
 
 from rbpf.kernels.signature import CUBE, INDICES, MATRIX, VECTOR, in_parts
 
-TILE = 32  #: Cells of a side of a tile.
-PLANES = 4  #: Of a tile: log-odds; how many beams ended in the cell, and their mean place in it, x and y in [0, 1).
+TILE = 32  #: Cells per side of a tile.
+PLANES = 4  #: Of a tile: log-odds; number of beams ending in the cell; their mean position in it, x and y in [0, 1).
 LOG_ODDS, ENDS, MEAN_X, MEAN_Y = range(PLANES)
-FINE = 8  #: Places in a cell, along each axis, for which the field of one occupied cell is tabulated.
+FINE = 8  #: Positions in a cell, per axis, for which the field of an occupied cell is tabulated.
 
 INDEX = types.Array(int32, 3, "C")
 POOL = types.Array(float32, 4, "C")
@@ -26,7 +26,7 @@ TOUCHED = types.Array(boolean, 3, "C")
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _first(a, d, pitch):
-    """Along one axis: the cell of `a`, the parameter at which a step `d` leaves it, and that of one cell more."""
+    """Along one axis: the cell of `a`, the line parameter at which a step `d` leaves it, and the parameter per cell."""
     cell = math.floor(a / pitch)
     if d > 0.0:
         return cell, ((cell + 1) * pitch - a) / d, pitch / d
@@ -37,10 +37,10 @@ def _first(a, d, pitch):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _walk(x0, y0, x1, y1, pitch):
-    """From cell to cell along a line (J. Amanatides and A. Woo 1987).
+    """Grid traversal along a line (J. Amanatides and A. Woo 1987).
 
-    Along each axis the first cell, the direction, where the line enters the next one and how much of it is in each; and how
-    many cells follow the first.
+    Returns per axis the first cell, the direction, the parameter at the next cell and per cell; and how many cells follow the
+    first.
     """
     x, next_x, more_x = _first(x0, x1 - x0, pitch)
     y, next_y, more_y = _first(y0, y1 - y0, pitch)
@@ -50,7 +50,7 @@ def _walk(x0, y0, x1, y1, pitch):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _ends(state, beam):
-    """Where a beam begins and ends in the world [m]."""
+    """Start and end point of a beam in the world [m]."""
     cos, sin = math.cos(state[0]), math.sin(state[0])
     return (
         state[1] + cos * beam[0] - sin * beam[1],
@@ -81,7 +81,7 @@ def touch(state, beams, side, origin, touched):
 
 @njit(void(TOUCHED, INDEX, INDICES, POOL, INDICES), cache=True, error_model="numpy")
 def own(touched, index, users, pool, free):
-    """Gives every particle a tile of its own wherever it will write: a copy of the one that it shares, or an empty one."""
+    """Copy-on-write: gives every particle its own tile wherever it will write, a copy of a shared one or an empty one."""
     taken = 0
     for n in range(index.shape[0]):
         for y in range(index.shape[1]):
@@ -107,7 +107,7 @@ def own(touched, index, users, pool, free):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _tile_of(index, n, origin, x, y):
-    """The tile of a cell, −1 where there is none."""
+    """The tile of a cell, −1 for none."""
     row, column = (y // TILE) - origin[0], (x // TILE) - origin[1]
     if row < 0 or column < 0 or row >= index.shape[1] or column >= index.shape[2]:
         return -1
@@ -116,13 +116,13 @@ def _tile_of(index, n, origin, x, y):
 
 @in_parts(MATRIX, MATRIX, float64, INDICES, INDEX, POOL, VECTOR)
 def insert(n, arguments):
-    """Writes a scan into tiles that nobody shares, of (state, beams, side, origin, index, pool, change); parts are particles.
+    """Inserts a scan into unshared tiles; arguments (state, beams, side, origin, index, pool, change); parts are particles.
 
-    `change` is what the log-odds take: of an end, of a crossing, the bound.
+    `change` has the log-odds increments of an end and of a crossing, and the bound.
     """
     state, beams, side, origin, index, pool, change = arguments
     hit, miss, bound = change[0], change[1], change[2]
-    # What is crossed comes first, so that a wall which a grazing beam passes by is a wall again after this scan.
+    # Crossings first, so that walls passed by grazing beams are restored by the ends of the same scan.
     for k in range(beams.shape[0]):
         x0, y0, x1, y1 = _ends(state[n], beams[k])
         x, step_x, next_x, more_x, y, step_y, next_y, more_y, steps = _walk(x0, y0, x1, y1, side)
@@ -153,7 +153,7 @@ def insert(n, arguments):
 
 @njit(cache=True, error_model="numpy")
 def _mark(marked, window, state, beams, side, turn, margin):
-    """Marks the window's tiles within `margin` [m] of where beams may end, if the heading errs by up to ±`turn`."""
+    """Marks the window's tiles within `margin` [m] of possible beam ends, for heading errors up to ±`turn`."""
     pitch = side * TILE
     reach = 0.0
     for k in range(beams.shape[0]):
@@ -173,7 +173,7 @@ def _mark(marked, window, state, beams, side, turn, margin):
 
 @njit(cache=True, error_model="numpy")
 def _build(field, marked, window, n, origin, index, pool, stamps):
-    """Fills the marked tiles of the field: at each cell's centre, the highest stamp of any occupied cell near it."""
+    """Fills the marked tiles of the field: at each cell's centre, the highest stamp of the occupied cells nearby."""
     width = stamps.shape[2]
     for row in range(marked.shape[0]):
         for column in range(marked.shape[1]):
@@ -189,7 +189,7 @@ def _build(field, marked, window, n, origin, index, pool, stamps):
                         continue
                     fine_y = min(int(pool[tile, MEAN_Y, b, a] * FINE), FINE - 1)
                     fine_x = min(int(pool[tile, MEAN_X, b, a] * FINE), FINE - 1)
-                    # The field has a border of half a stamp, so that one always fits.
+                    # The field has a border of half a stamp, so that stamps always fit.
                     for v in range(width):
                         target = field[row * TILE + b + v]
                         for u in range(width):
@@ -200,7 +200,7 @@ def _build(field, marked, window, n, origin, index, pool, stamps):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _prepare(n, state, beams, turn, margin, side, origin, index, pool, stamps, field, marked, window):
-    """The field about where the beams of one particle may end, in a window of tiles about its state."""
+    """The field around possible beam ends of one particle, in a window of tiles around its state."""
     pitch, tiles = side * TILE, marked.shape[0]
     window[0] = math.floor(state[2] / pitch) - tiles // 2
     window[1] = math.floor(state[1] / pitch) - tiles // 2
@@ -250,7 +250,7 @@ def _penalty(info, increment):
 
 @njit(cache=True, error_model="numpy")
 def _value(field, window, border, side, base, increment, beams, state):
-    """The score at base · Exp(increment) in SE(2), which goes to `state`."""
+    """The score at base · Exp(increment) in SE(2), which is written to `state`."""
     half = 0.5 * increment[0]
     sinc = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
     cos, sin = sinc * math.cos(base[0] + half), sinc * math.sin(base[0] + half)
@@ -262,7 +262,7 @@ def _value(field, window, border, side, base, increment, beams, state):
 
 @njit(cache=True, error_model="numpy")
 def _second_order(field, window, border, side, base, at, beams, steps, state, gradient, hessian):
-    """Value, gradient (3,) and Hessian (3, 3) of the score by differences over `steps` (3,), which see past single cells."""
+    """Value, gradient (3,) and Hessian (3, 3) of the score by differences over `steps` (3,), wider than a cell."""
     there = at.copy()
     value = _value(field, window, border, side, base, at, beams, state)
     for a in range(3):
@@ -285,7 +285,7 @@ def _second_order(field, window, border, side, base, at, beams, steps, state, gr
     return value
 
 
-#: Types of `place` = (state, beams, side, origin, index, pool, stamps, fields, marks); a field and marks of each thread, all
+#: Types of `place` = (state, beams, side, origin, index, pool, stamps, fields, marks); one field and marks per thread, all
 #: zero.
 PLACE = MATRIX, MATRIX, float64, INDICES, INDEX, POOL, STAMPS, FIELDS, TOUCHED
 
@@ -313,18 +313,18 @@ def _outward(k):
 
 @njit(cache=True, error_model="numpy")
 def _copy(values, out):
-    """Three numbers; a slice would compile what says that shapes differ."""
+    """Copies three numbers; a slice would also compile shape checks."""
     out[0], out[1], out[2] = values[0], values[1], values[2]
 
 
 @in_parts(*PLACE, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, MATRIX, VECTOR, CUBE)
 def search(thread, arguments):
-    """The increments (N, 3) at which score minus ½ εᵀ info ε is highest, within ±`radius` (3,) of the states.
+    """Finds the increments (N, 3) that maximise score − ½ εᵀ info ε within ±`radius` (3,) of the states.
 
-    Arguments are a place, (info, radius, spacing, steps, few, rest) and what is found; parts are threads. First on a
-    lattice of `spacing` (3,) from its middle outward, by the nearest cells' values for the beams `few`: those from each on
-    can add `rest` at most, so that most points are given up early. Then, from its best point, along the axes with steps
-    that are halved (G. Grisetti et al. 2007).
+    Arguments are a `place`, (info, radius, spacing, steps, few, rest) and the output; parts are threads. First a lattice
+    search with `spacing` (3,), from the centre outward, by nearest cells for the beams `few`: `rest` bounds the score of the
+    remaining beams, so that most points are rejected early. Then, from the best point, an axis search with halved steps (G.
+    Grisetti et al. 2007).
     """
     state, beams, side, origin, index, pool, stamps, fields, marks = arguments[:9]
     info, radius, spacing, steps, few, rest, increment, value, hessian = arguments[9:]
@@ -349,7 +349,7 @@ def search(thread, arguments):
                 beam = few[k]
                 ends[k, 0] = (base[1] + cos * beam[2] - sin * beam[3]) / side - left
                 ends[k, 1] = (base[2] + sin * beam[2] + cos * beam[3]) / side - low
-            # Shifts are along the axes of the robot half way through the turn, where Exp has its chord.
+            # Translations are along the robot's axes at half the rotation, the direction of the chord of Exp.
             half = 0.5 * trial[0]
             chord = 1.0 if abs(half) < 1e-8 else math.sin(half) / half
             cos, sin = chord * math.cos(base[0] + half) / side, chord * math.sin(base[0] + half) / side
@@ -369,7 +369,7 @@ def search(thread, arguments):
                     if total > highest:
                         highest = total
                         _copy(trial, best)
-        # Uphill from there.
+        # Hill climbing from there.
         highest = _value(field, window, border, side, base, best, beams, there) - _penalty(info, best)
         scale = 0.5
         while scale > 0.01:

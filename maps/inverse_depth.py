@@ -9,7 +9,7 @@ from rbpf.core.models import Landmark, Records
 from rbpf.lie import SE3
 from rbpf.ranges import Positive, Ranged
 
-MIN_RHO = 0.02  #: Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m.
+MIN_RHO = 0.02  #: Inverse depth to which smaller ones are raised for reporting, 1/m: 50 m.
 
 
 @final
@@ -22,7 +22,7 @@ class InverseDepth(Ranged, Landmark):
     Raises InputError: `ready_ratio` is not positive.
     """
 
-    #: A ray is ready to become a point when the standard deviation of q is below this fraction of q.
+    #: A ray can be promoted to a point once the standard deviation of q is below this fraction of q.
     ready_ratio: Positive = 0.1
 
     dim = 3
@@ -39,7 +39,7 @@ class InverseDepth(Ranged, Landmark):
         return np.concatenate([turned + rho * SE3.translation(const), rho], axis=-1)
 
     def point(self, mean: np.ndarray, const: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """With q kept away from 0."""
+        """With q raised to a minimum above 0."""
         assert const is not None
         u, v, q = np.moveaxis(mean, -1, 0)
         q = np.maximum(q, MIN_RHO)
@@ -50,14 +50,14 @@ class InverseDepth(Ranged, Landmark):
         return SE3.transform(const, direction / q[..., None]), SE3.rotation(const) @ jac
 
     def ready(self, records: Records) -> np.ndarray:
-        """Whether q is positive and well known, (N, K): then depth is nearly Gaussian too (Fig. 2)."""
+        """Whether q is positive and well known (N, K), so that the depth is nearly Gaussian, too (Fig. 2)."""
         rho, std = records.mean[..., 2], np.sqrt(records.cov[..., 2, 2])
         return (rho > 0.0) & (std <= self.ready_ratio * rho)
 
     def promote(self, records: Records) -> Records:
-        """The unscented transform where the point is ready, else the first order about an inverse depth of σ or more.
+        """The unscented transform if the ray is ready, else linearisation about an inverse depth of at least σ.
 
-        Sigma points of a particle that is not ready come near q = 0: far away, or behind the camera.
+        Without being ready, sigma points come close to q = 0: far away, or behind the camera.
         """
         ready, std = self.ready(records)[..., None], np.sqrt(records.cov[..., 2, 2])
         mean = records.mean.copy()

@@ -1,18 +1,18 @@
-"""A map whose landmarks, with the frame that they are expressed in, are one Gaussian given a short sampled window of the path.
+"""A map with one joint Gaussian of all landmarks and their frame, given a short sampled window of the path.
 
-A filter that samples its whole path forgets: resampling leaves all particles one past, and how the old map is bent, which
-nothing near the robot shows, is sampled once and never again (T. Bailey, J. Nieto and E. Nebot 2006). Here only the last
-few steps are sampled: the state y of a particle is the pose in a frame F, and
+A filter that samples its whole path loses information: after resampling all particles share one past, and the deformation of
+the old map, which nothing near the robot measures, is sampled only once (T. Bailey, J. Nieto and E. Nebot 2006). Here only
+the last few steps are sampled: the state y of a particle is the pose in a frame F, and
 
     (ξ, s, l_1 … l_M) | y_1:t  ~  N(μ_i, P),        world_from_F = G Exp(ξ),
 
-with the substate s (a velocity, where there is one) and the landmarks in F. Each particle has means of its own; the
-covariance is the same for all, for it depends on the path in the second order only. `consolidate` ends a window: F moves to
-the robot, and what the particles differ by becomes a part of P, Mathematics (consolidation). Lineage: C. Brooks and
-T. Bailey 2008 (HybridSLAM), E. Eade and T. Drummond 2007 (coalesced observations).
+with the substate s (a velocity, if any) and the landmarks in F. Each particle has its own means; the covariance is common, as
+it depends on the path only in second order. `consolidate` ends a window: F moves to the robot, and the particles' spread
+becomes part of P, Mathematics (consolidation). Related work: C. Brooks and T. Bailey 2008 (HybridSLAM), E. Eade and T.
+Drummond 2007 (coalesced observations).
 
-What is anchored, as a ray of unknown depth, stays in the frame of the pose that first saw it. That pose is a member of the
-Gaussian, too: a *clone*, C = K Exp(δ) in F, which moves with F as landmarks do (A. Mourikis and S. Roumeliotis 2007).
+Anchored landmarks, such as a ray of unknown depth, stay in the frame of the pose that first observed them. That pose is part
+of the Gaussian: a *clone*, C = K Exp(δ) in F, which moves with F as landmarks do (A. Mourikis and S. Roumeliotis 2007).
 """
 
 from collections.abc import Sequence
@@ -63,46 +63,45 @@ from rbpf.maps.point import Point
 from rbpf.maps.rows import MapOfRecords
 
 LARGEST = 6000
-"""Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
+"""Maximum number of landmark coordinates; their covariance takes 0.3 GB, and a step copies it."""
 FEWEST = 3
-"""Landmarks from afar with which all sub-maps are solved for."""
+"""Least number of distant landmarks for which all sub-maps are solved."""
 LOCAL, WORTH = 3.0, 20
-"""How far a sub-map may reach, over how far landmarks are seen from; and how many of them it must have to end by that.
+"""Largest extent of a sub-map relative to the range of observation, and least number of landmarks to end it by extent.
 
-What a turn of the heading does to a landmark in the second order, which a Gaussian leaves out, grows with its distance.
+The second-order effect of a heading error on a landmark, which a Gaussian neglects, grows with its distance.
 """
 SINGULAR = 1e-15
-"""Fraction of the largest variance of an increment below which another one is none."""
+"""Variances of an increment below this fraction of the largest count as zero."""
 
 
 @final
 class JointMap(MapOfRecords):
     """Landmarks, the frame's pose and a substate as one Gaussian; give the filter a `Consolidation` with it.
 
-    It takes points, what is anchored at a pose, and any `Landmark` that overrides `seen_from`.
-    The motion, and what is observed of landmarks, must not change when the whole world is moved, as it is with odometry and
-    sensors on the robot. An observation of the state alone, as a position fix, is of its pose in the world. Landmarks are
-    associated alike in all particles, all observations update state and landmarks, and what a likelihood takes for an outlier
-    is one in all particles: it updates nothing, and weighs each by its own innovation.
+    It supports points, landmarks anchored at a pose, and any `Landmark` that overrides `seen_from`. The motion and landmark
+    observations must be invariant to moving the whole world, as with odometry and sensors on the robot. An observation of the
+    state alone, such as a position fix, is of its pose in the world. Associations are common to all particles, all
+    observations update state and landmarks, and outliers are classified once for all particles: they update nothing, and
+    weigh each particle by its own innovation.
 
     Args:
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
-        substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
-            frame; None has none. It may be observed together with a landmark.
-        constants: the last k numbers of the substate never change, as what a sensor or the wheels get wrong: all sub-maps
-            have them in common.
-        compiled: use the models' fused kernels where they have one.
-        submap: landmarks with which a sub-map ends at the latest (`LOCAL`), so that a step costs the same however large the
-            map becomes; None keeps one Gaussian. Nothing may be observed in the world.
-        passed_on: a sub-map ends when landmarks are `put_away`, and what stays goes over into the next one, as always with a
-            substate that changes; else that begins with nothing but constants.
-        unnamed: measurements do not say which landmark they are of: those of old sub-maps are kept at hand, see `widened`;
-            not beside constants.
+        substate: mean (m,) and covariance (m, m) of the substate that drives the motion (`Transition.coupling`), in the
+            robot's frame; or None. It may be observed together with a landmark.
+        constants: the last k numbers of the substate are constants, such as systematic errors of a sensor or the wheels,
+            common to all sub-maps.
+        compiled: use the fused kernels of models that have one.
+        submap: maximum landmarks of a sub-map (see also `LOCAL`), which bounds the cost of a step however large the
+            map becomes; None is one Gaussian. With it nothing may be observed in the world.
+        passed_on: a sub-map ends when landmarks are `put_away`, and the others are passed on to the next one, together with a
+            substate that changes; else the next one starts with the constants only.
+        unnamed: for unknown association: old sub-maps' landmarks are kept available, see `widened`; not with constants.
 
     Attributes:
-        old: the sub-maps that are finished. All else is of the present one, where the world is the place where it began.
-        held: which landmarks and clones there are, and in which columns.
-        mean: (N, n) of ξ, s, and the landmarks and clones as they came.
+        old: the finished sub-maps. All else is of the current one, whose world is its start.
+        held: its landmarks and clones, and their columns.
+        mean: (N, n) of ξ, s, and the landmarks and clones in order of their addition.
         cov: (n, n), common to all particles.
         origin: (E,) G.
     """
@@ -141,13 +140,13 @@ class JointMap(MapOfRecords):
         self.n, self._next_id = n, 0
         self._begin_old(*self._substate)
         self._given_ids = self.leaving = self._returning = np.zeros(0, dtype=np.int64)
-        self._observed = self.leaving  # in a step what has been observed already, which stays until that ends
+        self._observed = self.leaving  # landmarks already observed in this step, which stay until it ends
         self._begin_submap()
 
     def begin_at(self, origin: np.ndarray, substate: np.ndarray, ids: np.ndarray, cov: np.ndarray) -> None:
-        """Places a map that was filled by `add_records`: its frame at `origin` (E,), the substate at (m,).
+        """Initialises a map filled by `add_records`: its frame at `origin` (E,), the substate at (m,).
 
-        Of that place, in its right chart, of the substate and of landmarks (K,) the covariance is (d + m + ΣD, …).
+        `cov` (d + m + ΣD, …) is the joint covariance of the frame (right chart), the substate and landmarks (K,).
         """
         own = slice(self.space.dim, self._first)
         self._begin_old(substate, cov[own, own])
@@ -158,32 +157,32 @@ class JointMap(MapOfRecords):
         self.cov[np.ix_(columns, columns)] = gaussian.symmetrise(cov)
 
     def _begin_old(self, mean: np.ndarray, cov: np.ndarray) -> None:
-        """No finished sub-map, and a substate as it is known before: of constants each of them is told what all say."""
+        """No finished sub-map, and the substate's prior; its constants are shared with all sub-maps."""
         own = slice(self._own.start - self.space.dim, None)
         self.old = SubMaps(
             self.space, self.point.dim, 2 * (self.submap or 0), self.unnamed, Constants(mean[own], cov[own, own])
         )
 
     def _begin_submap(self) -> None:
-        """At the robot, with no landmark, and with what all sub-maps say of their constants."""
+        """Starts a sub-map at the robot, without landmarks, with all sub-maps' estimate of the constants."""
         d, n = self.space.dim, self.n
         self.origin = self.space.identity()
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate if self.passed_on else self.old.known
         self.held = JointColumns(self.space, self._first, self.held.kinds)
-        self._walked = dict[int, np.ndarray]()  # what it has been loosened by, as seen from where it began
-        self._reach = 0.0  # distance from the frame at which its landmarks were begun, at most
+        self._walked = dict[int, np.ndarray]()  # random walk of its landmarks, relative to its start
+        self._reach = 0.0  # largest distance from the frame of its landmarks at their initialisation
         self._leave_step()
 
     def _leave_step(self) -> None:
-        self._in_step = False  # from prediction to correction: what is observed is associated with what is held
+        self._in_step = False  # from prediction to correction: associations refer to the current landmarks
         self._gain: np.ndarray | None = None
         self._rest: np.ndarray | None = None
-        self._reading: Reading | None = None  # of what is observed in this step
+        self._reading: Reading | None = None  # of this step's observations
 
     def presume(self, prior: Constants) -> None:
-        """When a window has ended: all that was observed, had the constants had this prior."""
+        """At the end of a window: replaces the constants' initial prior by this one in all estimates."""
         before, d = self.old.prior, self.space.dim
         self.old.presume(prior)
         mean, cov = exchanged(self.mean, self.cov, self._own, before, prior)
@@ -191,12 +190,12 @@ class JointMap(MapOfRecords):
         mean[:, :d] = 0.0
         self.mean, self.cov = mean, turn
         if self.old.maps:
-            if not self.passed_on:  # else about the start is what this one was given
+            if not self.passed_on:  # else `about` is the prior of this one
                 self.old.solve()
             self.old.look_from(self.finished())
 
     def pose_by_constants(self, particles: Particles) -> np.ndarray:
-        """How the robot's pose in the world moves with the constants, in the chart at its mean (d, k)."""
+        """Regression (d, k) of the robot's world pose on the constants, in the chart at its mean."""
         present, d = self._consolidated(particles), self.space.dim
         if self.old.maps:
             cov = self.old.end_and_constants(present.finished(self.old))[1]
@@ -205,7 +204,7 @@ class JointMap(MapOfRecords):
         return np.linalg.solve(cov[d:, d:], cov[d:, :d]).T
 
     def presumed(self, particles: Particles, prior: Constants) -> tuple[Constants, float]:
-        """What would be known of the constants if they had this prior, and by how many nats more probable all would be."""
+        """The constants' estimate if they had this prior, and the gain in log-evidence (nats)."""
         own = self.mean[:, self._own]
         mean, cov = gaussian.mixture_moments(particles.weights, own, self.cov[self._own, self._own][None])
         found = exchanged(mean, cov, slice(0, mean.size), self.old.prior, prior)
@@ -215,7 +214,7 @@ class JointMap(MapOfRecords):
         return self.mean[:, self.space.dim : self._first] if self._first > self.space.dim else None
 
     def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior | None:
-        """Joint distribution of the increment ε and all that is held, kept as (ξ, s, l) | ε; without a substate as it is."""
+        """Joint distribution of the increment ε and the map, stored as (ξ, s, l) | ε; unchanged without a substate."""
         coupling, dynamics, drift = transition.coupling, transition.dynamics, transition.drift
         d, m = space.dim, self._first - space.dim
         self._in_step = True
@@ -230,14 +229,14 @@ class JointMap(MapOfRecords):
         here = slice(d, self._first)
         substate = self.mean[:, here, None]
         self._increment_mean = (coupling @ substate)[..., 0]
-        # What particles may differ by here changes the covariance in the second order.
+        # Differences between particles change the covariance only in second order.
         blocks = coupling, dynamics, transition.noise_factor
         B, A, L = (block[0] if len(block) == 1 else block.mean(axis=0) for block in blocks)
         noise, cov = L @ L.T, self.cov
         increment = gaussian.symmetrise(B @ cov[here, here] @ B.T) + noise[:d, :d]
         cross = cov[:, here] @ B.T
         self._predicted = self.mean
-        if L[d:].any() or drift.any() or not (dynamics == np.eye(m)).all():  # else all stay what they are
+        if L[d:].any() or drift.any() or not (dynamics == np.eye(m)).all():  # else the map is unchanged
             self._predicted = self.mean.copy()
             self._predicted[:, here] = (dynamics @ substate)[..., 0] + drift
             cov = cov.copy()
@@ -246,7 +245,7 @@ class JointMap(MapOfRecords):
             cov[here, here] += noise[d:, d:]
             cross[here] = A @ cross[here] + noise[d:, :d]
         values, vectors = np.linalg.eigh(increment)
-        if values[0] < 0.0:  # by rounding, where the motion is known exactly and the path tells the substate
+        if values[0] < 0.0:  # rounding errors, if an exact motion determines the substate
             values = np.maximum(values, 0.0)
             increment = gaussian.symmetrise((vectors * values) @ vectors.T)
         known = values > SINGULAR * values[-1]
@@ -257,7 +256,7 @@ class JointMap(MapOfRecords):
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
     def decided(self, groups: Sequence[Observations], belief: Belief) -> Sequence[Observations]:
-        """How noisy observations with heavy tails are, Mathematics (joint-tails), and which are outliers (joint-outliers)."""
+        """Learns heavy-tailed observations' noise, Mathematics (joint-tails), and classifies outliers (joint-outliers)."""
         if any(group.likelihood is not None and np.isfinite(group.likelihood.dof) for group in groups):
             groups = with_tails(groups, *self._foreseen(groups, belief))
         if all(group.likelihood is None or group.likelihood.kernel_id == 0 for group in groups):
@@ -276,7 +275,7 @@ class JointMap(MapOfRecords):
         return self._seen_through(state, groups, prior).set_apart().information()
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
+        """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, each particle's innovations."""
         self.mean, self.cov = self._given(increment)
         self._gain, self._in_step, self._observed = None, False, self._observed[:0]
         if not groups:
@@ -298,12 +297,12 @@ class JointMap(MapOfRecords):
             self._increment_mean = take(self._increment_mean, ancestors)
 
     def consolidate(self, particles: Particles) -> Particles:
-        """Ends the window: the frame moves to the robot; what the particles differ by enters the common covariance."""
+        """Ends the window: the frame moves to the robot; the particles' spread enters the common covariance."""
         self._take(self._consolidated(particles))
         if self.submap is not None:
             if self.leaving.size or self._returning.size:
                 self._exchange()
-            # Where nothing is passed on, a sub-map that has been joined to the old ones is followed by one with nothing.
+            # Without `passed_on` a sub-map that is joined to the old ones is followed by an empty one.
             elif not (self._in_step or self.passed_on) and self.old.take(self.finished(), self._is_large()):
                 self._begin_submap()
             if self.old.maps:
@@ -311,20 +310,20 @@ class JointMap(MapOfRecords):
         return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
 
     def _is_large(self) -> bool:
-        """Whether the present sub-map should end: it is too much for a step, or reaches too far for one Gaussian."""
+        """Whether the current sub-map should end: it is too costly per step, or too extended for one Gaussian."""
         assert self.submap is not None
         away = np.linalg.norm(self.mean[0, self.held.of_one_kind(self.ids).columns], axis=1)
         return away.size >= self.submap or (away.size >= WORTH and bool(away.max() > LOCAL * self._reach))
 
     @property
     def is_full(self) -> bool:
-        """Whether more landmarks are held than a sub-map should have, without those that leave."""
+        """Whether the sub-map has more landmarks than it should, without those that leave."""
         return self.submap is not None and np.setdiff1d(self.ids, self.leaving).size > self.submap
 
     def make_room(self, order: np.ndarray) -> np.ndarray:
-        """Lets go of the first of these landmarks (K,) until half of a sub-map is left, if they are worth one.
+        """Removes the first of these landmarks (K,) until a sub-map is half full, if they are enough for a sub-map.
 
-        Points are put away, what is anchored is dropped. Returns which (k,) are gone, or will be when the window ends.
+        Points are put away, anchored ones dropped. Returns those (k,) removed now or at the end of the window.
         """
         assert self.submap is not None
         held = np.setdiff1d(self.ids, self.leaving).size
@@ -335,14 +334,14 @@ class JointMap(MapOfRecords):
         return away
 
     def put_away(self, ids: np.ndarray) -> None:
-        """Points (K,) go to the old sub-maps when the window ends: the present one ends there, and what stays goes over."""
+        """Moves points (K,) to old sub-maps at the end of the window: the current one ends there, the rest is passed on."""
         self.leaving = np.union1d(self.leaving, ids)
 
     def bring_back(self, ids: np.ndarray) -> bool:
-        """Points (K,) of old sub-maps are held again when the window ends, with all that is known of them; others stay.
+        """Adds points (K,) of old sub-maps at the end of the window, with all information about them; others stay.
 
-        Returns whether some can be: of those that are not about the start of the present one at least three, as many as tell
-        a pose in space; fewer are not worth a solution of all.
+        Returns whether any can be added: those not around the current start need at least three, the number that determines a
+        pose in space; fewer do not justify a joint solution.
         """
         if not ids.size and not self._returning.size:
             return False
@@ -352,7 +351,7 @@ class JointMap(MapOfRecords):
         return bool(near.any()) or np.isin(self._returning[~near], self.old.ids).sum() >= FEWEST
 
     def _exchange(self) -> None:
-        """Points leave for the old sub-maps, and others come back, Mathematics (passed-on); all particles are alike."""
+        """Moves points to and from old sub-maps, Mathematics (passed-on); all particles are equal."""
         leaving = self.leaving[self.holds(self.leaving)]
         returning = np.intersect1d(self._returning[~self.holds(self._returning)], self.old.ids)
         observed = np.isin(leaving, self._observed)
@@ -365,25 +364,25 @@ class JointMap(MapOfRecords):
         self._take(present)
 
     def finished(self) -> SubMap:
-        """The present sub-map as it would be if it ended here, when a window has just done so."""
+        """The current sub-map if it ended here, at the end of a window."""
         return self._present().finished(self.old)
 
     def _present(self) -> Present:
-        """The present sub-map, when a window has just ended and all particles are alike."""
+        """The current sub-map at the end of a window, when all particles are equal."""
         return Present(self.origin, self.held, self.mean[0], self.cov, self._given_ids, self._walked)
 
     def _take(self, present: Present) -> None:
-        """All particles are as the present sub-map is."""
+        """Sets all particles to the current sub-map."""
         self.origin, self.held, self.cov, self._given_ids = present.origin, present.held, present.cov, present.given
         self._walked = present.walked
         self.mean = np.repeat(present.mean[None], self.n, axis=0)
 
     def recognise(self, seen: Given, tied: bool = True) -> None:
-        """Points of old sub-maps are seen again from the frame, when a window has just ended: a loop is closed.
+        """Loop closure: points of old sub-maps are re-observed from the frame, at the end of a window.
 
-        The present sub-map, which does not hold them, ends here with them, all are solved for, linearised anew, and they are
-        held again. Not `tied`, what is seen is a sub-map of its own, as how the robot came here is not known: the substate
-        alone is held on.
+        The current sub-map, which does not have them, ends here with them, all are solved jointly with new linearisation
+        points, and the points are added. If not `tied`, without known motion to here, the sighting becomes a sub-map of its
+        own and only the substate is kept.
         """
         present = self._present()
         if tied:
@@ -397,7 +396,7 @@ class JointMap(MapOfRecords):
         self.old.look_from(self.finished())
 
     def widened(self) -> "JointMap":
-        """With the landmarks of old sub-maps that are next to the frame: what may be expected, and nothing is done with it."""
+        """A read-only copy extended by nearby landmarks of old sub-maps, for predicting their observations."""
         wide = copy(self)
         if self.old.beside is not None:
             wide.held, wide.mean, wide.cov = self.old.beside.widened(self.held, self.mean, self.cov)
@@ -405,13 +404,13 @@ class JointMap(MapOfRecords):
 
     @property
     def all_ids(self) -> np.ndarray:
-        """Of all landmarks, those of old sub-maps, too."""
+        """Ids of all landmarks, including old sub-maps'."""
         return self.ids if self.submap is None else np.union1d(self.ids, self.old.ids)
 
     def estimate(self, particles: Particles) -> Estimate:
-        """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
+        """The robot's pose in the world, with the particles' spread and the frame's uncertainty."""
         if self.old.maps and not self.passed_on:
-            # The present sub-map has begun some landmarks anew: what finished ones know of these counts here alone.
+            # The current sub-map has re-initialised some landmarks: only here the finished ones' information on them is used.
             return self.old.end(self._consolidated(particles).finished(self.old))
         d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
         origin, turn = self.space.mean(world, weights), self._turn(particles)
@@ -429,7 +428,7 @@ class JointMap(MapOfRecords):
             names, means, covs = self.landmarks(particles)
             rows = {name: row for row, name in enumerate(names.tolist())}
             if missing := [name for name in of.tolist() if name not in rows]:
-                raise InputError(f"the map holds no landmark {missing[0]}")
+                raise InputError(f"the map has no landmark {missing[0]}")
             chosen = [rows[name] for name in of.tolist()]
             return means[chosen], covs[chosen]
         if of == Part.STATE:
@@ -441,14 +440,14 @@ class JointMap(MapOfRecords):
         return self.landmarks(particles)[1:]
 
     def world(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """World_from_robot (n, E) of some particles, without what is uncertain about each one's frame."""
+        """World_from_robot (n, E) of some particles, at the mean of each one's frame."""
         if self.old.frame is None:
             return self._from_start(state, particles)
-        # Sub-maps tell the frame's place when it moves: it is the same until then.
+        # The pose of the frame from the sub-maps, constant between consolidations.
         return self.space.compose(self.old.frame.mean, state)
 
     def _from_start(self, state: np.ndarray, particles: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """As `world`, from where the present sub-map begins."""
+        """As `world`, relative to the current sub-map's start."""
         frame = self.space.retract(self.origin, self.mean[particles, : self.space.dim])
         return self.space.compose(frame, state)
 
@@ -458,7 +457,7 @@ class JointMap(MapOfRecords):
         d = space.dim
         world = self._from_start(state)
         origin, centre = space.mean(world, weights), space.mean(state, weights)
-        # Every particle's means as seen from its own robot, and T, by which the covariance turns with their mean.
+        # Each particle's means relative to its own robot, and the transformation T of the covariance at their mean.
         before = weighted_mean(self.mean, weights)
         moved = self.mean.copy()
         moved[:, :d] = space.local(origin, world)
@@ -469,7 +468,7 @@ class JointMap(MapOfRecords):
                 blocks.append((kind.columns, kind.landmark.seen_from(space, centre, before[kind.columns])[1]))
         held, clones = copy(self.held), self.held.clones
         if len(clones):
-            # Mathematics (clone), with K' what the mean of the particles sees.
+            # Mathematics (clone), with K' relative to the particles' mean pose.
             at = self.held.clone_columns(np.arange(len(clones)))
             poses = space.retract(clones, self.mean[:, at])
             held.clones = clones = space.between(centre, space.retract(clones, before[at]))
@@ -482,19 +481,19 @@ class JointMap(MapOfRecords):
         return Present(origin, held, mean, cov, self._given_ids, self._walked)
 
     def _turn(self, particles: Particles) -> np.ndarray:
-        """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
+        """Jacobian of the robot's pose by ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
         centre = self.space.mean(particles.state, particles.weights)
         frame = weighted_mean(self.mean[:, : self.space.dim], particles.weights)
         return self.space.adjoint(self.space.inverse(centre)) @ self.space.right_jacobian(frame)
 
     def _given(self, increment: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Means (N, n) given increments (N, d), and the covariance; a substate has been seen through the increment."""
+        """Means (N, n) given increments (N, d), and the covariance; the increment is a measurement of the substate."""
         if self._gain is None or increment is None:
             return self.mean, self.cov
         return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._left()
 
     def _left(self) -> np.ndarray:
-        """The covariance (n, n) given increments, made when it is asked for: `expected` does without."""
+        """The covariance (n, n) given increments, computed lazily: `expected` does not need it."""
         if self._rest is None:
             cov, half = self._before
             self._rest = plus_gram(cov.copy(), half.T, -1.0)
@@ -506,7 +505,7 @@ class JointMap(MapOfRecords):
         return self._reading.rows(groups, state, mean, self.origin if self.submap is None else None)
 
     def _seen_through(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Rows:
-        """The rows at predicted states; what has been seen through the increment of a substate moves with the state."""
+        """The rows at predicted states; if the increment measures a substate, the map moves with it."""
         increment = None if self._gain is None else self.space.local(prior.base, state)
         rows = self._rows(state, *self._given(increment), groups)
         if increment is None or self._gain is None:
@@ -514,7 +513,7 @@ class JointMap(MapOfRecords):
         return rows.moving(self._gain, self.space.right_jacobian_inverse(increment))
 
     def _foreseen(self, groups: Sequence[Observations], belief: Belief) -> tuple[np.ndarray, np.ndarray, list[Group]]:
-        """Mean (R,) and covariance (R, R) of the innovations under all particles, and whose rows they are."""
+        """Mean (R,) and covariance (R, R) of the innovations over all particles, and their groups."""
         prior, weights = belief.prior, belief.weights
         rows = self._seen_through(belief.state, groups, prior)
         by_state = rows.said[:, 1:].transpose(2, 0, 1)
@@ -544,7 +543,7 @@ class JointMap(MapOfRecords):
         return held
 
     def read(self, ids: np.ndarray, particles: np.ndarray | slice = slice(None)) -> Records:
-        """Means and covariances in the frame; of what is anchored those in the anchor's, whose clone is the constant."""
+        """Means and covariances in the frame; for anchored landmarks in the anchor's, whose clone is the constant."""
         kind = self.held.of_one_kind(np.asarray(ids))
         own = self.mean[particles]
         mean, blocks = own[:, kind.columns], diagonal_blocks(self.cov, kind.columns)
@@ -555,7 +554,7 @@ class JointMap(MapOfRecords):
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         if new_landmarks.mask is not None and not new_landmarks.mask.all():
-            raise InputError("a joint map's landmarks are in all particles")
+            raise InputError("a joint map's landmarks exist in all particles")
         model, z, own = new_landmarks.model, new_landmarks.z, slice(self.space.dim, self._first)
         records = self.first_records(new_landmarks, state)
         ids = self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
@@ -565,7 +564,7 @@ class JointMap(MapOfRecords):
                 centre, middle = self.space.mean(state, np.full(self.n, 1.0 / self.n)), records.mean.mean(axis=0)
                 slope = np.linalg.solve(new_landmarks.landmark.seen_from(self.space, centre, middle)[1], slope)
             by_own = slope.reshape(-1, slope.shape[-1])
-            last = slice(len(self.cov) - len(by_own), None)  # where they are
+            last = slice(len(self.cov) - len(by_own), None)  # their columns
             self.mean[:, last] += (self.mean[:, own] - model.about) @ by_own.T
             self.cov[last] += by_own @ self.cov[own]
             self.cov[:, last] += self.cov[:, own] @ by_own.T
@@ -574,9 +573,9 @@ class JointMap(MapOfRecords):
     def add_records(
         self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> np.ndarray:
-        """As `Map.add_records`; the poses that the constants of anchored landmarks are become clones."""
+        """As `Map.add_records`; the anchor poses of anchored landmarks become clones."""
         if log_odds is not None:
-            raise InputError("a joint map's landmarks are in all particles")
+            raise InputError("a joint map's landmarks exist in all particles")
         self.register(landmark)
         if not (np.isfinite(records.mean).all() and np.isfinite(records.cov).all()):
             raise InputError("a new landmark has a mean or covariance that is not finite")
@@ -584,7 +583,7 @@ class JointMap(MapOfRecords):
         ids = self.checked_new_ids(ids, count, self._next_id)
         if not landmark.anchored:
             self._reach = max(self._reach, float(np.linalg.norm(records.mean[0], axis=-1).max(initial=0.0)))
-        # Given the path, what is new owes its error to its own measurement alone, and a clone of the path has none.
+        # Given the path, a new landmark's error is that of its measurement alone, and a clone of the path has none.
         mean = np.broadcast_to(records.mean, (self.n, count, dim)).reshape(self.n, -1)
         clone, origins, places = np.full(count, -1), np.zeros((0, self.space.size)), np.zeros((self.n, 0, d))
         if landmark.anchored:
@@ -597,9 +596,7 @@ class JointMap(MapOfRecords):
         old, grown = self.mean.shape[1], self.mean.shape[1] + places.shape[1] * d + mean.shape[1]
         if grown > LARGEST:
             most = (LARGEST - self._first) // self.point.dim
-            raise InputError(
-                f"a joint map holds at most {most} landmarks: keep maps of the particles' own (map=particles)"
-            )
+            raise InputError(f"a joint map holds at most {most} landmarks: use per-particle maps (map=particles)")
         self.mean = np.concatenate([self.mean, places.reshape(self.n, -1), mean], axis=1)
         cov = np.empty((grown, grown))
         cov[:old, :old], cov[old:], cov[:old, old:] = self.cov, 0.0, 0.0
@@ -610,10 +607,10 @@ class JointMap(MapOfRecords):
         return ids
 
     def register(self, landmark: Landmark) -> None:
-        """Names a parametrisation before it is first used, so that a checkpoint can be read back.
+        """Registers a parametrisation before its first use, so that a checkpoint can be loaded.
 
-        The filter that saves and the one that loads name the same ones in the same order. Raises InputError: it has
-        components, constants that are no anchor, or does not say how it moves with the frame.
+        The saving and the loading filter must register the same ones in the same order. Raises InputError: it has several
+        components, constants that are not an anchor, or no `seen_from`.
         """
         if self.held.number(landmark) >= 0:
             return
@@ -621,7 +618,7 @@ class JointMap(MapOfRecords):
         fits = landmark.components == 1 and landmark.constants == (0 if anchor is None else space.size)
         if not fits or landmark.point(np.zeros(landmark.dim), anchor)[0].shape != (self.point.dim,):
             raise InputError(
-                f"a joint map of {space} holds Point({self.point.dim}), or what is anchored at a pose, in all particles, "
+                f"a joint map of {space} holds Point({self.point.dim}), or anchored landmarks, in all particles, "
                 f"not {type(landmark).__name__}"
             )
         landmark.seen_from(space, space.identity(), np.zeros(landmark.dim))
@@ -637,20 +634,20 @@ class JointMap(MapOfRecords):
         self.mean, self.cov = self.mean[:, columns], principal(self.cov, columns)
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
-        """Turns anchored landmarks into points of the frame: with all that they are correlated with, to first order.
+        """Converts anchored landmarks to points in the frame, with their correlations, to first order.
 
-        Their mean is that of the landmark's own transform: the mean of 1/q is not 1/q̄, and what is promoted as soon as it may
-        be would all come too near.
+        Their mean is that of the landmark's own transform: the mean of 1/q is not 1/q̄, which would place all landmarks
+        promoted as early as possible too near.
         """
         ids = np.asarray(ids, dtype=np.int64)
         if not ids.size:
             return
         kind = self.held.of_one_kind(ids)
         if not kind.landmark.anchored or self.held.number(to or self.point) != 0 or kind.landmark.dim != self.point.dim:
-            raise InputError(f"a joint map turns what is anchored into Point({self.point.dim})")
+            raise InputError(f"a joint map promotes anchored landmarks to Point({self.point.dim})")
         points, slopes = kind.landmark.promote(self.read(ids)).mean, self.held.points(kind, self.mean)[1]
         slope, columns = slopes.mean(axis=0), np.concatenate([kind.columns, kind.clones], axis=1)
-        # P' = T P Tᵀ, where T has the slope in the rows of each landmark.
+        # P' = T P Tᵀ, where T has the Jacobian in the rows of each landmark.
         for _ in range(2):
             self.cov[kind.columns] = slope @ self.cov[columns]
             self.cov = self.cov.T
@@ -662,7 +659,7 @@ class JointMap(MapOfRecords):
         self._keep(self.held.drop(kind.rows[:0]))
 
     def loosen(self, ids: np.ndarray, cov: np.ndarray) -> None:
-        """Landmarks (K,) may have moved by as much, covariance (K, D, D), in the frame: each by itself."""
+        """Adds process noise (K, D, D) to the positions of landmarks (K,) in the frame, independently."""
         columns = self.held.of_one_kind(ids).columns
         self.cov = self.cov.copy()
         for held in [self.cov] if self._gain is None else [self.cov, self._left()]:
@@ -675,7 +672,7 @@ class JointMap(MapOfRecords):
         return np.zeros((self.n, ids.size))
 
     def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
-        raise InputError("a joint map keeps no log-odds")
+        raise InputError("a joint map has no log-odds")
 
     def expected(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         kind, prior = self.held.of_one_kind(np.asarray(ids)), belief.prior
@@ -690,7 +687,7 @@ class JointMap(MapOfRecords):
         return predicted, within
 
     def project_jointly(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[Array, Array]:
-        """`project`, with what the landmarks have in common: mean (K, p) and covariance (K p, K p)."""
+        """`project` with cross-covariances of the landmarks: mean (K, p) and covariance (K p, K p)."""
         mode = slice(belief.mode, belief.mode + 1)
         records = self.read(ids, mode)
         z = model.predict(belief.state[mode, None], records.mean, records.const)[0]
@@ -698,7 +695,7 @@ class JointMap(MapOfRecords):
         return z - nu.reshape(z.shape), cov
 
     def expected_alone(self, model: ObservationModel, belief: Belief, ids: np.ndarray) -> tuple[Array, Array]:
-        """`project_jointly` of each landmark by itself: mean (K, p) and covariance (K, p, p)."""
+        """`project_jointly` without cross-covariances: mean (K, p) and covariance (K, p, p)."""
         mean, cov = self.project_jointly(model, ids, belief)
         return mean, diagonal_blocks(cov, np.arange(mean.size).reshape(mean.shape))
 
@@ -734,11 +731,11 @@ class JointMap(MapOfRecords):
         self.held.restore(arrays, "joint/", self.mean.shape[1])
         self._next_id = int(found["next"][0])
         if np.unique(self.ids).size < self.ids.size or self.ids.max(initial=-1) >= self._next_id:
-            raise InputError("the array joint/ids names a landmark twice, or one that was never started")
+            raise InputError("the array joint/ids has a landmark twice, or one that never existed")
         if self.submap is not None:
             self.old.restore(arrays)
             self._given_ids, self.leaving, self._returning = found["given"], found["leaving"], found["returning"]
             self._walked = dict(zip(found["walked_ids"].tolist(), found["walked"], strict=True))
             self._reach = float(found["reach"][0]) if "reach" in found else 0.0
             if not np.isin(self._given_ids, self.old.about.ids).all():
-                raise InputError("the array joint/given names a landmark that is not about the start of the sub-map")
+                raise InputError("the array joint/given has a landmark that is not around the start of the sub-map")

@@ -1,4 +1,4 @@
-"""A growing map of landmarks, each an independent Gaussian given the trajectory (E06 (1), S05 (3))."""
+"""A growing map of landmarks, conditionally independent Gaussians given the trajectory (E06 (1), S05 (3))."""
 
 from collections.abc import Sequence
 from operator import is_
@@ -26,10 +26,10 @@ class LandmarkMap(rows.MapOfRecords):
 
     Args:
         space: the group of the sampled state.
-        evidence: keep per particle the log-odds that each landmark exists (unknown association needs it); a
-            landmark may then be present in some particles only.
-        compiled: use the models' fused kernels where they have one.
-        part: its name, another one than Part.LANDMARK where it stands beside a second map.
+        evidence: store per particle the log-odds that each landmark exists (needed for unknown association); a landmark may
+            then exist in some particles only.
+        compiled: use the fused kernels of models that have one.
+        part: its name, for a second map another one than Part.LANDMARK.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class LandmarkMap(rows.MapOfRecords):
         self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> np.ndarray:
         if log_odds is not None and not self.evidence:
-            raise InputError("landmarks of some particles only need a map with evidence=True")
+            raise InputError("landmarks in some particles only need a map with evidence=True")
         kind = self.register(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
         ids = self.checked_new_ids(ids, len(columns), self.store.columns.next_id)
@@ -99,7 +99,7 @@ class LandmarkMap(rows.MapOfRecords):
             self.store.columns.kind[self.store.columns.rows(landmark_id)] = kind
 
     def ready(self, weights: np.ndarray, fraction: float = 0.95) -> np.ndarray:
-        """Landmarks of several components or with constants that are ready in `fraction` of the weight (N,)."""
+        """Landmarks with several components or constants that are ready in `fraction` of the weights (N,)."""
         ready = []
         for landmark_id in self.ids.tolist():
             landmark = self.landmark_of(landmark_id)
@@ -113,7 +113,7 @@ class LandmarkMap(rows.MapOfRecords):
     def read(self, ids: np.ndarray, particles: np.ndarray | slice = ALL) -> Records:
         ids = np.asarray(ids)
         if ids.size == 0:
-            raise InputError("no landmark was named")
+            raise InputError("no landmark id was given")
         kinds = self.store.columns.kinds(ids)
         if kinds[0] < 0 or (kinds != kinds[0]).any():
             self._known(ids)
@@ -121,7 +121,7 @@ class LandmarkMap(rows.MapOfRecords):
         return self.layouts[kinds[0]].unpack(self.store.read_all(ids, particles))
 
     def moments(self, particles: Particles, of: Part | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `Belief.moments`, of the particles in which a landmark exists; one that exists in none, of all that hold it."""
+        """As `Belief.moments`, over the particles in which a landmark exists, or if it exists in none, over all with it."""
         moments = []
         for landmark_id in (self.ids if isinstance(of, Part) else of).tolist():
             landmark, records = self.landmark_of(landmark_id), self.read(np.array([landmark_id]))
@@ -140,7 +140,7 @@ class LandmarkMap(rows.MapOfRecords):
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         self._known(ids)
         prior, weights, landmark = belief.prior, belief.weights, self._layout_of(int(ids[0])).landmark
-        # A constraint is projected by its prediction.
+        # Models with their own `innovation` are projected by their `predict`.
         is_plain = type(model).innovation is ObservationModel.innovation and landmark.components == 1
         kernel = rows.fused_kernel(model) if self.compiled and is_plain else None
         if kernel is not None:
@@ -160,7 +160,7 @@ class LandmarkMap(rows.MapOfRecords):
 
     def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
         if not self.evidence:
-            raise InputError("this map keeps no log-odds: build it with evidence=True")
+            raise InputError("this map has no log-odds: build it with evidence=True")
         for landmark_id, column in zip(ids.tolist(), log_odds.T, strict=True):
             record = self.store.read(landmark_id)
             if np.array_equal(record[-1], column):
@@ -171,7 +171,7 @@ class LandmarkMap(rows.MapOfRecords):
         self.remove(gone)
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        """Information of single-Gaussian landmarks; those of several components enter after sampling."""
+        """Information of single-Gaussian landmarks; mixtures enter after sampling."""
         for_state = [group for group in groups if Part.STATE in group.updates]
         return self._engine.information(self._plan(for_state), state, for_state, prior)
 
@@ -180,7 +180,7 @@ class LandmarkMap(rows.MapOfRecords):
         for group in groups:
             uses[group.updates].append(group)
         if uses[STATE] and uses[BOTH]:
-            # Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others.
+            # Rows of one landmark are correlated through it; rows that do not update it cannot be stacked with others.
             named = ([np.ravel(each.ids) for each in uses[use] if each.ids is not None] for use in (STATE, BOTH))
             one, other = (np.concatenate(ids) for ids in named)
             shared = np.intersect1d(one[one >= 0], other)
@@ -201,7 +201,7 @@ class LandmarkMap(rows.MapOfRecords):
         return LogDensities(log_density, after_sampling)
 
     def _density(self, state: np.ndarray, groups: Sequence[Observations]) -> np.ndarray:
-        """Log p(z | x) (N,) of observations that leave the landmarks as they are."""
+        """Log p(z | x) (N,) of observations that do not update the landmarks."""
         plan = self._plan(groups)
         if plan.mixtures:
             raise InputError("a landmark of several components cannot be observed without being updated")
@@ -209,7 +209,7 @@ class LandmarkMap(rows.MapOfRecords):
             found = self._engine.information(plan, state, groups, Prior.exactly(self.space, state))
             return found.log_factor - 0.5 * (found.quad + found.log_det)
         if plan.joint:
-            raise InputError("a landmark observed twice in a step needs a Gaussian likelihood to be left as it is")
+            raise InputError("a landmark observed twice in a step without being updated needs a Gaussian likelihood")
         total = plan.log_factor.copy()
         for batch in plan.batches:
             *_, log_terms = self._engine.updated(batch, groups[batch.group], state)
@@ -217,14 +217,14 @@ class LandmarkMap(rows.MapOfRecords):
         return total
 
     def resample(self, ancestors: np.ndarray) -> None:
-        """Nothing is copied: the lineage has advanced. Compacts what has lost its descendants."""
+        """Nothing is copied: the lineage has advanced. Compacts columns of extinct lineages."""
         self.store.compact()
 
     def arrays(self) -> dict[str, np.ndarray]:
         return self.store.arrays() | {"map/kinds": self.store.columns.kinds(self.ids)}
 
     def options(self) -> dict[str, object]:
-        """Whether there are log-odds, and the parametrisations in the order of their numbers."""
+        """Whether the map has log-odds, and the parametrisations in the order of their numbers."""
         kinds = {
             f"landmark kind {number}": f"{type(kind).__name__} {kind.dim, kind.constants, kind.components}"
             for number, kind in enumerate(layout.landmark for layout in self.layouts)
@@ -242,9 +242,9 @@ class LandmarkMap(rows.MapOfRecords):
         self.store.columns.kind[:] = kinds
 
     def register(self, landmark: Landmark) -> int:
-        """Names a parametrisation before it is first used, so that a checkpoint can be read back; returns its number.
+        """Registers a parametrisation before its first use, so that a checkpoint can be loaded; returns its number.
 
-        The filter that saves and the one that loads name the same ones in the same order.
+        The saving and the loading filter must register the same ones in the same order.
         """
         layout = Layout(landmark, self.evidence)
         if layout not in self.layouts:
@@ -252,7 +252,7 @@ class LandmarkMap(rows.MapOfRecords):
         return self.layouts.index(layout)
 
     def _plan(self, groups: Sequence[Observations]) -> rows.Plan:
-        """A step asks for the plan of the same groups again and again; a resampling may have replaced some."""
+        """Cached, as a step needs the plan of the same groups several times; a resampling may have replaced some."""
         planned = self._planned
         if planned is not None and len(planned[0]) == len(groups) and all(map(is_, planned[0], groups)):
             return planned[1]
@@ -268,4 +268,4 @@ class LandmarkMap(rows.MapOfRecords):
         named = np.asarray(ids)
         held = self.store.columns.held(named)
         if not held.all():
-            raise InputError(f"the map holds no landmark {named[~held][0]}")
+            raise InputError(f"the map has no landmark {named[~held][0]}")

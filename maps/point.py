@@ -9,8 +9,8 @@ from rbpf.core.models import Landmark, Records, RigidSpace
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 
-#: Distance from the heaviest component of a mixture, in its standard deviations, within which another one says the same;
-#: and the weight that these must have together for the mixture to be a single Gaussian.
+#: Distance from the heaviest component of a mixture, in its standard deviations, within which others count as the same mode;
+#: and the weight of that mode at which the mixture can become a single Gaussian.
 REACH, DOMINANT = 3.0, 0.99
 
 
@@ -51,9 +51,9 @@ class AnchoredPoint(Landmark):
 
 @final
 class MixturePoint(Landmark):
-    """A world point as C ≥ 2 weighted Gaussians in 2 or 3 dimensions, as the ring that a range-only beacon leaves.
+    """A world point as C ≥ 2 weighted Gaussians in 2 or 3 dimensions, such as the ring of a range-only beacon.
 
-    It is ready to become a single one when the components within reach of the heaviest dominate: Mathematics (mixture).
+    It can become a single one once the components close to the heaviest one dominate: Mathematics (mixture).
     """
 
     def __init__(self, components: int, dim: int = 2) -> None:
@@ -73,9 +73,9 @@ class MixturePoint(Landmark):
 
 
 def ring_components(radius: float, std_radius: float, dim: int = 2) -> int:
-    """The fewest Gaussians that follow a circle, or in 3 dimensions a sphere; radius and its deviation in metres.
+    """Least number of Gaussians for a circle, or in 3 dimensions a sphere; radius and standard deviation in metres.
 
-    Each is flat: at one standard deviation along it the curve must be no further away than half the deviation across it.
+    Each is flat: one standard deviation along it the curve may be off by at most half the standard deviation across it.
     """
     bend = std_radius / radius
     if dim == 3:
@@ -84,11 +84,11 @@ def ring_components(radius: float, std_radius: float, dim: int = 2) -> int:
 
 
 def ring(centre: np.ndarray, radius: np.ndarray, std_radius: float, components: int | None = None) -> Records:
-    """Gaussians along a circle, or over a sphere, for a beacon whose range alone was measured; neighbours overlap at one σ.
+    """Gaussians along a circle, or over a sphere, for a range-only measurement of a beacon; neighbours overlap at one σ.
 
-    Centres (N, D) of the sensor, D = 2 or 3, and ranges (K,), metres, with the deviation `std_radius`, give records with
-    means (N, K, C, D), covariances (N, K, C, D, D) and equal weights; C is that of the landmarks' `MixturePoint`, by default
-    what the longest range needs. Raises InputError: the range needs more components than C.
+    Centres (N, D) of the sensor, D = 2 or 3, and ranges (K,) with standard deviation `std_radius`, in metres, give records
+    with means (N, K, C, D), covariances (N, K, C, D, D) and equal weights; C is that of the landmarks' `MixturePoint`, by
+    default that of the longest range. Raises InputError: the range needs more components than C.
     """
     (n, dim), k, longest = centre.shape, radius.size, float(radius.max(initial=std_radius))
     needed = ring_components(longest, std_radius, dim)

@@ -1,6 +1,6 @@
-"""Observations of landmarks in a step: which of them must be taken together, and what they say and change.
+"""Landmark observations of a step: which are processed jointly, their information, and their updates.
 
-Rows that speak of different landmarks are independent given the state; rows of one landmark that a particle observes
+Rows of different landmarks are independent given the state; rows of one landmark that a particle observes
 twice in a step (two cameras, two groups) are correlated through it and are stacked. Rows run compiled where the model
 has a kernel, else in NumPy.
 """
@@ -41,13 +41,13 @@ from rbpf.maps.store import Layout, SharedStore
 #: What observations update.
 STATE, MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
 BOTH = STATE | MAP
-#: Numbers (K,) of the parametrisations of landmarks (K,), -1 where the map holds none.
+#: Numbers (K,) of the parametrisations of landmarks (K,), -1 if not in the map.
 Kinds = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Row:
-    """Measurement k of a group speaks of a landmark, in the particles of `mask` (N,); None is all."""
+    """Measurement k of a group, of one landmark, in the particles of `mask` (N,); None is all."""
 
     group: int
     k: int
@@ -63,20 +63,20 @@ class Batch:
     ks: np.ndarray
     ids: np.ndarray
     mask: np.ndarray | None = None
-    #: What the drivers take of it in every stage of a step, in parts; found when it is first asked for.
+    #: Inputs of the drivers in all stages of a step, in parts; computed on first use.
     for_drivers: "list[ForDrivers]" = field(default_factory=list)
 
     def some(self, rows: np.ndarray | slice) -> "Batch":
-        """A part of its rows."""
+        """The batch of some rows."""
         mask = None if self.mask is None else self.mask[:, rows]
         return Batch(self.group, self.ks[rows], self.ids[rows], mask)
 
 
 class ForDrivers(NamedTuple):
-    """What the drivers take of a part of a batch, whatever the states are."""
+    """The drivers' inputs for a part of a batch that do not depend on the states."""
 
     ids: np.ndarray
-    kernel: FusedKernel | None  #: None where the model is linearised in NumPy.
+    kernel: FusedKernel | None  #: None if the model is linearised in NumPy.
     #: z (K, p), their covariances, the mask (K, N) or (0, 0), and the likelihood's number and parameters.
     measured: tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]
     sizes: np.ndarray  #: d, D, A.
@@ -84,9 +84,9 @@ class ForDrivers(NamedTuple):
 
 @dataclass
 class Plan:
-    """All rows of a step, and what new and clutter observations cost (N,).
+    """All rows of a step, and the log-densities (N,) of new and clutter observations.
 
-    Independent rows of single-Gaussian landmarks, rows that share a landmark, and rows of landmarks with several components,
+    Independent rows of single-Gaussian landmarks, rows that share a landmark, and rows of mixture landmarks,
     which enter after sampling.
     """
 
@@ -97,10 +97,10 @@ class Plan:
 
 
 def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.ndarray) -> Plan:
-    """Sorts the rows of all groups, which read a landmark.
+    """Sorts the rows of all groups that read landmarks.
 
-    `kinds` gives landmarks (K,) the numbers (K,) of their parametrisations, -1 where the map holds none; `plain` (kinds,)
-    says whether one has a single component. Raises InputError: ids are missing, of a wrong shape, or of no landmark held.
+    `kinds` gives landmarks (K,) the numbers (K,) of their parametrisations, -1 if not in the map; `plain` (kinds,)
+    tells which are single Gaussians. Raises InputError: ids are missing, of a wrong shape, or not in the map.
     """
     plan = Plan(np.zeros(n))
     found = [_checked_ids(group, n, kinds) for group in groups]
@@ -110,10 +110,10 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
             if log_density != 0.0:
                 count = (ids == outcome).sum(axis=-1)
                 plan.log_factor += np.where(count > 0, log_density, 0.0) * count
-    # Where all particles agree, no landmark is observed twice and each group's have one plain parametrisation.
+    # Fast path: all particles agree, no landmark is observed twice, and each group has one plain parametrisation.
     seen = [landmark for ids in named if ids.ndim == 1 for landmark in ids.tolist() if landmark >= 0]
     agreed = all(ids.ndim == 1 for ids in named) and len(set(seen)) == len(seen)
-    # A group that names no landmark has no kind that could differ.
+    # A group without landmarks has no kind that could differ.
     if agreed and all(of.size == 0 or (plain[of[0]] and (of == of[0]).all()) for _, of in found):
         chosen = [np.flatnonzero(ids >= 0) for ids in named]
         plan.batches = [Batch(number, ks, named[number][ks]) for number, ks in enumerate(chosen) if ks.size]
@@ -128,7 +128,7 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
         if not plain[kind]:
             plan.mixtures.extend(observed)
             continue
-        # Whether some particle observes the landmark in two rows.
+        # Whether any particle observes the landmark in two rows.
         masks = [row.mask for row in observed if row.mask is not None]
         if len(observed) > 1 and (len(masks) < len(observed) or (np.sum(masks, axis=0) > 1).any()):
             plan.joint.append(observed)
@@ -147,7 +147,7 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.nd
 
 
 def _checked_ids(group: Observations, n: int, kinds: Kinds) -> tuple[np.ndarray, np.ndarray]:
-    """The landmarks of a group's measurements, and the kinds of those that are some."""
+    """The ids of a group's measurements, and the kinds of those that are landmarks."""
     ids, count = group.ids, group.z.shape[0]
     if ids is None:
         raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
@@ -158,7 +158,7 @@ def _checked_ids(group: Observations, n: int, kinds: Kinds) -> tuple[np.ndarray,
     named = ids[ids >= 0]
     of = kinds(named)
     if (of < 0).any():
-        raise InputError(f"a measurement names landmark {named[of < 0][0]}, which the map does not hold")
+        raise InputError(f"a measurement is of landmark {named[of < 0][0]}, which is not in the map")
     return ids, of
 
 
@@ -175,7 +175,7 @@ def _rows(number: int, ids: np.ndarray) -> list[Row]:
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
-#: Particle-observation pairs that NumPy takes at once, so that what it works on stays in the second-level cache.
+#: Particle-observation pairs processed at once by NumPy, so that the arrays fit the second-level cache.
 PAIRS_AT_ONCE = 8192
 
 
@@ -189,7 +189,7 @@ class RowEngine:
         self.compiled = compiled
 
     def information(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        """Information of all rows but those of mixtures, about a right perturbation of the states (N, E)."""
+        """Information of all rows except mixtures, about a right perturbation of the states (N, E)."""
         n = state.shape[0]
         total = Information.zeros(n, self.space.dim)
         total.log_factor += plan.log_factor
@@ -216,7 +216,7 @@ class RowEngine:
                 [not _likelihood(groups[row.group]).normalised for row in rows],
                 [groups[row.group].model.dim for row in rows],
             )
-            # ½ log|2πS| of these rows, whose likelihood is no density.
+            # ½ log|2πS| of rows whose likelihood is not normalised.
             chol = gaussian.cholesky(2.0 * np.pi * cov[:, literal][:, :, literal])
             total.log_factor += 0.5 * gaussian.log_det(chol)
         return total
@@ -245,7 +245,7 @@ class RowEngine:
         return self.compiled and _likelihood(group).kernel_id >= 0
 
     def _for_drivers(self, batch: Batch, group: Observations) -> list[ForDrivers]:
-        """Of a batch as the drivers take it: whole, or so much of it at once as NumPy linearises in the cache."""
+        """The drivers' inputs of a batch: whole, or in parts that NumPy can linearise in the cache."""
         if not batch.for_drivers:
             kernel, parts = fused_kernel(group.model), [batch]
             if kernel is None:
@@ -267,9 +267,9 @@ class RowEngine:
     def _observed(
         self, part: ForDrivers, group: Observations, state: np.ndarray, by: frozenset[Part]
     ) -> tuple[tuple[int, np.ndarray, np.ndarray], tuple[Any, ...]]:
-        """What both drivers take: the kernel and the states; the measurements and their likelihood.
+        """Common inputs of both drivers: the kernel and the states; the measurements and their likelihood.
 
-        A model without a kernel is linearised in NumPy, and its rows are handed on.
+        A model without a kernel is linearised in NumPy, and its rows are passed instead.
         """
         kernel, (z, *likelihood) = part.kernel, part.measured
         if kernel is None:
@@ -287,7 +287,7 @@ class RowEngine:
         return columns, self.layout_of(int(ids[0])).unpack(columns)
 
     def _write(self, ids: np.ndarray, columns: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> None:
-        """Writes new Gaussians (N, K, …) into columns (K, fields, N); their other fields stay."""
+        """Writes new Gaussians (N, K, …) into columns (K, fields, N); other fields are unchanged."""
         fields = np.concatenate([mean, gaussian.pack(cov)], axis=-1)
         fields = np.moveaxis(fields.reshape(*fields.shape[:2], -1), 0, -1)
         columns[:, : fields.shape[1]] = fields
@@ -316,7 +316,7 @@ class RowEngine:
     ) -> tuple[np.ndarray, np.ndarray, Records, np.ndarray, np.ndarray, np.ndarray]:
         """Stacked ν (N, Σp), [H J], the landmark's records, R, the log-density of rows taken as outliers, and rows used (N,).
 
-        With a prior, rows whose likelihood is not Gaussian pass its gate or take no part.
+        With a prior, rows with a non-Gaussian likelihood are used only if they pass its gate.
         """
         _, records = self._read(np.array([rows[0].landmark]))
         nus, jacs, noises, masks = [], [], [], []
@@ -341,9 +341,9 @@ class RowEngine:
         return nu, jac_all, records, noise, log_factor, used
 
     def _correct_joint(self, rows: list[Row], groups: Sequence[Observations], state: Array, log_density: Array) -> None:
-        """Stacked where all rows are Gaussian; else one after the other, each with its own likelihood's density.
+        """Stacked if all rows are Gaussian; else sequentially, each with the density of its own likelihood.
 
-        They are sorted by what was measured, so that the order within a frame does not matter.
+        They are sorted by measurement, so that the order within a frame does not matter.
         """
         if any(_likelihood(groups[row.group]).kernel_id != 0 for row in rows):
             for row in sorted(rows, key=lambda row: groups[row.group].z[row.k].tolist()):
@@ -394,7 +394,7 @@ def fused_kernel(model: ObservationModel) -> FusedKernel | None:
 
 
 def _one_after_the_other(batch: Batch) -> list[Batch]:
-    """A landmark that particles associate with several measurements is updated by one after the other."""
+    """Splits a batch so that a landmark associated with several measurements is updated sequentially."""
     parts, pending = [], np.arange(batch.ids.size)
     while pending.size:
         _, first = np.unique(batch.ids[pending], return_index=True)
@@ -408,13 +408,13 @@ def _likelihood(group: Observations) -> Likelihood:
 
 
 class MapOfRecords(Map):
-    """What every map does alike: numbers for new landmarks, and what the particles expect to measure of those they hold."""
+    """Common base of the maps: ids of new landmarks, and predicted measurements."""
 
     space: LieGroup
-    compiled: bool  #: use the models' fused kernels where they have one.
+    compiled: bool  #: use the fused kernels of models that have one.
 
     def checked_new_ids(self, ids: np.ndarray | None, count: int, next_id: int) -> np.ndarray:
-        """Numbers (K,) of `count` new landmarks, from `next_id` on where none are given; errors as `add_records`."""
+        """Ids (K,) of `count` new landmarks, by default from `next_id` on; errors as of `add_records`."""
         if ids is None:
             return np.arange(next_id, next_id + count)
         ids = np.asarray(ids)
@@ -427,7 +427,7 @@ class MapOfRecords(Map):
         return ids.astype(np.int64)
 
     def first_records(self, new: NewLandmarks, state: np.ndarray) -> Records:
-        """Estimates (N, K, …) of landmarks that are started at states (N, E)."""
+        """Estimates (N, K, …) of landmarks initialised from states (N, E)."""
         name = type(new.model).__name__
         return new.model.initialise(state, numbers(new.z, f"z of {name}"), numbers(new.cov, f"cov of {name}"))
 

@@ -1,9 +1,9 @@
 """Copy-on-write store of landmark records, shared between particles along their ancestry.
 
-A landmark is a column: one record per particle, field by field, written in some generation of the lineage. Particles
-that descend from the same writer read the same row, so resampling copies nothing here, whatever the map's size. A
-column is rewritten only when it is observed; one that is left alone is compacted to the rows that still have
-descendants, whose number falls like 1/age as lineages coalesce. See `docs/adr` for the comparison with a tree.
+A landmark is a column: one record per particle, field by field, written in some generation of the lineage. Particles with the
+same writer as ancestor read the same row, so resampling copies nothing here, whatever the map's size. A column is rewritten
+only when it is observed; unobserved ones are compacted to the rows that still have descendants, whose number falls like 1/age
+as lineages coalesce. See `docs/adr` for the comparison with a tree.
 """
 
 from contextlib import suppress
@@ -29,19 +29,19 @@ _TABLES = {
 _HOT = {"data": numbers("fields", "n", values="log")}
 _COLD = {"kept": integers("kept", least=0, below="n", ascending=True), "data": numbers("fields", "kept", values="log")}
 
-#: A column with fewer surviving rows than this fraction of the particles gives its dense slab back.
+#: A column with fewer surviving rows than this fraction of the particles is compacted and its dense slab freed.
 HOT_FRACTION = 0.75
-COLD_FRACTION = 0.9  #: A compacted column is compacted again when no more than this fraction of its rows survives.
+COLD_FRACTION = 0.9  #: A compacted column is compacted again once at most this fraction of its rows survives.
 
 _FIRST_SLABS = 32
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How a landmark's estimate lies in a record of fixed size.
+    """Layout of a landmark's estimate in a record of fixed size.
 
-    Per component the mean (D) and the covariance's lower triangle by rows (D(D+1)/2); the components' log-weights where there
-    are several; the constants (A); where the map keeps them, the log-odds that the landmark exists.
+    Per component the mean (D) and the covariance's lower triangle by rows (D(D+1)/2); the log-weights of several components;
+    the constants (A); with evidence, the log-odds that the landmark exists.
     """
 
     landmark: Landmark
@@ -117,9 +117,9 @@ class Layout:
 
 @final
 class Columns:
-    """Tables of the columns that are held, and of no others: a filter may run for ever in a world that changes.
+    """Tables of the existing columns only, so that memory is bounded however many landmarks come and go.
 
-    Row r of every table is the column with the r-th id, in the order in which they came. Ids are the caller's, or counted up
+    Row r of every table is the column with the r-th id, in order of addition. Ids are the caller's, or counted up
     from the largest used.
     """
 
@@ -128,22 +128,22 @@ class Columns:
         self._hold(np.zeros((5, 0), dtype=np.int64))
 
     def rows(self, ids: np.ndarray | int) -> np.ndarray:
-        """Rows (K,) of columns (K,), which must be held; of a single one its number."""
+        """Rows (K,) of columns (K,), which must exist; for a single one its number."""
         return self._order[self._ascending.searchsorted(ids)]
 
     def held(self, ids: np.ndarray) -> np.ndarray:
-        """Whether each of some ids (K,) is that of a column held, (K,) bool."""
+        """Mask (K,) of the ids (K,) that exist."""
         return self.kinds(ids) >= 0
 
     def kinds(self, ids: np.ndarray) -> np.ndarray:
-        """What `kind` says of each of some ids (K,), −1 where there is no such column."""
+        """`kind` of each of some ids (K,), −1 if there is no such column."""
         if not self.ids.size:
             return np.full(ids.shape, -1)
         rows = self._order[np.minimum(self._ascending.searchsorted(ids), self.ids.size - 1)]
         return np.where(self.ids[rows] == ids, self.kind[rows], -1)
 
     def add(self, count: int, ids: np.ndarray | None = None) -> np.ndarray:
-        """Makes room for new columns and returns their ids (K,): those given, none of which may be held, or the next ones."""
+        """Adds columns and returns their ids (K,): those given, none of which may exist, or the next ones."""
         ids = np.arange(self.next_id, self.next_id + count) if ids is None else ids
         new = np.zeros((5, count), dtype=np.int64)
         new[0], new[2] = ids, -1
@@ -152,11 +152,11 @@ class Columns:
         return ids
 
     def remove(self, ids: np.ndarray) -> None:
-        """Drops columns (K,), which must be held."""
+        """Drops columns (K,), which must exist."""
         self._hold(np.delete(self._tables, self.rows(ids), axis=1))
 
     def _hold(self, tables: np.ndarray) -> None:
-        """Five tables, one below the other."""
+        """Sets the five tables, which are stacked."""
         self._tables = tables
         self.ids, self.fields, self.slab, self.generation, self.kind = tables
         self._order = self.ids.argsort(kind="stable")
@@ -175,14 +175,14 @@ class Pool:
         return self.data.shape[0] - len(self._free)
 
     def take(self, count: int) -> np.ndarray:
-        """Free slabs, (count,) int; the pool doubles where there are too few."""
+        """Free slabs, (count,) int; the pool doubles if there are too few."""
         while len(self._free) < count:
             held, old = self.data, self.data.shape[0]
             self.data = self._slabs(2 * old, *held.shape[1:])
-            # What is not used yet needs no memory, and what has been copied is given back.
+            # Unused slabs take no memory, and the old array's memory is returned while copying.
             for first in range(old - _FIRST_SLABS, -1, -_FIRST_SLABS):
                 self.data[first : first + _FIRST_SLABS] = held[first : first + _FIRST_SLABS]
-                with suppress(ValueError):  # somebody is still reading it: then it goes as a whole
+                with suppress(ValueError):  # still referenced: freed as a whole later
                     held.resize((first, *held.shape[1:]))
             self._free = list(range(2 * old - 1, old - 1, -1)) + self._free
         taken = self._free[: -count - 1 : -1]
@@ -206,7 +206,7 @@ class Cold:
 
 
 class Access(NamedTuple):
-    """What a kernel needs to read columns: slab, and the row of each particle, `maps[which[k]]`."""
+    """A kernel's access to columns: slab, and the row of each particle, `maps[which[k]]`."""
 
     pool: np.ndarray
     slabs: np.ndarray
@@ -231,7 +231,7 @@ class SharedStore:
         return self.columns.ids.copy()
 
     def add(self, records: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
-        """Stores new columns (K, fields, N) and returns their ids (K,): those given, none of them alive, or new ones."""
+        """Stores new columns (K, fields, N) and returns their ids (K,): those given, none of which may exist, or new ones."""
         self._checked(records)
         ids = self.columns.add(len(records), ids)
         self._occupy(ids, self.columns.rows(ids), records)
@@ -254,13 +254,13 @@ class SharedStore:
         return self.read_all(np.array([column]), particles)[0]
 
     def read_all(self, columns: np.ndarray, particles: np.ndarray | slice = ALL) -> np.ndarray:
-        """Records (K, fields, N) of columns (K,), at least one, of one record size; cold ones stay cold."""
+        """Records (K, fields, N) of columns (K,), at least one, of one record size; compacted ones stay compacted."""
         at = self.columns.rows(columns)
         generations = self.columns.generation[at].tolist()
         rows = {g: self.lineage.rows(g)[particles] for g in dict.fromkeys(generations)}
         pool = self._pool(int(at[0])).data
         out = np.empty((columns.size, pool.shape[1], rows[generations[0]].size))
-        # Columns that were compacted together share one array of writers.
+        # Columns compacted together share one array of writers.
         found: dict[int, np.ndarray] = {}
         slabs = self.columns.slab[at].tolist()
         for k, (column, generation, slab) in enumerate(zip(columns.tolist(), generations, slabs, strict=True)):
@@ -275,14 +275,14 @@ class SharedStore:
         return out
 
     def access_read_only(self, columns: np.ndarray) -> Access:
-        """As `access`, for a kernel that only reads: cold columns stay cold."""
+        """As `access`, for a kernel that only reads: compacted columns stay so."""
         if (self.columns.slab[self.columns.rows(columns)] >= 0).all():
             return self.access(columns)
         records, count = self.read_all(columns), columns.size
         return Access(records, np.arange(count), np.zeros(count, dtype=np.int64), np.arange(self.n)[None])
 
     def access(self, columns: np.ndarray) -> Access:
-        """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
+        """Lets a kernel read columns (K,), at least one, of one record size; compacted ones are expanded first."""
         return self._opened(columns, self.columns.rows(columns))
 
     def _opened(self, columns: np.ndarray, at: np.ndarray) -> Access:
@@ -303,7 +303,7 @@ class SharedStore:
     def rewrite(self, columns: np.ndarray) -> tuple[Access, np.ndarray]:
         """Lets a kernel overwrite columns (K,) in every particle: what to read, and the slabs to write.
 
-        A column named twice is read again from where it was first written.
+        A column named twice is read from its new slab the second time.
         """
         at, now = self.columns.rows(columns), self.lineage.generation
         access, generations = self._opened(columns, at), self.columns.generation[at]
@@ -317,7 +317,7 @@ class SharedStore:
         old = self.columns.slab[rows].copy()
         self.columns.slab[rows] = pool.take(len(stale))
         pool.give(old)
-        # All of one past generation together, as a resampling leaves them.
+        # All of one past generation together, as after a resampling.
         for generation in {past[column] for column in stale}:
             self._leave(generation, [column for column in stale if past[column] == generation])
         self.columns.generation[rows] = now
@@ -334,7 +334,7 @@ class SharedStore:
         return Access(pool.data, slabs, which, maps), targets
 
     def compact(self) -> None:
-        """After a resampling: shrinks the columns whose writers have lost half their lineages; amortised O(1)."""
+        """After a resampling: compacts the columns whose writers have lost half their lineages; amortised O(1)."""
         for generation in self.lineage.due():
             members, before = self._members.get(generation), self._survivors.get(generation, self.n)
             if not members or before == 1:
@@ -342,7 +342,7 @@ class SharedStore:
             alive = self.lineage.survivors(generation)
             if alive.size <= COLD_FRACTION * before:
                 self._survivors[generation] = alive.size
-                # Columns that were compacted together share one array of writers.
+                # Columns compacted together share one array of writers.
                 found: dict[int, np.ndarray] = {}
                 columns = list(members)
                 for column, row in zip(columns, self.columns.rows(np.array(columns)).tolist(), strict=True):
@@ -359,13 +359,13 @@ class SharedStore:
 
     @property
     def stored_bytes(self) -> int:
-        """Bytes of records and row indices held."""
+        """Bytes of records and row indices."""
         hot = sum(pool.used * pool.data[0].nbytes for pool in self.pools.values())
         return hot + sum(cold.data.nbytes + cold.kept.nbytes for cold in self._cold.values())
 
     @property
     def dense_bytes(self) -> int:
-        """Bytes that separate copies for all particles would take."""
+        """Bytes of separate copies for all particles."""
         return int(self.columns.fields.sum()) * 8 * self.n
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -387,7 +387,7 @@ class SharedStore:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`, into an empty store.
 
-        Raises InputError: an array is missing, or is not what it should be.
+        Raises InputError: an array is missing or invalid.
         """
         next_id = int(read_one(arrays, "store/size", integers(least=0)))
         sizes = {"generations": self.lineage.generation + 1, "ids": next_id, "n": self.n}

@@ -23,19 +23,19 @@ POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Given as control: the body is where this distribution says, however it came there. The start, or a kidnapping."""
+    """Given as control: resets the pose to this distribution, whatever it was before (at the start, or after a kidnapping)."""
 
-    mean: np.ndarray  #: (7,) world_from_body, or (N, 7) of each particle's.
+    mean: np.ndarray  #: (7,) world_from_body, or (N, 7), one per particle.
     cov: np.ndarray  #: (6, 6) in the right chart at the mean, order [ω, v].
-    #: (6,) of its velocity about zero, rad/s, m/s; None where the velocity goes on as it was.
+    #: (6,) standard deviation of the velocity about zero, rad/s, m/s; None keeps the velocity as it was.
     std_velocity: np.ndarray | None = None
 
 
 def velocity_walk(std_walk: np.ndarray, dt: float) -> np.ndarray:
-    """Factor L (12, 12) of E06 (5), Q = L Lᵀ, Mathematics (velocity-factor); its first six columns move the pose.
+    """Factor L (12, 12) of E06 (5), Q = L Lᵀ, Mathematics (velocity-factor); the first six columns carry the pose noise.
 
-    The last six carry the variance δΣ/4 that the velocity keeps once the pose is given. `std_walk` (6,) is σ of E06 (4), the
-    velocity's random walk in one second, (rad/s, m/s)/√s; `dt` is δ, seconds.
+    The last six carry the variance δΣ/4 of the velocity given the pose. `std_walk` (6,) is σ of E06 (4), the standard
+    deviation of the velocity's random walk over one second, (rad/s, m/s)/√s; `dt` is δ, seconds.
     """
     sigma = np.diag(std_walk)
     factor = np.zeros((12, 12))
@@ -53,7 +53,7 @@ class MarginalVelocity(MotionModel):
 
     Args:
         std_walk: (6,) or a number, see `velocity_walk`.
-        constants: numbers of the substate after the velocity's six that stay what they are and do not move the body.
+        constants: how many constant parameters follow the six of the velocity in the substate; they do not move the body.
     """
 
     space = SE3
@@ -67,7 +67,7 @@ class MarginalVelocity(MotionModel):
         coupling, factor = dt * np.eye(6)[None], velocity_walk(self.std_walk, dt)
         keeps = np.eye(6)[None]
         if control is not None:
-            state, factor = _placed(state, control), _with_prior(factor, control)
+            state, factor = _reset_pose(state, control), _with_prior(factor, control)
             coupling = np.zeros((1, 6, 6))
             keeps = keeps if control.std_velocity is None else np.zeros((1, 6, 6))
         if k := self.constants:
@@ -85,7 +85,7 @@ class SampledVelocity(MotionModel):
         std_walk: (6,) or a number, see `velocity_walk`.
         mode: "joint" samples all twelve dimensions; "paper" moves the velocity to its conditional mean given the
             sampled pose, v ← v + (3/2δ) w₁ (E06 §3.1), and drops the variance δΣ/4 around it.
-        std_start: (6,) or a number, standard deviation of the velocity where a `PosePrior` places the body, rad/s, m/s.
+        std_start: (6,) or a number, standard deviation of the velocity after a `PosePrior` that keeps it, rad/s, m/s.
     """
 
     space = POSE_AND_VELOCITY
@@ -104,7 +104,7 @@ class SampledVelocity(MotionModel):
         placed, velocity = state[:, :7], state[:, 7:]
         if control is not None:
             stopped = control.std_velocity is not None
-            mean = np.concatenate([_placed(placed, control), 0.0 * velocity if stopped else velocity], axis=1)
+            mean = np.concatenate([_reset_pose(placed, control), 0.0 * velocity if stopped else velocity], axis=1)
             factor = _with_prior(np.zeros((12, 12)), control)
             if not stopped:
                 factor[6:, 6:] = np.diag(self.std_start)
@@ -115,14 +115,14 @@ class SampledVelocity(MotionModel):
         return Transition(np.concatenate([SE3.retract(placed, step), velocity], axis=1), factor)
 
 
-def _placed(state: np.ndarray, prior: PosePrior) -> np.ndarray:
+def _reset_pose(state: np.ndarray, prior: PosePrior) -> np.ndarray:
     if prior.mean.shape not in ((7,), state.shape) or prior.cov.shape != (6, 6) or not np.isfinite(prior.mean).all():
         raise InputError(f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {prior.mean} and {prior.cov.shape}")
     return np.broadcast_to(SE3.normalise(prior.mean), state.shape).copy()
 
 
 def _with_prior(factor: np.ndarray, prior: PosePrior) -> np.ndarray:
-    """The pose's noise is the prior's, independent of the velocity's."""
+    """The noise factor (12, 12) with the prior's pose covariance, independent of the velocity's noise."""
     walk = np.linalg.norm(factor[6:], axis=1)
     placed = np.zeros((12, 12))
     placed[:6, :6] = gaussian.psd_factor(prior.cov)

@@ -5,11 +5,11 @@ S05 (15)–(16) with d = 0 in the least-squares sense,
 
     [J; λI] χ = [ε; 0],    J = ∂ε/∂ξ of ε(x ⊕ ξ),    Mathematics (vo-step).
 
-With J = U S Vᵀ that is χ = V diag(s / (s² + λ²)) Uᵀε for every λ, so that a step that is tried again with more damping
-costs no decomposition. λ follows the ratio of the decrease found to the decrease promised (H. B. Nielsen 1999).
+With J = U S Vᵀ that is χ = V diag(s / (s² + λ²)) Uᵀε for every λ, so that retrying a step with more damping needs no new
+decomposition. λ follows the ratio of actual to predicted decrease (H. B. Nielsen 1999).
 
-The state x is whatever `retract` moves: a pose (`SE3.retract`), a vector (`np.add`), or an object of the caller's that
-holds several of them.
+The state x is whatever `retract` moves: a pose (`SE3.retract`), a vector (`np.add`), or any object of the caller's that
+holds several of these.
 """
 
 from collections.abc import Callable
@@ -24,37 +24,37 @@ from rbpf.ranges import NotNegative, Positive, Range, Ranged
 
 State = TypeVar("State")
 
-#: x → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is senseless.
+#: x → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is not admissible.
 Evaluate = Callable[[State], tuple[Array, Array]]
 Retract = Callable[[State, Array], State]  #: x moved by ξ (d,).
-#: A singular value below this fraction of the largest counts as this fraction: its direction is not determined.
+#: Singular values are raised to at least this fraction of the largest: a smaller one means an undetermined direction.
 SINGULAR = 1e-7
-#: A decrease below this fraction of the squared residuals is not worth a step, nor certain to be found.
+#: A decrease below this fraction of the squared residuals is within rounding errors: no step is taken for it.
 ROUNDING = 1e-12
-STUCK = 1e8  #: Damping at this multiple of the largest singular value leaves no step.
+STUCK = 1e8  #: Damping beyond this multiple of the largest singular value ends the iteration: the step is zero.
 
 
 @dataclass(frozen=True)
 class Rule(Ranged):
-    """When to stop, and how to begin."""
+    """Stopping criteria and initial damping."""
 
-    #: what is left to go to the linearised problem's minimum, in standard deviations of the solution (D. Bates and D.
-    #: Watts 1981): the iteration has converged below it.
+    #: the iteration has converged once the remaining step to the minimum of the linearised problem is below this, in
+    #: standard deviations of the solution (D. Bates and D. Watts 1981).
     offset: Positive = 1e-6
-    iterations: Annotated[int, Range(ge=1, le=100000)] = 50  #: most of them.
+    iterations: Annotated[int, Range(ge=1, le=100000)] = 50  #: maximum number.
     damping: NotNegative = 1e-4  #: the first λ, as a fraction of the largest singular value.
 
 
 @dataclass(frozen=True)
 class Minimum(Generic[State]):
-    """Where the iteration ended."""
+    """The result of the iteration."""
 
     x: State  #: the state.
     residual: Array  #: (m,) ε there.
     s: Array  #: (d,) singular values of J there, descending.
     vt: Array  #: (d, d) its right singular vectors, by rows.
-    iterations: int  #: steps that were tried.
-    converged: bool  #: whether the remaining offset is below the rule's.
+    iterations: int  #: number of steps tried.
+    converged: bool  #: whether the remaining step is below `Rule.offset`.
 
     @property
     def squared(self) -> float:
@@ -70,13 +70,13 @@ class Minimum(Generic[State]):
     def cov(self) -> Array:
         """(JᵀJ)⁻¹ = V S⁻² Vᵀ (d, d): the covariance of the solution if the whitened residuals have variance one.
 
-        A direction that the residuals do not determine has a variance that is finite, and enormous.
+        A direction that the residuals do not determine gets a very large, finite variance.
         """
         return self.factor @ self.factor.T
 
 
 def minimise(evaluate: Evaluate[State], x: State, retract: Retract[State], rule: Rule | None = None) -> Minimum[State]:
-    """The minimum of ½‖ε(x)‖² that is reached from x.
+    """The local minimum of ½‖ε(x)‖² reached from x.
 
     Raises InputError: there are fewer residuals than unknowns, or at the start they or their derivative are not
     finite or the derivative is zero.
@@ -92,12 +92,12 @@ def minimise(evaluate: Evaluate[State], x: State, retract: Retract[State], rule:
     squared, along, s, vt = _linearised(residual, jac)
     damping, growth, iterations = rule.damping * float(s[0]), 2.0, 0
     while True:
-        # `along` is the step that is left, in standard deviations of the solution.
+        # `along` is the undamped step to the linearised minimum, in standard deviations of the solution.
         converged = bool(np.linalg.norm(along) <= max(rule.offset, np.sqrt(ROUNDING * squared)))
         if converged or iterations >= rule.iterations or damping > STUCK * s[0]:
             return Minimum(x, residual, s, vt, iterations, converged)
         iterations += 1
-        # The damped step, and the decrease of ‖ε‖² that the linearised problem promises for it.
+        # The damped step, and the decrease of ‖ε‖² that the linearised problem predicts for it.
         squares = s**2
         step = vt.T @ (s / (squares + damping**2) * along)
         fractions = squares * (squares + 2.0 * damping**2) / (squares + damping**2) ** 2
@@ -114,10 +114,10 @@ def minimise(evaluate: Evaluate[State], x: State, retract: Retract[State], rule:
 
 def _linearised(residual: Array, jac: Array) -> tuple[float, Array, Array, Array]:
     """‖ε‖², and in the axes of J = U S Vᵀ: Uᵀε (d,), the singular values (d,), and Vᵀ (d, d)."""
-    # [J ε] = Q [R r]: R has J's singular values and V, and r = Qᵀε; it is as small as the number of unknowns.
+    # [J ε] = Q [R r]: R has J's singular values and V, and r = Qᵀε; the triangle has only as many rows as unknowns plus one.
     size = jac.shape[1]
     triangle = np.asarray(np.linalg.qr(np.column_stack([jac, residual]), mode="r"))
     u, s, vt = np.linalg.svd(triangle[:size, :size])
-    # Along a direction that is not determined there is nowhere to go.
+    # No step along undetermined directions.
     along = np.where(s > SINGULAR * s[0], u.T @ triangle[:size, size], 0.0)
     return float(residual @ residual), along, s, vt

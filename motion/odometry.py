@@ -11,7 +11,7 @@ from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, LieGroup
 
-#: Of [ω, v] of a camera: the turn about its y axis, which points down, and the shift along x and z.
+#: Of [ω, v] of a camera: rotation about its y axis, which points down, and translation along x and z.
 CAMERA_PLANE = (False, True, False, True, False, True)
 
 
@@ -21,17 +21,17 @@ class Odometry:
 
     delta: np.ndarray
     cov: np.ndarray
-    #: (d, k) how it moves, in that chart, with the constants of an `OdometryMotion` that has some, as by `wheel_errors`;
-    #: None where it does not.
+    #: (d, k) derivative of the increment, in that chart, by the constants of an `OdometryMotion` that has some, see
+    #: `wheel_errors`; None if it does not depend on them.
     by_constants: np.ndarray | None = None
 
     @classmethod
     def at_rest(cls, space: LieGroup = SE3) -> "Odometry":
-        """No motion, for certain."""
+        """No motion, with zero covariance."""
         return cls(space.identity(), np.zeros((space.dim, space.dim)))
 
     def then(self, later: "Odometry", space: LieGroup = SE3, cross: np.ndarray | None = None) -> "Odometry":
-        """One motion after another: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ + Ad⁻¹ X + Xᵀ Ad⁻ᵀ with Ad of the later one.
+        """The composition of two motions: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ + Ad⁻¹ X + Xᵀ Ad⁻ᵀ with Ad of `later`.
 
         Mathematics (chain). `cross` is X (d, d) = E[ξ₁ ξ₂ᵀ] of the errors ξ in the right charts; None for independent ones.
         """
@@ -45,16 +45,16 @@ class Odometry:
 def preintegrate(
     ticks: np.ndarray, cov: np.ndarray, by_bias: np.ndarray, space: LieGroup = SE3
 ) -> tuple[Odometry, np.ndarray]:
-    """What wheels and a gyroscope say at a high rate between two frames, as one motion (T. Lupton, S. Sukkarieh 2012).
+    """Preintegrates high-rate wheel and gyroscope increments between two frames (T. Lupton, S. Sukkarieh 2012).
 
-    The motion is Π Exp(tick + by_bias b + noise) at b = 0, with the errors b alike in all ticks: a little of them moves
-    its end by Exp(B b).
+    The motion is Π Exp(tick + by_bias b + noise) at b = 0, with the bias b common to all ticks: a small b changes the
+    motion by Exp(B b) on the right.
 
     Args:
         ticks: (K, d) increments, in the chart [ω, v] of `space`.
-        cov: (d, d) of the noise of each.
-        by_bias: (d, k) how each depends on b; −dt in the row of ω for a gyroscope's bias.
-        space: that they move in.
+        cov: (d, d) noise covariance of each.
+        by_bias: (d, k) derivative of each by b; −dt in the row of ω for a gyroscope bias.
+        space: SE2, SE3 or any group.
 
     Returns: the motion, and its derivative B (d, k), in the right chart there.
     """
@@ -72,11 +72,11 @@ class OdometryMotion(MotionModel):
 
     Args:
         space: SE2, SE3 or any group.
-        std_added: standard deviation of noise injected per step, one number or (d,) in the order of the tangent. S05 §V
-            injects some and names no figure; none is the default, for covariances are tested.
-        free: (d,) bool: the components of Log(delta) and of the noise that are kept, as `CAMERA_PLANE`, which keeps a
-            camera in the x–z plane of its first pose (S05); the others are dropped. None keeps all.
-        constants: numbers k of a substate that stay what they are, as of a calibration; `Odometry` moves with them.
+        std_added: standard deviation of noise added per step, one number or (d,) in the order of the tangent. S05 §V adds
+            some and gives no figure; the default is none, so that covariances can be tested for consistency.
+        free: (d,) bool: the components of Log(delta) and of the noise that are kept; the others are dropped. `CAMERA_PLANE`
+            keeps a camera in the x–z plane of its first pose (S05). None keeps all.
+        constants: number k of constant substate parameters, such as a calibration, see `Odometry.by_constants`.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class OdometryMotion(MotionModel):
         self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
     def transition(self, state: np.ndarray, control: Odometry | None, dt: float) -> Transition:
-        """The increment, the same for all particles; refused is one that is not finite, or whose covariance is none."""
+        """The increment, the same for all particles. Raises InputError: it is not finite, or its covariance is invalid."""
         d = self.space.dim
         if control is None:
             return self._with_constants(state, np.zeros((d, d)), None)
@@ -102,7 +102,7 @@ class OdometryMotion(MotionModel):
         try:
             factor = gaussian.psd_factor(moved.cov)
         except InputError as error:
-            raise InputError(f"the covariance of the odometry is not one: {error}") from error
+            raise InputError(f"the covariance of the odometry is not valid: {error}") from error
         return self._with_constants(self.space.compose(state, moved.delta), factor, moved.by_constants)
 
     def _with_constants(self, mean: np.ndarray, factor: np.ndarray, coupling: np.ndarray | None) -> Transition:
@@ -115,7 +115,7 @@ class OdometryMotion(MotionModel):
         return Transition(mean, factor[None], coupling[None], np.eye(k)[None], np.zeros((1, k)))
 
     def constrained(self, measured: Odometry) -> Odometry:
-        """The increment and the covariance that particles are moved by, of a measured one."""
+        """A measured increment and its covariance, reduced to the `free` components and with `std_added`."""
         cov, by_constants = measured.cov + self.cov_added, measured.by_constants
         if self._free is None:
             return Odometry(measured.delta, cov, by_constants)
@@ -125,12 +125,12 @@ class OdometryMotion(MotionModel):
 
 
 def wheel_errors(delta: np.ndarray) -> np.ndarray:
-    """How an increment (…, 3) in the plane moves with what wheels get wrong alike in all steps: (…, 3, 4).
+    """Derivative (…, 3, 4) of an increment (…, 3) in the plane by four constant (systematic) odometry errors.
 
-    In the chart at its end the heading is off, in this order: per metre ahead [rad/m], as by wheels of unequal size or a
-    steering that is not straight, and by fractions of what is turned to the left and to the right, as by a track or a
-    steering ratio that is wrong (J. Borenstein and L. Feng 1996); then the place, by a fraction of the distance, as by wheels
-    that are larger than they are said to be.
+    In the chart at its end, in this order: heading error per metre driven forward [rad/m], from wheels of unequal size or a
+    biased steering angle; heading error as a fraction of left turns and of right turns, from a wrong track width or
+    steering ratio (J. Borenstein and L. Feng 1996); position error as a fraction of the distance, from a wrong wheel
+    radius.
     """
     log, by_errors = SE2.log(delta), np.zeros((*np.shape(delta), 4))
     by_errors[..., 0, 0] = log[..., 1]
@@ -140,7 +140,7 @@ def wheel_errors(delta: np.ndarray) -> np.ndarray:
 
 
 def deviations(std: ArrayLike, dim: int, name: str) -> np.ndarray:
-    """Standard deviations (dim,), of one for all or one each. Raises InputError: they are none."""
+    """Standard deviations (dim,), from one for all or one each. Raises InputError: one is negative or not finite."""
     array = np.asarray(std, dtype=float)
     if array.shape not in ((), (dim,)) or not (np.isfinite(array).all() and (array >= 0.0).all()):
         raise InputError(f"{name} must be one or {dim} numbers from 0 up, got {std!r}")

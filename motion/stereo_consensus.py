@@ -1,8 +1,8 @@
 """The motion that most matches of two stereo frames agree with, from triples of them (RANSAC).
 
-M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). The points of a
-triple are aligned, which gives a motion of any size, and this is refined on their pixels: far points are too uncertain
-in space for the alignment alone.
+M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). Aligning the points of a
+triple gives a motion of any size, which is refined on their pixels: the 3D positions of far points are too uncertain for
+the alignment alone.
 """
 
 from dataclasses import dataclass
@@ -16,21 +16,21 @@ from rbpf.motion.stereo_geometry import Matches, homography, projective, times_p
 from rbpf.ranges import Formerly, Probability, Range, Ranged
 
 REFINEMENTS = 2  #: Gauss-Newton steps on the nine pixels of a triple.
-FARTHEST = 1e4  #: Baselines away at most is a point put for the alignment.
+FARTHEST = 1e4  #: Largest depth given to a point for the alignment, in baselines.
 
 
 @dataclass(frozen=True)
 class RansacConfig(Ranged):
     """How many triples of matches are tried."""
 
-    batch: Annotated[int, Range(ge=1, le=10000)] = 32  #: tried at a time.
-    max_triples: Annotated[int, Range(ge=1, le=1000000), Formerly("most")] = 512  #: of all batches.
-    #: with this probability one triple without a false match is among them, given the fraction of matches that agree
-    #: with the best motion so far.
+    batch: Annotated[int, Range(ge=1, le=10000)] = 32  #: triples per batch.
+    max_triples: Annotated[int, Range(ge=1, le=1000000), Formerly("most")] = 512  #: triples over all batches.
+    #: probability with which at least one triple is free of false matches, given the fraction of matches that agree with
+    #: the best motion so far.
     confidence: Annotated[Probability, Formerly("certainty")] = 0.9999
 
     def needed(self, fraction: float) -> float:
-        """Triples that it takes where this fraction of the matches is right."""
+        """Number of triples needed if this fraction of the matches is right."""
         spoilt = 1.0 - min(fraction, 1.0 - 1e-9) ** 3
         return float(np.log1p(-self.confidence) / np.log(spoilt)) if spoilt < 1.0 else np.inf
 
@@ -40,14 +40,14 @@ def consensus(
 ) -> Array:
     """The motion (7,) of the lowest truncated score Σ min(d², gate), from triples that `rng` draws.
 
-    `start` is a guess of the motion; it takes part, and so does standing still. The distances d are Mahalanobis',
-    under the sum of both frames' covariances: enough to tell motions apart.
+    `start` is a guess of the motion; it competes with the triples' motions, and so does zero motion. The distances d are
+    Mahalanobis distances under the sum of both frames' covariances, which is enough to rank motions.
     """
     config, search = config or RansacConfig(), _Search(matches, start)
     best, lowest, fraction = start, np.inf, 0.0
     motions, batch, tried = np.stack([start, SE3.identity()]), config.batch, 0
     while tried < config.max_triples and tried <= config.needed(fraction):
-        # Twice as many each time, looked at batch by batch as if they were drawn so: what is not needed is not drawn.
+        # The number drawn doubles each time, so that few are drawn in vain; the stopping rule is checked batch by batch.
         before = rng.bit_generator.state
         count = batch * min(max(tried // batch, 1), -(-(config.max_triples - tried) // batch))
         found = search.candidates(triples(len(matches), count, rng))
@@ -77,11 +77,11 @@ def triples(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 class _Search:
-    """What stays the same for all motions."""
+    """What all candidate motions share."""
 
     def __init__(self, matches: Matches, start: Array) -> None:
         self.matches, self.start = matches, np.ascontiguousarray(start, dtype=float)
-        # The points of both frames' pixels, those at infinity and beyond put far away.
+        # Triangulated points of both frames; those with no positive disparity are put at a large finite depth.
         raised = times_pixels(projective(matches.camera)[1], np.stack([matches.z_prev, matches.z_now]))
         nearest = 1.0 / (FARTHEST * matches.camera.baseline_m)
         self.before, self.now = raised[..., :3] / np.maximum(raised[..., 3:], nearest)

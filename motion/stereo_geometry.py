@@ -5,13 +5,13 @@ u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T
 
     (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography),
 
-a homography, which does not notice where infinity is: noise may well make the disparity of a far point negative.
+a homography, which stays valid where noise makes the disparity of a far point negative.
 
-Measured are z⁻ = m + v⁻ and z = g(T, m) + v. About an m̂, eliminating m leaves S05 (14) as
+The measurements are z⁻ = m + v⁻ and z = g(T, m) + v. Linearised about m̂, eliminating m leaves S05 (14) as
 
     ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ,    Mathematics (vo-innovation).
 
-`Points` says which m̂: by default that of least Mathematics (vo-profile).
+`Points` says which m̂: by default the minimiser of Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass
@@ -27,15 +27,15 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array, skew
 
 Points = Literal["adjusted", "propagated", "exact"]
-"""What the earlier frame's points are taken for.
+"""How the earlier frame's points are treated.
 
-- adjusted: unknown as well, m̂ minimises ‖z⁻ − m‖² + ‖z − g(T, m)‖², each under its covariance. The minimum over T then
+- adjusted: also unknown, m̂ minimises ‖z⁻ − m‖² + ‖z − g(T, m)‖², each under its covariance. The minimum over T then
   is that of the bundle adjustment of both frames, and JᵀS⁻¹J the Schur complement of its information.
-- propagated: where they were measured, m̂ = z⁻, with their covariance in S.
-- exact: where they were measured, without error, S = R: the paper's.
+- propagated: fixed at their measurement, m̂ = z⁻, with its covariance in S.
+- exact: fixed at their measurement, taken as exact, S = R: the paper's choice.
 """
 
-#: Of the adjustment of m̂: most of them, and the last one's change. g is nearly linear: two or three do.
+#: Iterations that adjust m̂: their maximum number, and the change that ends them. g is nearly linear: 2 or 3 suffice.
 SWEEPS, SWEPT_PX = 10, 1e-4
 
 
@@ -65,7 +65,7 @@ class Matches(RowByRow):
     def checked(
         cls, camera: StereoCamera, z_prev: Array, z_now: Array, cov_prev: ArrayLike, cov_now: ArrayLike
     ) -> "Matches":
-        """Of pixels (K, 3) and covariances (K, 3, 3), or (3, 3) for all.
+        """Matches from pixels (K, 3) and covariances (K, 3, 3), or (3, 3) for all.
 
         Raises InputError: a shape does not fit, a number is not finite, or a covariance is not positive definite.
         """
@@ -84,12 +84,12 @@ class Matches(RowByRow):
             try:
                 gaussian.cholesky(cov)
             except InputError as error:
-                raise InputError(f"{name} is no covariance of pixels: {error}") from error
+                raise InputError(f"{name} is not a covariance of pixels: {error}") from error
             covs.append(np.ascontiguousarray(np.broadcast_to(cov, (*before.shape, 3))))
         return cls(camera, before, now, *covs)
 
     def plausible(self, gate: float) -> np.ndarray:
-        """Which (K,) can be points in front of the camera: no disparity is below zero by a squared distance of `gate`."""
+        """Mask (K,): no disparity is significantly negative, by more than a squared Mahalanobis distance `gate`."""
         across = np.array([1.0, 0.0, -1.0])
         kept = np.ones(len(self), dtype=bool)
         for z, cov in ((self.z_prev, self.cov_prev), (self.z_now, self.cov_now)):
@@ -118,7 +118,7 @@ class Reprojection:
 
 @lru_cache(maxsize=16)
 def projective(camera: StereoCamera) -> tuple[Array, Array]:
-    """Q (4, 4), from points to pixels, and Q⁻¹ (4, 4), which are not to be written into."""
+    """Q (4, 4), from points to pixels, and Q⁻¹ (4, 4), both read-only."""
     fx, fy, cx, cy, shift = camera.intrinsics.tolist()
     q = np.array([[fx, 0.0, cx, 0.0], [0.0, fy, cy, 0.0], [fx, 0.0, cx, -shift], [0.0, 0.0, 1.0, 0.0]])
     back = np.asarray(np.linalg.inv(q), dtype=float)
@@ -138,7 +138,7 @@ def times_pixels(matrix: Array, pixels: Array) -> Array:
 
 
 def reproject(camera: StereoCamera, delta: Array, pixels: Array) -> Reprojection:
-    """Where points seen at `pixels` (…, k, 3) are seen after motions T (…, 7), broadcast over the leading axes."""
+    """Reprojects points seen at `pixels` (…, k, 3) after motions T (…, 7), broadcast over the leading axes."""
     (q, back), matrix = projective(camera), homography(camera, delta)
     raised = times_pixels(matrix, pixels)
     front = raised[..., 3] > 0.0
@@ -190,7 +190,7 @@ def white_rows(matches: Matches, delta: Array, points: Points) -> tuple[Array, n
 
 
 def _arguments(matches: Matches, delta: Array, points: Points) -> tuple[Any, ...]:
-    """What the compiled functions take, the camera apart."""
+    """Arguments of the compiled functions, without the camera's."""
     given = matches.z_prev, matches.z_now, matches.cov_prev, matches.cov_now
     sweeps = SWEEPS if points == "adjusted" else 0
     return homography(matches.camera, delta), *given, points != "exact", sweeps, SWEPT_PX

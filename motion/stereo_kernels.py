@@ -1,6 +1,6 @@
-"""Compiled: the innovations of matches, many at a time, and the score and the proposals of the consensus search.
+"""Compiled: innovations of many matches at once, and the scores and proposals of the consensus search (RANSAC).
 
-In the proposals of triples vectors are tuples, and a pose is a quaternion (x, y, z, w) and a translation.
+In the proposals from triples a vector is a tuple, and a pose is a quaternion (x, y, z, w) and a translation.
 """
 
 import math
@@ -10,9 +10,9 @@ from numba import njit
 
 from rbpf.kernels.se3 import cross, exp_pair, multiply, quaternion, turned
 
-#: Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open.
+#: Added to the information of a triple, as a fraction of its trace: three collinear points leave a rotation undetermined.
 STIFFNESS = 1e-9
-FLAT = 1e-12  #: Shortest length that is divided by: points that coincide have no direction.
+FLAT = 1e-12  #: Lower bound of a length used as divisor: coinciding points have no direction.
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -53,7 +53,7 @@ def _factored(cov, p, q, r, gain):
     return a, b, c, d, e, math.sqrt(_plus(cov[5], r, third) - d * d - e * e)
 
 
-# As in `rbpf.kernels.dense`, of three rows that are held in registers: L is (l₀₀, l₁₀, l₁₁, l₂₀, l₂₁, l₂₂).
+# As in `rbpf.kernels.dense`, for three rows held in registers: L is (l₀₀, l₁₀, l₁₁, l₂₀, l₂₁, l₂₂).
 @njit(cache=True, error_model="numpy", inline="always")
 def _solved_lower(chol, v):
     x = v[0] / chol[0]
@@ -74,8 +74,8 @@ def _raised(row, pixels):
     return row[0] * pixels[0] + row[1] * pixels[1] + row[2] * pixels[2] + row[3]
 
 
-# Matches side by side, a number of each in one lane: places of z⁻, z, R⁻ by rows, R's lower triangle by rows, m̂, what it last
-# changed by, the depth relative to that before the motion, g, ν, and L with L Lᵀ = S.
+# Matches side by side, one lane per match and one row per number: z⁻, z, R⁻ by rows, R's lower triangle by rows, m̂, its
+# last change, the depth relative to that before the motion, g, ν, and L with L Lᵀ = S.
 _LANES = 64
 _BEFORE, _NOW, _COV_BEFORE, _COV_NOW, _PIXELS = 0, 3 * _LANES, 6 * _LANES, 15 * _LANES, 21 * _LANES
 _CHANGE, _DEPTH, _SEEN, _NU, _CHOL, _ALL = (n * _LANES for n in (24, 25, 26, 29, 32, 38))
@@ -120,7 +120,7 @@ def _sweep(matrix, n, swept, lanes):
         solved = _solved(chol, nu)
         moved = _plus(before[0], gain[0], solved), _plus(before[1], gain[1], solved), _plus(before[2], gain[2], solved)
         change = max(abs(moved[0] - pixels[0]), abs(moved[1] - pixels[1]), abs(moved[2] - pixels[2]))
-        # What has come to rest, or lies behind the camera, stays.
+        # Converged points, and those behind the camera, stay as they are.
         goes_on = (lanes[_CHANGE + i] > swept) & (depth > 0.0)
         lanes[_CHANGE + i] = change if goes_on else 0.0
         lanes[_PIXELS + i] = moved[0] if goes_on else pixels[0]
@@ -146,7 +146,7 @@ def _rows(matrix):
 
 @njit(cache=True, error_model="numpy")
 def _adjust(matrix, first, n, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, lanes):
-    # Fills the lanes with n matches from the first on, m̂ adjusted.
+    # Fills the lanes with n matches from index `first` on and adjusts m̂.
     for i in range(n):
         k = first + i
         for a in range(3):
@@ -166,7 +166,7 @@ def _adjust(matrix, first, n, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, s
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _pixel_row(down, point, nearness, seen, camera):
-    """A row of ∂g/∂ξ, of v or of u: with the slope a of a pixel by the point p, a × p and −ρ a with the sign of T Exp(ξ)."""
+    """A row of ∂g/∂ξ, for v or u: with a = ∂pixel/∂p at the point p it is a × p and −ρ a, signs as of T Exp(ξ)."""
     a, b = (0.0, camera[1] / point[2]) if down else (camera[0] / point[2], 0.0)
     c = ((camera[3] if down else camera[2]) - seen) / point[2]
     x, y, z = b * point[2] - c * point[1], c * point[0] - a * point[2], a * point[1] - b * point[0]
@@ -177,8 +177,8 @@ def _pixel_row(down, point, nearness, seen, camera):
 def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, rows, front, best):
     """Fills rows (K, 3, 7) with L⁻¹ [ν, −∂g/∂ξ], front (K,) and best (K, 3) with m̂; zeros for a point behind.
 
-    Of pixels z (K, 3) with covariances (K, 3, 3), the matrix H (4, 4) and the `camera` (fx, fy, cx, cy, fx · baseline).
-    `noisy`: the earlier pixels' noise is in S. m̂ is adjusted in `sweeps`, until it changes by less than `swept`.
+    Inputs: pixels z (K, 3) with covariances (K, 3, 3), the matrix H (4, 4) and the `camera` (fx, fy, cx, cy, fx · baseline).
+    `noisy`: S includes the earlier pixels' noise. m̂ is adjusted at most `sweeps` times, until it changes by < `swept`.
     """
     lanes, by_motion, count = np.empty(_ALL), np.empty((3, 6)), z_prev.shape[0]
     for first in range(0, count, _LANES):
@@ -218,14 +218,14 @@ def distances(matrix, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, sq
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _white(lanes, place, i, v):
-    # W v of a point whose z⁻, z and W lie from the place on.
+    # W v of a point whose z⁻, z and W start at the row `place`.
     first = _dot(_three(lanes, place + 6 * _LANES, i), v)
     return first, _dot(_three(lanes, place + 9 * _LANES, i), v), _dot(_three(lanes, place + 12 * _LANES, i), v)
 
 
 @njit(cache=True, error_model="numpy")
 def _miss(matrix, n, lanes):
-    # d² of the lanes, as `_sweep` without a branch.
+    # d² of the lanes, without a branch as in `_sweep`.
     across, down, other, last = matrix
     for i in range(n):
         before, now = _three(lanes, _BEFORE, i), _three(lanes, _NOW, i)
@@ -239,7 +239,7 @@ def _miss(matrix, n, lanes):
 def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
     """Fills score (C,) with Σ min(d², gate) over the matches and agreeing (C,) with how many have d² ≤ gate.
 
-    Of matrices H (C, 4, 4), pixels z (K, 3) and `white` W (K, 3, 3), with d² = ‖W (z − g)‖².
+    Inputs are matrices H (C, 4, 4), pixels z (K, 3) and `white` W (K, 3, 3), with d² = ‖W (z − g)‖².
     """
     lanes, count = np.empty(_ALL), z_prev.shape[0]
     score[:], agreeing[:] = 0.0, 0.0
@@ -284,7 +284,7 @@ def _frame(points, triple):
 
 @njit(cache=True, error_model="numpy")
 def _align(before, now, triple):
-    """T with T now = before: the triangles' planes, centres and first edges are laid on one another."""
+    """T with T now = before: the triangles' planes, centres and first edges are made to coincide."""
     a0, a1, a2, centre = _frame(before, triple)
     b0, b1, b2, middle = _frame(now, triple)
     turn = np.empty((3, 3))
@@ -297,7 +297,7 @@ def _align(before, now, triple):
 
 @njit(cache=True, error_model="numpy")
 def _transformed(quat, shift, pixels, camera):
-    """A point (x, y, 1, ρ) ~ Q⁻¹ (m, 1) after the motion: its place relative to that depth, and ρ."""
+    """A point (x, y, 1, ρ) ~ Q⁻¹ (m, 1) after the motion: its position as a multiple of the depth before it, and ρ."""
     nearness = (pixels[0] - pixels[2]) / camera[4]
     x, y = (pixels[0] - camera[2]) / camera[0], (pixels[1] - camera[3]) / camera[1]
     apart = (x - nearness * shift[0], y - nearness * shift[1], 1.0 - nearness * shift[2])
@@ -312,8 +312,8 @@ def _projected(point, nearness, camera):
     return left, down, left - camera[4] * nearness / point[2]
 
 
-# Triples side by side: of each of three points z⁻, z and W by rows, the motion T, and of one of them, which is copied, three
-# pixels' derivatives (6), whitened, and their error; then products of these seven columns, Σ aᵢ bᵢ for b ≤ a, by rows.
+# Triples side by side, one per lane: z⁻, z and W by rows of each of three points; the motion T; a copy of one of the points:
+# whitened derivatives (6) of three pixels, and their error; then products of these seven columns, Σ aᵢ bᵢ for b ≤ a, by rows.
 _POINT, _POSE, _ONE, _SLOPE, _PRODUCTS = 15 * _LANES, 45 * _LANES, 52 * _LANES, 67 * _LANES, 88 * _LANES
 _GUESSED, _MISSED, _OF_TRIPLES = _SLOPE, _SLOPE + _LANES, 116 * _LANES
 
@@ -338,14 +338,14 @@ def _put_motion(lanes, i, quat, shift):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _take_point(lanes, j):
-    # To a place that is a constant: what is written out for each of three takes three times as long to compile.
+    # Copies point j to a fixed place: unrolling the code for each of three points would triple the compile time.
     for i in range(_POINT):
         lanes[_ONE + i] = lanes[j * _POINT + i]
 
 
 @njit(cache=True, error_model="numpy")
 def _squared_distances(lanes, n, camera):
-    # Of the points from the motion, infinite where one is behind the camera.
+    # Σ d² of a triple's points under the motion, infinite where one is behind the camera.
     lanes[_MISSED : _MISSED + n] = 0.0
     for j in range(3):
         _take_point(lanes, j)
@@ -360,7 +360,7 @@ def _squared_distances(lanes, n, camera):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _put_slopes(lanes, n, camera):
-    # Of the point that was taken. One behind the camera counts as one at infinity that is seen at the pixels (0, 0, 0).
+    # Derivatives of the copied point; one behind the camera is treated as at infinity and seen at the pixels (0, 0, 0).
     for i in range(n):
         quat, shift = _motion(lanes, i)
         point, nearness = _transformed(quat, shift, _three(lanes, _ONE, i), camera)
@@ -388,7 +388,7 @@ def _put_column(lanes, place, i, v):
 
 @njit(cache=True, error_model="numpy")
 def _solve_triples(lanes, n, camera):
-    """Puts a step of Gauss-Newton (6) into the last row of the products."""
+    """Writes a Gauss-Newton step (6) into the last row of the products."""
     lanes[_PRODUCTS:] = 0.0
     for j in range(3):
         _take_point(lanes, j)
@@ -405,7 +405,7 @@ def _solve_triples(lanes, n, camera):
         trace = trace + lanes[_at(3, 3) + i] + lanes[_at(4, 4) + i] + lanes[_at(5, 5) + i]
         for a in range(6):
             lanes[_at(a, a) + i] += STIFFNESS * trace + np.finfo(np.float64).tiny
-    # Cholesky's factor, and what is solved by it, as in `rbpf.kernels.dense`.
+    # Cholesky factorisation and substitution, as in `rbpf.kernels.dense`.
     for a in range(7):
         for b in range(min(a + 1, 6)):
             out, pivot = _at(a, b), _at(b, b)
@@ -428,10 +428,10 @@ def _take_off(lanes, n, out, p, q):
 
 @njit(cache=True, error_model="numpy")
 def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motions):
-    """Fills motions (C, 7) with what triples of matches, `rows` (C, 3), propose.
+    """Fills motions (C, 7) with the proposals of triples of matches, `rows` (C, 3).
 
-    A triple's points, of those `before` and `now` (K, 3), are aligned; the better of this and `start` (7,) on the triple's
-    pixels z (K, 3) is refined by some `steps` of Gauss-Newton. `white` and `camera` as above.
+    The points `before` and `now` (K, 3) of a triple are aligned; the better of this motion and `start` (7,), judged on the
+    triple's pixels z (K, 3), is refined by `steps` Gauss-Newton steps. `white` and `camera` as above.
     """
     lanes = np.empty(_OF_TRIPLES)
     camera = (camera[0], camera[1], camera[2], camera[3], camera[4])

@@ -1,11 +1,11 @@
-"""Visual odometry: how a stereo camera has moved between two frames, from points seen in both (S05 §III-C).
+"""Visual odometry: the motion of a stereo camera between two frames, from points seen in both (S05 §III-C).
 
-A consensus of triples separates true from false matches; Levenberg-Marquardt on the reprojection error of those that
-agree finds the motion, and what they leave open about it is its covariance. In three respects this is not the paper's
-method, which `points="exact"` gives: the earlier points are estimated together with the motion, both images of the
-later pair count, and the covariance includes the earlier points' noise.
+RANSAC on triples separates true from false matches; Levenberg-Marquardt minimises the reprojection error of the inliers,
+and the covariance of its solution is that of the motion. Three things differ from the paper's method, which is
+`points="exact"`: the earlier points are estimated together with the motion, both images of the later pair are used, and the
+covariance includes the earlier points' noise.
 
-`estimate_motion` looks at the matches alone; `candidate_motions` starts from a prior, and joins with it what says less.
+`estimate_motion` uses the matches alone; `candidate_motions` also a prior, which it fuses with weaker estimates.
 """
 
 import math
@@ -22,10 +22,10 @@ from rbpf.motion.stereo_consensus import RansacConfig, consensus
 from rbpf.motion.stereo_geometry import Matches, Points, linearised, residuals, squared_distances, white_rows
 from rbpf.ranges import Formerly, Positive, Range, Ranged
 
-ROUNDS = 5  #: Of optimising and choosing anew which matches agree; it ends when they stay the same.
-REWEIGHTED = 3  #: Times that S is formed anew for propagated points.
-WIDE = 4.0  #: Times the gate is what agrees with the consensus of three: it is not yet the motion of all.
-#: No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it.
+ROUNDS = 5  #: Maximum rounds of optimising and reselecting the inliers; they end once the inliers stay the same.
+REWEIGHTED = 3  #: Times that S is recomputed for propagated points.
+WIDE = 4.0  #: Factor on the gate for the inliers of a triple's motion, which is less exact than one from all matches.
+#: Lower bound of the eigenvalues of I − D relative to I: below it the rest cannot be told from noise.
 LEAST_KEPT = 0.05
 ROUNDING = 1e-14  #: Variances below this fraction of the largest are rounding.
 
@@ -35,14 +35,14 @@ ROUNDING = 1e-14  #: Variances below this fraction of the largest are rounding.
 class VoConfig(Ranged):
     """How a motion is estimated."""
 
-    points: Points = "adjusted"  #: what the earlier points are taken for, see `rbpf.motion.stereo_geometry.Points`.
-    #: squared Mahalanobis distance beyond which a match is false; 99 % of the true ones are within, χ² with three
+    points: Points = "adjusted"  #: how the earlier points are treated, see `rbpf.motion.stereo_geometry.Points`.
+    #: squared Mahalanobis distance beyond which a match is an outlier: the 99 % quantile of χ² with three
     #: degrees of freedom.
     gate: Annotated[float, Range(gt=0.0, le=math.inf)] = 11.345
-    min_matches: Annotated[int, Range(ge=3), Formerly("least_matches")] = 8  #: fewer that agree are no motion.
-    #: how many triples are tried.
+    min_matches: Annotated[int, Range(ge=3), Formerly("least_matches")] = 8  #: with fewer inliers the estimate fails.
+    #: number of triples tried by RANSAC.
     ransac: Annotated[RansacConfig, Formerly("draws")] = field(default_factory=RansacConfig)
-    #: when the optimiser stops; the default is a hundredth of the motion's standard deviations.
+    #: stopping criterion of the optimiser; by default a hundredth of the motion's standard deviations.
     rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
 
 
@@ -51,18 +51,18 @@ class VoConfig(Ranged):
 class MotionEstimate:
     """The motion between two stereo frames."""
 
-    previous_camera_from_camera: Array  #: (7,) increment; the start where none was found.
-    cov: Array  #: (6, 6) in the right chart there, order [ω, v]; NaN where none was found.
+    previous_camera_from_camera: Array  #: (7,) increment; the start if estimation failed.
+    cov: Array  #: (6, 6) in the right chart there, order [ω, v]; NaN if estimation failed.
     inliers: np.ndarray  #: (K,) bool, matches that agree with it.
-    failure: str = ""  #: why no motion was found, in words; empty where one was.
-    note: str = ""  #: in words, where it is not simply what the matches say; empty else.
-    #: motions that matches far from this one agree on, as those on a thing that moves, each with its own inliers; false
-    #: matches agree on none.
+    failure: str = ""  #: why estimation failed; empty on success.
+    note: str = ""  #: a remark if the estimate is not from the matches alone; else empty.
+    #: further motions supported by matches that are outliers of this one, such as those on a moving object, each with its
+    #: own inliers; false matches support none.
     others: tuple["MotionEstimate", ...] = ()
 
     @property
     def found(self) -> bool:
-        """Whether there is a motion."""
+        """Whether estimation succeeded."""
         return not self.failure
 
     @property
@@ -74,29 +74,29 @@ class MotionEstimate:
 def estimate_motion(
     matches: Matches, rng: np.random.Generator, start: Array | None = None, config: VoConfig | None = None
 ) -> MotionEstimate:
-    """The motion of a rectified stereo camera between two frames, from their `Matches.checked`.
+    """The motion of a rectified stereo camera between two frames, from `Matches.checked`.
 
-    Where matches are too few or do not agree, the estimate's `failure` says so.
+    If there are too few matches or inliers, the estimate's `failure` says so.
 
     Args:
         matches: of the two frames.
-        rng: draws the triples; the same state gives the same bytes.
-        start: (7,) a guess of the increment; by default the camera stands still.
-        config: how.
+        rng: draws the triples; equal states give bit-identical results.
+        start: (7,) a guess of the increment; by default no motion.
+        config: settings.
     """
     config, start = config or VoConfig(), SE3.identity() if start is None else np.asarray(start, dtype=float)
     plausible = matches.plausible(config.gate)
     if plausible.sum() < config.min_matches:
-        there, count = f"{plausible.sum()} matches are there", len(matches)
+        there, count = f"{plausible.sum()} matches are valid", len(matches)
         if count and plausible.mean() < 0.5:
             negative = f"{count - plausible.sum()} of {count} matches have a negative disparity"
-            there = f"{negative}: are left and right swapped? {plausible.sum()} are left"
+            there = f"{negative}: are left and right swapped? {plausible.sum()} are valid"
         return _failed(start, matches, f"{there}, {config.min_matches} are needed")
     motion = consensus(matches.take(plausible), start, config.gate, rng, config.ransac)
     found, squared = _refined(matches, plausible, motion, start, config)
     others, left, last = list[MotionEstimate](), plausible, found
     while last.found:
-        # Matches just outside a gate belong to the motion that was found first.
+        # Matches just outside the gate still belong to the previous motion.
         left = left & (squared > WIDE * config.gate)
         if left.sum() < config.min_matches:
             break
@@ -111,16 +111,16 @@ def estimate_motion(
 
 
 def refine_motion(matches: Matches, start: Array, config: VoConfig | None = None) -> MotionEstimate:
-    """As `estimate_motion`, near a motion (7,) that is known well enough to tell which matches are false."""
+    """As `estimate_motion`, from a start (7,) that is close enough to classify the matches: no RANSAC."""
     config = config or VoConfig()
     plausible = matches.plausible(config.gate)
     if plausible.sum() < config.min_matches:
-        return _failed(start, matches, f"{plausible.sum()} matches are there, {config.min_matches} are needed")
+        return _failed(start, matches, f"{plausible.sum()} matches are valid, {config.min_matches} are needed")
     return _refined(matches, plausible, start, start, config)[0]
 
 
 def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[Array, Array]:
-    """By what noise of the pixels moves an estimate, of the K matches that agree with it: Mathematics (vo-gain).
+    """Derivatives of an estimate by the pixel noise of its K inliers: Mathematics (vo-gain).
 
     (K, 6, 3) of the earlier pixels and (K, 6, 3) of the later ones, in the right chart at the estimate.
     """
@@ -128,8 +128,8 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
     cov_nu, seen = linearised(matches, motion.delta, pixels, config.points)
     slope = seen.by_motion
     by_score = np.linalg.solve(cov_nu, slope)
-    # K with K I Kᵀ = cov, where the estimate is its matches' alone, and K = cov in directions in which a prior has its say.
-    # What the gate costs is in the covariance, not in the gains: of noise in two estimates both cut off their part.
+    # K with K I Kᵀ = cov where the estimate is from its matches alone, and K = cov in directions in which a prior
+    # contributes. The gains leave out the variance factor of the gate: estimates that share noise are trimmed alike.
     root = gaussian.psd_factor(motion.cov if config.points == "exact" else motion.cov / trimming(config.gate))
     values, axes = np.linalg.eigh(root.T @ np.einsum("kpa,kpb->ab", slope, by_score) @ root)
     half = root @ axes
@@ -139,11 +139,11 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
-    """The motion (7,) of least reprojection error near a start, all matches taken as true."""
+    """The motion (7,) of least reprojection error near a start, with all matches as inliers."""
     if config.points != "propagated":
         return _minimum(matches, start, config.points, config.rule)
     for _ in range(REWEIGHTED):
-        # S as it is at the last motion takes the place of R, and stays while the motion is sought.
+        # S at the last motion replaces R and is kept fixed during the optimisation.
         weighted = replace(matches, cov_now=linearised(matches, start, matches.z_prev, "propagated")[0])
         found = _minimum(weighted, start, "exact", config.rule)
         start = found.x
@@ -157,7 +157,7 @@ def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Mini
 def _refined(
     matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig
 ) -> tuple[MotionEstimate, Array]:
-    """The motion of all matches that agree, from one that many agree with, and squared distances (K,) of all from it."""
+    """The motion refined on its inliers, from an initial one, and squared distances (K,) of all matches from it."""
     squared, iterations = _squared(matches, motion, config), 0
     agreeing = plausible & (squared <= WIDE * config.gate)
     for _ in range(ROUNDS):
@@ -180,7 +180,7 @@ def _refined(
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
-    """Squared distances (K,) of the matches from a motion; the paper's points have no noise, but their matches do."""
+    """Squared distances (K,) of the matches from a motion; for `exact` points the noise is included here."""
     points: Points = "propagated" if config.points == "exact" else config.points
     return squared_distances(matches, motion, points)
 
@@ -192,11 +192,10 @@ def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:
 def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Array:
     """Covariance (6, 6) of a motion (7,), in the right chart there; `factor` is F with F Fᵀ = I⁻¹.
 
-    (JᵀS⁻¹J)⁻¹ at the solution is the usual answer, and too small where points are far: the translation's derivative is
-    proportional to the inverse depth ρ̂, and the square of a noisy ρ̂ is larger than that of the true one by var ρ̂, on
-    average. With the information I = Σ JᵀS⁻¹J as found and D = Σ var ρ̂ (∂J/∂ρ)ᵀS⁻¹(∂J/∂ρ), the derivative of the
-    score is I − D while the score itself has the covariance I, because ν is independent of m̂. Hence (W. Fuller 1987,
-    §3.2)
+    The usual answer (JᵀS⁻¹J)⁻¹ at the solution is too small where points are far: the translation's derivative is
+    proportional to the inverse depth ρ̂, and E[ρ̂²] exceeds the square of the true ρ by var ρ̂. With the estimated
+    information I = Σ JᵀS⁻¹J and D = Σ var ρ̂ (∂J/∂ρ)ᵀS⁻¹(∂J/∂ρ), the derivative of the score is I − D while the score
+    itself has the covariance I, because ν is independent of m̂. Hence (W. Fuller 1987, §3.2)
 
         cov = (I − D)⁻¹ I (I − D)⁻¹,    Mathematics (vo-covariance).
     """
@@ -207,7 +206,7 @@ def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Ar
     gain = seen.by_pixels @ across[..., None]
     solved = np.linalg.solve(cov, np.concatenate([gain, seen.by_scaled_translation], axis=-1))
     variance = (across[:, 0] - across[:, 2]) / shift - (gain * solved[..., :1]).sum(axis=(1, 2))
-    # D is zero but for the translation.
+    # D is zero except in the translation block.
     d = np.zeros((6, 6))
     scaled = variance[:, None, None] * seen.by_scaled_translation
     d[3:, 3:] = scaled.reshape(-1, 3).T @ solved[..., 1:].reshape(-1, 3)
@@ -218,13 +217,13 @@ def _consistent_covariance(matches: Matches, motion: Array, factor: Array) -> Ar
 
 
 def trimming(gate: float) -> float:
-    """Variance of a motion from the matches within a gate, beside that from as many that were not chosen.
+    """Variance factor for gating: of a motion from K inliers, relative to one from K matches not selected by a gate.
 
-    Leaving out what lies beyond a gate costs true matches, and the farthest, which speak most: the rest determines the
-    motion less well than as many that were not chosen would. F₃ / F₅, the distributions of χ² with three and five
-    degrees of freedom at the gate: rejection by ν has the influence function ν within the gate, the covariance
-    E[νᵀν] / 3 = F₅ and the slope F₅ (P. Huber 1981, §4.5), for each match; the fraction F₃ of them is within. It is
-    also 3 / E[ν² | within]. The gate is a squared Mahalanobis distance, infinite for none.
+    A gate also removes true matches, and those with the largest, most informative residuals: K inliers determine the motion
+    less well than K matches that were not selected. The factor is F₃ / F₅, the distributions of χ² with three and five
+    degrees of freedom at the gate: rejection by ν has the influence function ν within the gate, the covariance E[νᵀν] / 3 =
+    F₅ and the slope F₅ (P. Huber 1981, §4.5), per match, of which the fraction F₃ is within. It equals 3 / E[ν² | within].
+    The gate is a squared Mahalanobis distance, infinite for none.
     """
     if math.isinf(gate):
         return 1.0
@@ -236,11 +235,11 @@ def trimming(gate: float) -> float:
 @final
 @dataclass(frozen=True)
 class MotionPrior(Ranged):
-    """The motion that is expected before anything is seen: the last velocity, or standing still."""
+    """The prior of the motion before any match is used: constant velocity, or zero velocity."""
 
     std_turn: Positive = 1.0  #: standard deviation of the angular velocity about the expected one, rad/s.
     std_speed: Positive = 1.0  #: of the velocity, m/s. Both defaults are a hand-held camera's or an indoor robot's.
-    keep_velocity: bool = True  #: whether the last velocity that was seen is expected to go on.
+    keep_velocity: bool = True  #: whether the expected velocity is the last one estimated, or zero.
 
     def increment(self, velocity: Array, dt: float) -> Odometry:
         """The increment expected after `dt` seconds at a velocity (6,) [ω, v]."""
@@ -251,11 +250,11 @@ class MotionPrior(Ranged):
 def candidate_motions(
     matches: Matches, expected: Odometry, rng: np.random.Generator, config: VoConfig
 ) -> tuple[tuple[MotionEstimate, ...], str]:
-    """The motions that the matches may tell of, that of the first consensus first; else, in words, why there is none.
+    """The candidate motions of the camera, that of the first consensus first; else the reason why there is none.
 
-    One is the rule. Several mean that something in the view moves: which of them is the camera's is not in the matches,
-    and is for the caller to say. Where they tell less than what is `expected` before anything is seen (nothing but far
-    points: how far did the camera go?) both are joined, and a motion's `note` says so.
+    Usually there is one. Several mean that something in the view moves; the matches do not tell which of them is the
+    camera's, so the caller has to decide. Where the matches are weaker than the `expected` motion (only far points, which
+    leave the translation open), both are fused, and the motion's `note` says so.
     """
     found = estimate_motion(matches, rng, expected.delta, config)
     motions = (found, *found.others) if found.found else ()
@@ -263,7 +262,7 @@ def candidate_motions(
 
 
 def _joined(found: MotionEstimate, expected: Odometry) -> MotionEstimate:
-    """The estimate, or in case it is the weaker one anywhere, the product of its Gaussian and the expected one."""
+    """The estimate, or if it is weaker in any direction, the product of its Gaussian and the expected one."""
     joined, worst = product(found.odometry, expected)
     if worst <= 1.0:
         return found
@@ -273,9 +272,9 @@ def _joined(found: MotionEstimate, expected: Odometry) -> MotionEstimate:
 
 
 def product(measured: Odometry, expected: Odometry) -> tuple[Odometry, float]:
-    """What both say, their errors being independent; and the largest variance of `measured`, where the expected one is 1.
+    """The fusion of two independent motions; and the largest variance of `measured`, in units of the expected one.
 
-    `expected` has a diagonal covariance. The product moves with constants as much as `measured` has a say in it.
+    `expected` has a diagonal covariance. Its `by_constants` is that of `measured`, weighted by its share.
     """
     # In units of the expected standard deviations the expected covariance is I.
     std = np.sqrt(np.diagonal(expected.cov))

@@ -1,6 +1,6 @@
 """Rao-Blackwellised particle filters: bring a motion model and an observation model, get FastSLAM-2.0 inference.
 
-The public names stand in `__init__.pyi`. They are imported when they are first used, so that `import rbpf` is quick.
+The public names are in `__init__.pyi`. They are imported on first use, so that `import rbpf` is fast.
 """
 
 import lazy_loader

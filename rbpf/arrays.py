@@ -31,13 +31,13 @@ Array = NDArray[np.float64]
 
 
 class RowByRow:
-    """A dataclass whose arrays have a row each for as many things; what is no array is of all of them."""
+    """A dataclass of arrays with equal numbers of rows; other fields apply to all rows."""
 
     def __len__(self) -> int:
         return len(next(iter(self._arrays().values())))
 
     def take(self, rows: np.ndarray | slice) -> Self:
-        """Some of them, by number or by mask."""
+        """A subset of the rows, by index or mask."""
         whole: Any = self
         chosen: Self = replace(whole, **{name: array[rows] for name, array in self._arrays().items()})
         return chosen
@@ -48,7 +48,7 @@ class RowByRow:
 
 
 def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:
-    """Float64 of this machine, in C order, writable; copied only where it is not. Raises InputError: no real numbers."""
+    """Float64 of this machine, in C order, writable; copied only if necessary. Raises InputError: not real numbers."""
     if type(array) is np.ndarray and array.dtype == np.float64 and array.flags.carray:
         return array
     given = np.asarray(array)

@@ -18,14 +18,14 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from rbpf.errors import InputError
 
-#: Of any number of which no range says otherwise: larger ones are slips, and their squares spoil what they enter.
+#: Default upper limit of numbers: larger ones are mistakes, and their squares could overflow.
 LARGEST = 1e9
 MOST = 10**7  #: Particles, landmarks or images: more than any machine holds.
 
 
 @dataclass(frozen=True)
 class Range:
-    """What a number may be: at least `ge`, above `gt`, at most `le`, below `lt`, perhaps odd."""
+    """The range of a number: at least `ge`, above `gt`, at most `le`, below `lt`, perhaps odd."""
 
     ge: float = -LARGEST
     gt: float = -math.inf
@@ -46,7 +46,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Formerly:
-    """Of a field that had another name: `load_settings` refuses that name with today's."""
+    """Former name of a field: `load_settings` refuses it and names the current one."""
 
     name: str = field(repr=False)  # not in the annotation, where Sphinx would take it for a reference
 
@@ -65,14 +65,14 @@ Seed = Annotated[int, Range(ge=0, le=2**63 - 1)]
 
 
 class Ranged:
-    """A dataclass whose fields are checked by what is declared of them."""
+    """A dataclass whose fields are validated by their declarations."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
 
 
 class SettingError(InputError):
-    """A field, by its name, has a value that it cannot have; `words` say what it must be, and what it is."""
+    """A field has an invalid value; `words` describe the expected and the actual value."""
 
     def __init__(self, name: str, words: str, whose: str = "") -> None:
         super().__init__(f"{whose}{name} {words}")
@@ -93,7 +93,7 @@ def check_ranges(settings: Any, whose: str = "") -> None:
 
 
 def require_memory(size: float, what: str) -> None:
-    """Refuses what would take more bytes than the machine has, before it is allocated; `what` needs them, for the message."""
+    """Raises InputError: more bytes are needed than the machine has; `what` names their purpose."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if size > memory:
         raise InputError(
@@ -102,7 +102,7 @@ def require_memory(size: float, what: str) -> None:
 
 
 def former_names(kind: Any) -> dict[str, str]:
-    """The names that fields of a dataclass had, with those of today."""
+    """Former names of a dataclass's fields, with the current ones."""
     notes = {name: getattr(hint, "__metadata__", ()) for name, hint in _hints(kind).items()}
     return {note.name: name for name, of_field in notes.items() for note in of_field if isinstance(note, Formerly)}
 
@@ -114,7 +114,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def _expected(hint: Any, value: Any, allowed: Range) -> str | None:
-    """What a value should be, in words; None where it is that, or where nothing is known of the type."""
+    """Description of the expected value; None if the value is valid, or the type is unknown."""
     if get_origin(hint) is Annotated:
         hint, *notes = get_args(hint)
         allowed = next((note for note in notes if isinstance(note, Range)), allowed)

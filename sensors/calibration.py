@@ -1,16 +1,16 @@
-"""Printed boards of known size, chessboards and grids of ArUco markers: known points to start from, and the camera itself.
+"""Printed boards of known size, chessboards and grids of ArUco markers: known points at the start, and camera calibration.
 
 A chessboard's frame: the first inner corner is the origin, x runs along the rows, y across them, z into the sheet. Where
-columns and rows are not both even or both odd, the first corner is the one whose square towards the board's middle is
-black; else the board looks the same upside down, and either of two corners is the first.
+columns and rows are not both even or both odd, the first corner is the one whose diagonally inner square is black; else the
+board has a half-turn symmetry, and either of two corners can be the first.
 
 The frame of a grid of markers: the top left corner of the first marker is the origin, x runs along the rows, y down, z
-into the sheet. Markers are numbered row by row from 0, as OpenCV's `GridBoard` prints them. A marker's pattern tells its
-number and which way up it is, so that part of the board is enough (S. Garrido-Jurado and others, 2014).
+into the sheet. Markers are numbered row by row from 0, as OpenCV's `GridBoard` prints them. A marker's pattern gives its
+number and orientation, so that a partial view of the board is enough (S. Garrido-Jurado and others, 2014).
 
-The camera is that of several views of a chessboard (Z. Zhang 2000, by OpenCV): focal lengths, principal point, distortion.
-The Bayesian information criterion (G. Schwarz 1978) chooses how many coefficients of distortion are estimated: one that the
-corners do not need would bend the image where no corner was.
+`calibrate` estimates focal lengths, principal point and distortion from several views of a chessboard (Z. Zhang 2000, by
+OpenCV). The Bayesian information criterion (G. Schwarz 1978) selects the number of distortion coefficients: a superfluous
+one would distort the parts of the image without corners.
 """
 
 import re
@@ -27,22 +27,22 @@ from rbpf.sensors.camera import LENSES, Pinhole
 from rbpf.sensors.features.interface import checked_image
 from rbpf.sensors.readers.known_points import KnownPixels
 
-#: Corners that a run starts from, spread over the board: more are nearer to each other than a search reaches.
+#: Maximum number of corners used for initialisation: more would be closer together than the search radius.
 MOST = 12
-LEAST_SQUARE_PX = 5.0  #: Corners nearer to each other than this cannot be told apart.
-LEAST_SIDE_PX = 12.0  #: Markers smaller than this are read wrongly now and then.
+LEAST_SQUARE_PX = 5.0  #: Smallest usable side of a square in the image: closer corners would be confused.
+LEAST_SIDE_PX = 12.0  #: Smallest usable side of a marker in the image: smaller ones are sometimes misread.
 DICTIONARIES = (
     *("4X4_50", "4X4_100", "4X4_250", "5X5_50", "5X5_100", "5X5_250", "6X6_50", "6X6_100", "6X6_250"),
     "APRILTAG_36H11",
-)  #: Sets of patterns of markers.
+)  #: Supported marker dictionaries.
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Board:
-    """A printed chessboard, by its inner corners in a row and in a column, and the side of its squares.
+    """A printed chessboard: the numbers of inner corners in a row and in a column, and the side of a square.
 
-    Raises InputError: there are fewer than three of either, or the squares have no size.
+    Raises InputError: there are fewer than three of either, or the side is not positive.
     """
 
     columns: int
@@ -59,7 +59,7 @@ class Board:
 
     @classmethod
     def parse(cls, size: str, square_m: float) -> "Board":
-        """A board whose inner corners are written as 9x6, else an `InputError`."""
+        """The board of a size such as "9x6" (inner corners). Raises InputError: the size is malformed."""
         return cls(*_parsed(size, "a chessboard is its inner corners as 9x6"), square_m)
 
     @property
@@ -70,7 +70,7 @@ class Board:
 
 
 def _parsed(size: str, what: str) -> tuple[int, int]:
-    """Columns and rows."""
+    """Columns and rows of a size such as "9x6"."""
     found = _SIZE.fullmatch(size.strip())
     if found is None:
         raise InputError(f"the size of {what}, got {size!r}")
@@ -78,20 +78,20 @@ def _parsed(size: str, what: str) -> tuple[int, int]:
 
 
 def find_board(image: np.ndarray, board: Board) -> KnownPixels:
-    """Well-spread corners of a board in an image (H, W) uint8, as exact known points, named by their numbers, row by row.
+    """Well-spread corners of a board in an image (H, W) uint8, as exact known points, numbered row by row.
 
-    Raises InputError: the board is not seen whole, or it is too small in the image.
+    Raises InputError: the board is not detected as a whole, or is too small in the image.
     """
     image = checked_image(image)
     px = board_corners(image, board)
     if px is None:
         raise InputError(
-            f"no chessboard of {board.columns}x{board.rows} inner corners is seen in the first image: it has to be "
-            "seen whole, with its white border, sharp and evenly lit"
+            f"no chessboard of {board.columns}x{board.rows} inner corners is detected in the first image: it has to be "
+            "visible as a whole, with its white border, sharp and evenly lit"
         )
     side = least_side(px, board)
     if side < LEAST_SQUARE_PX:
-        raise InputError(f"the chessboard's squares are only {side:.1f} px wide in the first image: start nearer to it")
+        raise InputError(f"the chessboard's squares are only {side:.1f} px wide in the first image: start closer to it")
     chosen = spread_rows(board.corners, MOST)
     return KnownPixels(chosen, px[chosen], board.corners[chosen], np.zeros(chosen.size), own_frame=True)
 
@@ -99,7 +99,7 @@ def find_board(image: np.ndarray, board: Board) -> KnownPixels:
 def board_corners(image: np.ndarray, board: Board, thorough: bool = True) -> np.ndarray | None:
     """All corners (rows · columns, 2) of a board in an image (H, W) uint8, in the order of the board's frame, px.
 
-    None where the board is not seen whole. Without `thorough` a second look at images that show none is left out.
+    None if the board is not detected as a whole. `thorough` adds an exhaustive search if the fast ones fail.
     """
     import cv2
 
@@ -110,14 +110,14 @@ def board_corners(image: np.ndarray, board: Board, thorough: bool = True) -> np.
             break
     else:
         return None
-    # To a fraction of a pixel: where the slopes of the image all point past the corner (saddle points).
+    # Subpixel refinement of the saddle points: image gradients around a corner are orthogonal to the lines to it.
     px = np.asarray(px, dtype=np.float32).reshape(-1, 2)
     half = int(np.clip(0.4 * least_side(px, board), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     px = cv2.cornerSubPix(image, px.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
     grid = np.asarray(px, dtype=float).reshape(board.rows, board.columns, 2)
-    # The detector gives one of several orders. Seen from the front, x, y and z into the sheet are right-handed; and the
-    # square after the first corner is the darker one of the first two.
+    # The detector returns one of several orders. In the right one the board is seen from the front, so that x, y and z into
+    # the sheet are right-handed, and the square at the first corner is darker than its neighbour.
     across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0.0:
         grid = grid[:, ::-1]
@@ -128,13 +128,13 @@ def board_corners(image: np.ndarray, board: Board, thorough: bool = True) -> np.
 
 
 def least_side(px: np.ndarray, board: Board) -> float:
-    """Least distance of corners (rows · columns, 2) that are neighbours along a side of a square, px."""
+    """Shortest side of a square in the image, px, from its corners (rows · columns, 2)."""
     grid = px.reshape(board.rows, board.columns, 2)
     return min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
 
 
 def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
-    """Rows, ascending, of at most `count` points (M, D), each in turn the farthest from those chosen before it."""
+    """Ascending indices of at most `count` points (M, D) by farthest-point sampling."""
     middle = points.mean(axis=0)
     chosen = [int(np.argmax(np.linalg.norm(points - middle, axis=1)))]
     nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
@@ -148,8 +148,8 @@ def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
 class MarkerBoard:
     """A printed grid of markers of a dictionary in `DICTIONARIES`, `gap_m` apart.
 
-    A marker's `side_m` includes its black border. Raises InputError: a number makes no sense, or the dictionary is not
-    known or too small.
+    A marker's `side_m` includes its black border. Raises InputError: a number is out of range, or the dictionary is unknown
+    or too small.
     """
 
     columns: Count
@@ -165,7 +165,7 @@ class MarkerBoard:
 
     @classmethod
     def parse(cls, size: str, side_m: float, gap_m: float, dictionary: str) -> "MarkerBoard":
-        """A board whose markers are written as 5x7, columns first, else an `InputError`."""
+        """The board of a size such as "5x7" (columns x rows). Raises InputError: the size is malformed."""
         return cls(*_parsed(size, "a board of markers is their number as 5x7"), side_m, gap_m, dictionary.upper())
 
     @property
@@ -180,7 +180,7 @@ class MarkerBoard:
 def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
     """Well-spread corners of the markers seen in an image (H, W) uint8, as exact known points.
 
-    Corner k of marker i is named 4 i + k. Raises InputError: no marker of the board is seen, or all are too small in
+    Corner k of marker i is named 4 i + k. Raises InputError: no marker of the board is detected, or all are too small in
     the image.
     """
     import cv2
@@ -190,7 +190,7 @@ def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     patterns = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
     found, names, _ = cv2.aruco.ArucoDetector(patterns, parameters).detectMarkers(image)
-    # The board's own markers, each seen once, in the order of their numbers.
+    # The board's own markers, only those detected exactly once, sorted by number.
     numbers = np.zeros(0, dtype=np.int64) if names is None else np.asarray(names).ravel().astype(np.int64)
     px = np.array(found, dtype=float).reshape(-1, 4, 2)
     numbers, first, count = np.unique(numbers, return_index=True, return_counts=True)
@@ -199,10 +199,10 @@ def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
     side = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=-1).min(axis=1) if numbers.size else np.zeros(0)
     large = side >= LEAST_SIDE_PX
     if not large.any():
-        small = f"; {numbers.size} are seen, with sides of {side.max(initial=0.0):.0f} px: start nearer"
+        small = f"; {numbers.size} are detected, with sides of {side.max(initial=0.0):.0f} px: start closer"
         raise InputError(
-            f"no marker of a board of {board.columns}x{board.rows} from {board.dictionary} is seen large enough in the "
-            f"first image{small if numbers.size else ''}; white has to be left around each"
+            f"no marker of a board of {board.columns}x{board.rows} from {board.dictionary} is detected large enough in the "
+            f"first image{small if numbers.size else ''}; each needs a white margin"
         )
     positions = board.corners[numbers[large]].reshape(-1, 3)
     corners = (4 * numbers[large][:, None] + np.arange(4)).ravel()
@@ -211,14 +211,14 @@ def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
     return KnownPixels(corners[chosen], seen, positions[chosen], np.zeros(chosen.size), own_frame=True)
 
 
-LEAST_VIEWS = 5  #: Three determine the camera; with fewer than five no mistake is noticed.
-#: Standard deviation of the focal length, as a fraction of it, above which the views say too little.
+LEAST_VIEWS = 5  #: Three determine the camera; fewer than five leave no redundancy to detect errors.
+#: Standard deviation of the focal length, as a fraction of it, above which the views are insufficient.
 MOST_UNCERTAIN = 0.02
-#: Angle between the board's normals that two views must have: from one direction, near and small is far and large.
+#: Least angle between the board's normals in two views: equal orientations leave the focal length undetermined.
 LEAST_TURN = np.deg2rad(10.0)
-OUTLYING = 4.0  #: Views whose error is this many times the median one are left out, and …
-HARMLESS_PX = 0.3  #: … those with less than this are not.
-#: Of each kind of lens: how many of its coefficients, the first ones, may be needed.
+OUTLYING = 4.0  #: Views with an error above this multiple of the median are rejected …
+HARMLESS_PX = 0.3  #: … if it also exceeds this.
+#: Candidate numbers of distortion coefficients to estimate, the first ones, for each lens model.
 COUNTS = {"radial-tangential": (0, 2, 4, 5), "equidistant": (0, 2, 4)}
 
 
@@ -231,15 +231,15 @@ class BoardView(NamedTuple):
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """A camera, and how well it explains V views of M corners."""
+    """A calibrated camera and its fit to V views of M corners."""
 
     camera: Pinhole  #: the camera.
-    #: (P,) standard deviations of fx, fy, cx, cy [px] and the lens's coefficients; 0 for one that was not needed.
+    #: (P,) standard deviations of fx, fy, cx, cy [px] and the lens's coefficients; 0 for one that was not estimated.
     std: np.ndarray
     views: tuple[BoardView, ...]  #: those that were used.
-    residuals: np.ndarray  #: (V, M, 2) where corners were found less where the camera sees them, px.
+    residuals: np.ndarray  #: (V, M, 2) detected minus projected corners, px.
     normals: np.ndarray  #: (V, 3) of the board in the camera's frame.
-    left_out: tuple[str, ...] = ()  #: names of views that no camera explains together with the others.
+    left_out: tuple[str, ...] = ()  #: names of views rejected as outliers.
 
     @property
     def rms_px(self) -> float:
@@ -248,7 +248,7 @@ class BoardCalibration:
 
     @property
     def rms_by_view_px(self) -> np.ndarray:
-        """(V,) the same for each view."""
+        """(V,) reprojection error of each view, px."""
         return np.asarray(np.sqrt(np.square(self.residuals).sum(axis=-1).mean(axis=-1)))
 
     @property
@@ -258,7 +258,7 @@ class BoardCalibration:
 
     @property
     def covered(self) -> float:
-        """Fraction of the image, in 8 × 6 fields, in which a corner was seen."""
+        """Fraction of 8 × 6 image cells in which a corner was detected."""
         px = np.concatenate([view.px for view in self.views])
         field = (px / [self.camera.width, self.camera.height] * [8, 6]).astype(int).clip(0, [7, 5])
         return len(np.unique(field, axis=0)) / 48
@@ -267,10 +267,10 @@ class BoardCalibration:
 def calibrate(
     views: Sequence[BoardView], board: Board, width: int, height: int, model: str = "radial-tangential"
 ) -> BoardCalibration:
-    """The camera that explains the views of a board, all in images of one size [px].
+    """Calibrates a camera from views of a board, all in images of one size [px].
 
-    Its lens's distortion is radial-tangential or equidistant. Raises InputError: there are too few views, or they are
-    too much alike to determine the camera.
+    The distortion `model` is radial-tangential or equidistant. Raises InputError: there are too few views, or they are too
+    similar to determine the camera.
     """
     used = list(views)
     left_out: list[str] = []
@@ -278,10 +278,10 @@ def calibrate(
         if len(used) < LEAST_VIEWS:
             agree = f" that agree ({', '.join(left_out)} did not)" if left_out else ""
             raise InputError(
-                f"the board is found in {len(used)} images{agree}, expected at least {LEAST_VIEWS}, better 15, from "
+                f"the board is detected in {len(used)} images{agree}, expected at least {LEAST_VIEWS}, better 15, from "
                 "different directions: take more"
             )
-        # The model of distortion with the least information criterion.
+        # The number of coefficients with the lowest information criterion.
         scores, fits = [], []
         for count in COUNTS[model]:
             fit = _fitted(used, board, (width, height), model, count)
@@ -298,7 +298,7 @@ def calibrate(
     relative_std = float((found.std[:2] / [found.camera.fx, found.camera.fy]).max())
     if found.turn_rad < LEAST_TURN or not relative_std <= MOST_UNCERTAIN:
         raise InputError(
-            f"the {len(used)} views show the board from too much the same direction, the focal length stays open: turn "
+            f"the {len(used)} views show the board from too similar directions to determine the focal length: turn "
             "and tilt the board, or the camera, by some 30 degrees to all sides between the images"
         )
     return replace(found, left_out=tuple(left_out))
@@ -307,14 +307,14 @@ def calibrate(
 def _fitted(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], model: str, count: int
 ) -> BoardCalibration:
-    """The camera of least squared error, whose lens has so many coefficients; the others are zero.
+    """The least-squares camera with the first `count` distortion coefficients; the others are zero.
 
-    Raises InputError: OpenCV finds none, or what it finds is no camera.
+    Raises InputError: OpenCV fails, or its result is not a valid camera.
     """
     import cv2
 
     corners, px, names = board.corners, np.array([view.px for view in views]), LENSES[model].coefficient_names
-    # The tangential coefficients, p1 and p2, are one thing to OpenCV.
+    # OpenCV fixes the tangential coefficients p1 and p2 by one common flag.
     flags = sum(getattr(cv2, f"CALIB_FIX_{name.upper()}") for name in names[count:] if name.startswith("k"))
     flags |= cv2.CALIB_ZERO_TANGENT_DIST if "p1" in names[count:] else 0
     try:
@@ -335,7 +335,7 @@ def _fitted(
             std = std.ravel()[:9].copy()
     except cv2.error as error:
         raise InputError(
-            f"no camera explains the {len(views)} views ({error.err}): are they all of one flat board?"
+            f"the calibration failed for the {len(views)} views ({error.err}): are they all of one flat board?"
         ) from error
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
     camera = Pinhole(*size, fx, fy, cx, cy, tuple(coefficients.tolist()), model)
@@ -347,12 +347,12 @@ def _fitted(
 
 
 def _deviations(camera: Pinhole, places: np.ndarray, px: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Standard deviations (P,) of a camera's numbers with the boards' poses unknown; 0 where they are not `free` (P,).
+    """Standard deviations (P,) of a camera's parameters, the board poses marginalised; 0 where not `free` (P,).
 
-    From the residuals' variance and derivatives, as calibrateCameraExtended has them of other lenses, of corners (V, M, 3)
-    in the camera's frame, seen at px (V, M, 2).
+    From the residuals' variance and Jacobians, as calibrateCameraExtended does for other lenses; corners are (V, M, 3) in
+    the camera's frame, detected at px (V, M, 2).
     """
-    # Pixels are linear in fx, fy, cx, cy and each coefficient, so that one more of it tells the derivative.
+    # Pixels are linear in fx, fy, cx, cy and each coefficient: a unit increment gives the exact derivative.
     k = np.array(camera.distortion)
     more = [replace(camera, **{name: getattr(camera, name) + 1.0}) for name in ("fx", "fy", "cx", "cy")]
     more += [replace(camera, distortion=tuple((k + unit).tolist())) for unit in np.eye(k.size)]

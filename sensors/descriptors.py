@@ -1,11 +1,11 @@
-"""Which descriptors of two sets match: distance, ratio to the next best, and preference on both sides.
+"""Matching of two sets of descriptors: distance limit, ratio test and mutual nearest neighbours.
 
-Descriptors are float32 rows of length 1, so that one matrix product gives all distances: |a − b|² = 2 − 2 aᵀb. Where
-pixels or a prediction leave few candidate pairs (`band_pairs`, `gate_pairs`), only those are compared (`match_pairs`),
-and only those compete in the ratio test.
+Descriptors are float32 rows of length 1, so that one matrix product gives all distances: |a − b|² = 2 − 2 aᵀb. Where pixels
+or a prediction restrict the candidate pairs (`band_pairs`, `gate_pairs`), only those are compared (`match_pairs`) and take
+part in the ratio test.
 
-The descriptors of a map are stored once for all particles, and found again in new images (S05 §III-B, §V): compared with all
-by one matrix product, or one by one with those of the landmarks that a prediction puts near.
+A map's descriptors are stored once for all particles and matched with those of new images (S05 §III-B, §V): with all of
+them by one matrix product, or only with those of the landmarks predicted nearby.
 """
 
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from rbpf.arrays import RowByRow
 from rbpf.core.likelihoods import squared_mahalanobis
 from rbpf.ranges import Range, Ranged
 
-BLOCK = 4096  #: Columns of a product that are looked at together: a block of a few hundred rows stays in the cache.
-#: Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer.
+BLOCK = 4096  #: Columns of a product computed per block: a block of a few hundred rows fits the cache.
+#: Largest distance of matching "root" descriptors, by their length: it separates most true from most false pairs.
 LARGEST = {36: 0.25, 128: 0.55}
-#: Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time.
+#: Cost of comparing a single pair relative to one in a matrix product; and pairs gathered at a time.
 GATHERED, PAIRS = 8, 65536
 
 
 @dataclass(frozen=True)
 class MatchLimits(Ranged):
-    """When a candidate is taken."""
+    """Limits for accepting a match."""
 
     #: the largest distance of two descriptors, at most 2; None for `LARGEST` of their length.
     distance: Annotated[float | None, Range(gt=0.0, le=2.0)] = None
     #: largest ratio of the distance to that of the second-best candidate (D. Lowe 2004, §7.1); 1 is no limit.
     ratio: Annotated[float, Range(gt=0.0, le=1.0)] = 0.8
-    mutual: bool = True  #: whether each has to be the other's nearest.
+    mutual: bool = True  #: whether both have to be mutual nearest neighbours.
 
     def largest(self, length: int) -> float:
-        """Distance up to which descriptors of this length are taken."""
+        """Largest accepted distance of descriptors of this length."""
         return LARGEST.get(length, 2.0) if self.distance is None else self.distance
 
 
@@ -50,7 +50,7 @@ class DescriptorMatches(RowByRow):
 
 
 def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> DescriptorMatches:
-    """Matches descriptors (K, d) with descriptors (M, d), every one of which is a candidate."""
+    """Matches descriptors (K, d) with descriptors (M, d); all pairs are candidates."""
     product, next_best, where = two_best(first, second)
     kept = np.flatnonzero(within(product, next_best, limits, first.shape[1]))
     if limits.mutual and kept.size:
@@ -82,11 +82,11 @@ def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
 def match_pairs(
     first: np.ndarray, second: np.ndarray, pairs: tuple[np.ndarray, np.ndarray], limits: MatchLimits
 ) -> DescriptorMatches:
-    """Matches descriptors (K, d) with descriptors (M, d) where only pairs (C,), (C,) of their rows are possible, each once."""
+    """Matches descriptors (K, d) with descriptors (M, d) among candidate pairs (C,), (C,) of their rows, each pair once."""
     k, m = pairs
     if not k.size:
         return one_each(k, m, np.zeros(0))
-    # All at once by a matrix product where the pairs are many, else one by one.
+    # By one matrix product if there are many pairs, else pair by pair.
     if k.size * GATHERED > first.shape[0] * second.shape[0]:
         products = (first @ second.T)[k, m]
     else:
@@ -106,7 +106,7 @@ def match_pairs(
 
 
 def within(best: np.ndarray, next_best: np.ndarray, limits: MatchLimits, length: int) -> np.ndarray:
-    """Whether products (K,) of the best and of the next best candidates pass distance and ratio; −inf is none."""
+    """Mask (K,): products with the best and the next best candidate pass distance and ratio test; −inf: no candidate."""
     distance, other = distances(best), distances(next_best)
     # Two equal candidates at distance 0 are ambiguous, too.
     near = distance <= limits.largest(length)
@@ -114,25 +114,25 @@ def within(best: np.ndarray, next_best: np.ndarray, limits: MatchLimits, length:
 
 
 def distances(products: np.ndarray) -> np.ndarray:
-    """Of descriptors of length 1, from their products."""
+    """Distances of descriptors of length 1, from their products."""
     return np.sqrt(np.maximum(2.0 - 2.0 * products.astype(np.float64), 0.0))
 
 
 def one_each(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> DescriptorMatches:
-    """Of pairs (P,), (P,) that share a row of the second set the nearest, of equally near ones the first."""
+    """Of pairs (P,), (P,) with the same row of the second set, keeps the nearest; of ties the first."""
     matches = DescriptorMatches(first, second, distances(products))
     order = np.lexsort((matches.distance, matches.second))
     return matches.take(np.sort(_first_of(matches.second, order)))
 
 
 def _first_of(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Of the rows those at which a value occurs first."""
+    """The rows at which a value occurs first."""
     _, first = np.unique(values[rows], return_index=True)
     return np.asarray(rows[first])
 
 
 def band_pairs(first: np.ndarray, second: np.ndarray, reach: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs (C,), (C,) of numbers (K,) and (M,) that differ by at most the reach (K,) or ()."""
+    """Indices (C,), (C,) of all pairs of values (K,) and (M,) that differ by at most `reach` (K,) or ()."""
     order = np.argsort(second, kind="stable")
     low = np.searchsorted(second[order], first - reach, side="left")
     count = np.maximum(np.searchsorted(second[order], first + reach, side="right") - low, 0)
@@ -144,10 +144,10 @@ def band_pairs(first: np.ndarray, second: np.ndarray, reach: np.ndarray | float)
 def gate_pairs(
     z: np.ndarray, noise: np.ndarray, mean: np.ndarray, cov: np.ndarray, gate: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (C,) of measurements z (K, p) and (C,) of predictions (M, p) that are near to one another.
+    """Rows (C,) of measurements z (K, p) and (C,) of predictions (M, p) that pass a gate.
 
-    `gate` is the largest squared Mahalanobis distance; cov (M, p, p) is without the measurements' noise (K, p, p).
-    Predictions that are not finite are near to nothing.
+    `gate` is the largest squared Mahalanobis distance; cov (M, p, p) excludes the measurement noise (K, p, p).
+    Predictions that are not finite pass no gate.
     """
     held = np.flatnonzero(np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
     mean, cov = mean[held], cov[held]

@@ -1,4 +1,4 @@
-"""What a camera saw, feature by feature: pixels of named landmarks, the landmarks known beforehand, and the truth."""
+"""A recording of feature observations: pixels of named landmarks, landmarks known in advance, and ground truth."""
 
 from dataclasses import dataclass, field
 from numbers import Integral
@@ -17,7 +17,7 @@ _KNOWN = {"names": integers("M", distinct=True), "positions": numbers("M", 3), "
 
 @dataclass(frozen=True)
 class FeatureFrame(RowByRow):
-    """One image: which landmarks were seen, and where. It is checked by the `FeatureLog`, which knows its index."""
+    """One image: which landmarks were observed, at which pixels. The `FeatureLog` validates it."""
 
     stamp_ns: int  #: time of the image, integer nanoseconds.
     landmarks: np.ndarray  #: (K,) int64 names, each once.
@@ -26,15 +26,15 @@ class FeatureFrame(RowByRow):
 
     @property
     def cov(self) -> np.ndarray:
-        """(K, p, p), as features of any kind have it."""
+        """(K, p, p) `cov_z`, under the name that all kinds of features share."""
         return self.cov_z
 
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Landmarks known beforehand, such as the corners of a calibration target.
+    """Landmarks known in advance, such as the corners of a calibration target.
 
-    Raises InputError: a shape or a type is another one, a number is not finite, a name comes twice, or a cov is no
+    Raises InputError: a shape or a type is wrong, a number is not finite, a name occurs twice, or a cov is not a
     covariance.
     """
 
@@ -50,7 +50,7 @@ class KnownPoints:
 class Truth:
     """Ground truth of a recording: poses in SE(2) or SE(3), and landmarks.
 
-    Raises InputError: a shape or a type is another one, a number is not finite, the stamps are out of order, or a
+    Raises InputError: a shape or a type is wrong, a number is not finite, the stamps are out of order, or a
     quaternion is not of unit length.
     """
 
@@ -68,7 +68,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class FeatureLog:
-    """A recording of a camera that sees landmarks.
+    """A camera recording of landmark observations.
 
     Raises InputError: there is no frame, or one is out of order, names a landmark twice, has a shape or a type that
     does not fit the camera, a number that is not finite, or a cov_z that is no covariance.
@@ -76,9 +76,9 @@ class FeatureLog:
 
     name: str  #: short name of the recording.
     camera: Pinhole | RectifiedStereo  #: that took the images.
-    frames: list[FeatureFrame]  #: the images in order of time; equal stamps, between which no time passes, are allowed.
-    known: KnownPoints | None = None  #: landmarks known beforehand, None where there are none.
-    truth: Truth | None = None  #: ground truth, None where the log has none.
+    frames: list[FeatureFrame]  #: the images in order of time; equal stamps are allowed.
+    known: KnownPoints | None = None  #: landmarks known in advance, or None.
+    truth: Truth | None = None  #: ground truth, or None.
 
     def __post_init__(self) -> None:
         if not self.frames:

@@ -1,9 +1,9 @@
-"""How landmarks look, and which features become some: candidates are started, confirmed and dropped (S05 §IV–V).
+"""Landmark descriptors and landmark management: candidates are created, confirmed and dropped (S05 §IV–V).
 
-S05 adds 10 to 15 SIFT features per frame whose descriptors are sufficiently distinct from those held, drops one that is
-not seen again within three frames, and calls it a landmark once it has been seen three times. Until then it is a
-candidate. Here candidates are 60 at most, and new ones are spread over the image. Landmarks and candidates go by names,
-whole numbers that are never used again.
+S05 adds 10 to 15 SIFT features per frame whose descriptors differ sufficiently from those in the map, drops one that is not
+re-observed within three frames, and confirms it as a landmark after three observations. Until then it is a candidate. Here
+there are at most 60 candidates, and new ones are spread over the image. Names of landmarks and candidates are integers that
+are never reused.
 """
 
 from collections.abc import Mapping
@@ -19,30 +19,30 @@ from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, Formerly, NotNegative, Range, Ranged
 from rbpf.sensors.descriptors import MatchLimits, distances, match_all, two_best
 
-#: Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer.
+#: Least distance of a new descriptor from others, by its length: those of one point are mostly closer.
 DISTINCT = {36: 0.12, 128: 0.3}
 
 
 @dataclass(frozen=True)
 class NewLandmarkConfig(Ranged):
-    """Which features become landmarks, and how long candidates are kept."""
+    """Selection of new landmarks, and how long candidates are kept."""
 
     max_per_frame: Annotated[CountOrNone, Formerly("per_frame")] = 15  #: new candidates in a frame at most.
-    #: least distance of a new descriptor from those held and from other new ones; None for `DISTINCT`.
+    #: least distance of a new descriptor from those stored and from other new ones; None for `DISTINCT`.
     distinct: Annotated[float | None, Range(ge=0.0, le=2.0)] = None
     #: least distance of a new candidate's pixel from those of matched features and of other new candidates.
     spacing_px: NotNegative = 10.0
-    #: the image is divided into so many columns and rows, which fill evenly.
+    #: columns and rows of the grid over which new candidates are spread.
     cells: Annotated[int, Range(ge=1, le=1000)] = 6
-    patience: Count = 3  #: a candidate that has not been observed in so many frames is dropped.
-    #: a candidate that was observed so often is a landmark, the first time included.
+    patience: Count = 3  #: frames without an observation after which a candidate is dropped.
+    #: observations that confirm a candidate as a landmark, the first one included.
     observations: Annotated[Count, Formerly("sightings")] = 3
     max_candidates: Annotated[CountOrNone, Formerly("waiting")] = 60  #: candidates at most.
 
 
 @final
 class LandmarkManager(Kept):
-    """Holds landmarks and candidates by their descriptors, and counts observations of them, frame by frame.
+    """Stores descriptors of landmarks and candidates, and counts their observations frame by frame.
 
     Call `observe`, then `select`, then `add`.
 
@@ -67,7 +67,7 @@ class LandmarkManager(Kept):
         self.frame = 0  #: Frames so far.
         self.next_name = 0
         self.descriptors = np.zeros((0, length), dtype=np.float32)  #: (M, d), in the order of the names.
-        #: Of each its name, how often it was seen, and the frame in which it was seen last.
+        #: Name, number of observations, and frame of the last observation, of each.
         self._table = np.zeros((0, 3), dtype=np.int64)
 
     def __len__(self) -> int:
@@ -75,17 +75,17 @@ class LandmarkManager(Kept):
 
     @property
     def names(self) -> np.ndarray:
-        """(M,) of what is held, ascending."""
+        """(M,) names of all landmarks and candidates, ascending."""
         return self._table[:, 0]
 
     @property
     def observations(self) -> np.ndarray:
-        """(M,) how often each was seen."""
+        """(M,) number of observations of each."""
         return self._table[:, 1]
 
     @property
     def unseen_for(self) -> np.ndarray:
-        """(M,) for how many frames each has not been seen."""
+        """(M,) frames since the last observation of each."""
         return self.frame - self._table[:, 2]
 
     @property
@@ -94,12 +94,12 @@ class LandmarkManager(Kept):
         return self.observations >= self.config.observations
 
     def find(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (k,) of landmarks (k,), and whether each is held (k,); the row of one that is not means nothing."""
+        """Rows (k,) of landmarks (k,), and whether each is stored (k,); if not, its row is meaningless."""
         rows = np.minimum(np.searchsorted(self.names, names), max(len(self) - 1, 0))
         return rows, (self.names[rows] == names) if len(self) else np.zeros(rows.shape, dtype=bool)
 
     def rows(self, names: np.ndarray) -> np.ndarray:
-        """Rows (k,) of landmarks (k,); an InputError if one is not held."""
+        """Rows (k,) of landmarks (k,). Raises InputError: one is not stored."""
         names = np.asarray(names, dtype=np.int64)
         rows, held = self.find(names)
         if not held.all():
@@ -107,7 +107,7 @@ class LandmarkManager(Kept):
         return rows
 
     def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
-        """The landmark (K,) of each descriptor (K, d), each once; NULL where there is none, an InputError for another d."""
+        """The landmark (K,) of each descriptor (K, d), each once, NULL for none. Raises InputError: d is another one."""
         if descriptors.ndim != 2 or descriptors.shape[1] != self.length:
             raise InputError(f"descriptors must be (K, {self.length}), got {descriptors.shape}")
         matches = match_all(descriptors, self.descriptors, limits)
@@ -116,19 +116,19 @@ class LandmarkManager(Kept):
         return names
 
     def nearest(self, descriptors: np.ndarray) -> np.ndarray:
-        """Distance (K,) of each descriptor (K, d) to the nearest one held, infinite where none is."""
+        """Distance (K,) of each descriptor (K, d) to the nearest stored one, infinite if there is none."""
         return distances(two_best(descriptors, self.descriptors)[0])
 
     def copied(self) -> "LandmarkManager":
-        """To be asked what a frame would do to it."""
+        """A copy, to try out the effect of a frame."""
         other = copy(self)
-        other._table = self._table.copy()  # all else is never changed in place
+        other._table = self._table.copy()  # nothing else is changed in place
         return other
 
     def observe(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Begins a frame in which landmarks (k,) were seen again; returns names (j,) and rows (j,) of those dropped.
+        """Begins a frame that re-observes landmarks (k,); returns names (j,) and rows (j,) of those dropped.
 
-        Raises InputError: one is not held.
+        Raises InputError: one is not stored.
         """
         rows = self.rows(names)
         self.frame += 1
@@ -141,19 +141,19 @@ class LandmarkManager(Kept):
         return dropped, overdue
 
     def select(self, px: np.ndarray, descriptors: np.ndarray, nearest: np.ndarray, taken: np.ndarray) -> np.ndarray:
-        """Rows (k,) of those features of a frame that are worth a new candidate, in their order.
+        """Selects the features (k,) of a frame that become new candidates, in their order.
 
         Args:
-            px: (K, 2) places of features that matched no landmark, best first.
+            px: (K, 2) pixels of features that matched no landmark, best first.
             descriptors: (K, d) float32 of length 1.
-            nearest: (K,) distances of these from the nearest descriptor held, infinite where there is none.
-            taken: (L, 2) places of the features that did match.
+            nearest: (K,) distances of these from the nearest stored descriptor, infinite if there is none.
+            taken: (L, 2) pixels of the features that did match.
         """
         room = min(self.config.max_per_frame, self.config.max_candidates - int((~self.confirmed).sum()))
         distinct = self.config.distinct
         if distinct is None:
             distinct = DISTINCT.get(self.length, 0.0)
-        # Those of the emptiest cells first, in each cell in their order.
+        # Features of the emptiest cells first; within a cell in their order.
         cell = self._cell(px)
         rank, count = (
             np.zeros(cell.size, dtype=np.int64),
@@ -166,7 +166,7 @@ class LandmarkManager(Kept):
         for row in np.argsort(rank, kind="stable").tolist():
             if len(chosen) >= room:
                 break
-            # Far enough from what is held, and from others of the frame, in the image and in the descriptor.
+            # Distant enough from stored landmarks and from others of the frame, in the image and by descriptor.
             others = np.concatenate([taken, px[chosen]])
             if nearest[row] < distinct:
                 continue
@@ -177,7 +177,7 @@ class LandmarkManager(Kept):
         return np.array(sorted(chosen), dtype=np.int64)
 
     def add(self, descriptors: np.ndarray) -> np.ndarray:
-        """Takes in descriptors (k, d), seen for the first time in this frame; returns their names (k,)."""
+        """Adds candidates with descriptors (k, d), first observed in this frame; returns their names (k,)."""
         count = len(descriptors)
         names = np.arange(self.next_name, self.next_name + count)
         self.next_name += count
@@ -190,7 +190,7 @@ class LandmarkManager(Kept):
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         super().restore(arrays, length=self.length)
         if (np.diff(self.names, append=self.next_name) <= 0).any():
-            raise InputError("the landmarks' names do not ascend, or not below the next one")
+            raise InputError("the landmarks' names are not ascending, or not below the next new name")
 
     def _cell(self, px: np.ndarray) -> np.ndarray:
         column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T

@@ -1,4 +1,4 @@
-"""Sensors of landmarks: numbered by the recording, or associated by maximum likelihood in each particle."""
+"""Sensors of landmarks: with known association, or associated by maximum likelihood in each particle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from rbpf.errors import InputError
 
 
 class LandmarkFrame(Protocol):
-    """What these sensors need of a frame: `landmarks` (K,) numbers, `z` (K, p), `cov_z` (K, p, p)."""
+    """What these sensors require of a frame: `landmarks` (K,) numbers, `z` (K, p), `cov_z` (K, p, p)."""
 
     @property
     def landmarks(self) -> np.ndarray: ...
@@ -37,9 +37,9 @@ class LandmarkFrame(Protocol):
 class NamedLandmarkSensor(Sensor):
     """Known association: each observation carries the landmark's number, which is its id in the map.
 
-    A number that the map does not hold starts a landmark. Names that are text have to be numbered by the caller. Without a
-    likelihood that of the innovation is Gaussian. With one that `rejects` outliers, a landmark whose second observation
-    contradicts the first is begun anew with it: either may be the wrong one.
+    A number that is not in the map initialises a landmark. The caller has to map textual names to numbers. The default
+    likelihood of an innovation is Gaussian. With one that `rejects` outliers, a landmark whose second observation
+    contradicts the first is re-initialised by it: either observation may be the outlier.
     """
 
     model: ObservationModel
@@ -51,7 +51,7 @@ class NamedLandmarkSensor(Sensor):
     _contradicted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), init=False)
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
-        """The observations of landmarks that the map holds."""
+        """The observations of landmarks in the map."""
         if frame.landmarks.size and frame.landmarks.dtype.kind not in "iu":
             first = frame.landmarks[0]
             raise InputError(f"landmarks must be whole numbers from 0 up, got {first!r}: number their names")
@@ -73,7 +73,7 @@ class NamedLandmarkSensor(Sensor):
     def new_landmarks(
         self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """The first observation of each new landmark; a second one in the same frame is left to the next frame."""
+        """The first observation of each new landmark; a second one in the same frame is ignored."""
         if self._contradicted.size:
             belief.map.remove(self._contradicted)
         first = np.zeros(frame.landmarks.size, dtype=bool)
@@ -92,8 +92,8 @@ class NamedLandmarkSensor(Sensor):
 class AnonymousLandmarkSensor(Sensor):
     """Unknown association: maximum likelihood per particle with mutual exclusion; spurious landmarks are deleted.
 
-    The map must keep evidence (`LandmarkMap(space, evidence=True)`); the model's `visible` says which landmarks should have
-    been seen. Without a likelihood that of the innovation is Gaussian.
+    The map must keep evidence (`LandmarkMap(space, evidence=True)`); the model's `visible` tells which landmarks should have
+    been observed. The default likelihood of an innovation is Gaussian.
     """
 
     model: ObservationModel
@@ -104,7 +104,7 @@ class AnonymousLandmarkSensor(Sensor):
     part: Part = Part.LANDMARK
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
-        """Every measurement, with each particle's own association."""
+        """All measurements, with the association of each particle."""
         if not frame.z.shape[0]:
             return []
         ids = belief.map.ids
@@ -123,7 +123,7 @@ class AnonymousLandmarkSensor(Sensor):
     def new_landmarks(
         self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Updates the evidence of what should have been seen; starts what some particle takes as new."""
+        """Updates the evidence of landmarks expected in view; initialises those that any particle takes as new."""
         chosen = np.zeros((belief.log_weights.size, 0), dtype=np.int64)
         if observed and observed[0].ids is not None:
             chosen = observed[0].ids

@@ -1,4 +1,4 @@
-"""A laser scanner in the plane, a recording of one, and a scan as the beams that a grid takes."""
+"""A planar laser scanner, its recordings, and the conversion of a scan to the beams of a grid map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,13 +14,13 @@ from rbpf.lie import SE2
 
 @dataclass(frozen=True)
 class Scanner:
-    """Where each beam points and how far it reaches. Raises InputError: an array or a range does not fit."""
+    """Directions and range limits of the beams. Raises InputError: an array or a range does not fit."""
 
     #: (B,) of the beams, counterclockwise in the scanner's frame, whose x axis points forward [rad].
     angles: Float[np.ndarray, " B"]
-    min_range_m: float = 0.0  #: what is nearer is the robot itself.
-    max_range_m: float = 30.0  #: what is farther gives no return.
-    #: (E,) element of SE2: where the scanner sits on the robot.
+    min_range_m: float = 0.0  #: nearer readings are the robot itself.
+    max_range_m: float = 30.0  #: beyond it there is no return.
+    #: (E,) element of SE2, the scanner's mounting pose.
     robot_from_sensor: Float[np.ndarray, " E"] = field(default_factory=SE2.identity)
 
     def __post_init__(self) -> None:
@@ -32,12 +32,12 @@ class Scanner:
             raise InputError(f"robot_from_sensor must be ({SE2.size},) finite numbers: {self.robot_from_sensor}")
 
     def beams(self, ranges: Float[np.ndarray, " B"], correlation_m: float) -> Float[np.ndarray, "K 5"]:
-        """The readings that came back, in the robot's frame: where each beam begins and ends [m], and its weight.
+        """The beams with a return, in the robot's frame: start and end point [m], and weight.
 
-        Neighbouring ends on one wall err together, by the wall's error in the map: a stretch of `correlation_m` counts as one
+        Neighbouring end points on one wall share the wall's error in the map: a stretch of `correlation_m` counts as one
         measurement. So the weight is the distance to the nearer neighbour over that length, 1 at most.
 
-        Raises InputError: there are not as many readings as beams.
+        Raises InputError: the numbers of readings and beams differ.
         """
         ranges = np.asarray(ranges, dtype=float)
         if ranges.shape != self.angles.shape:
@@ -53,7 +53,7 @@ class Scanner:
 
 
 class Scan(NamedTuple):
-    """A scan of a recording: time, ranges (B,), and world_from_robot (E,) by odometry, None where there is none."""
+    """A scan of a recording: time, ranges (B,), and world_from_robot (E,) by odometry, or None."""
 
     stamp_ns: int
     ranges: np.ndarray
@@ -62,13 +62,13 @@ class Scan(NamedTuple):
 
 @final
 class BeamSensor(Sensor[np.ndarray]):
-    """Hands a scan's beams (K, 5), see `Scanner.beams`, to the part of the filter that reads them."""
+    """Passes a scan's beams (K, 5), see `Scanner.beams`, to the `Part` of the filter that reads them."""
 
     def __init__(self, reader: Part) -> None:
         self.reader = reader
 
     def observe(self, frame: np.ndarray, belief: Belief) -> Sequence[Observations]:
-        # A weighted product of densities is none.
+        # A weighted product of densities is not normalised.
         return [Observations.raw(frame, self.reader, normalised=False)]
 
 
@@ -79,9 +79,9 @@ class LaserLog:
     name: str
     scanner: Scanner
     stamps_ns: Int[np.ndarray, " T"]  #: (T,) times of the scans, ascending.
-    #: (T, B) [m]; inf where nothing came back within `max_range_m`, NaN where the reading is not valid.
+    #: (T, B) [m]; inf for no return within `max_range_m`, NaN for an invalid reading.
     ranges: Float[np.ndarray, "T B"]
-    #: (T, E) world_from_robot by odometry, elements of SE2; None where the log has none.
+    #: (T, E) world_from_robot by odometry, elements of SE2, or None.
     odometry: Float[np.ndarray, "T E"] | None = None
 
     @property

@@ -1,24 +1,24 @@
-"""Features of a rectified stereo pair (S05 §III-B), those of both images matched along the rows; the left camera leads.
+"""Features of a rectified stereo pair (S05 §III-B), matched along the rows of both images; the left camera is the reference.
 
-Impulse noise, salt and pepper, is taken out before (`remove_impulses`): single corrupted pixels, which SIFT takes for blobs.
+Impulse noise (salt and pepper) is removed first (`remove_impulses`): SIFT would detect single corrupted pixels as blobs.
 
-A keypoint of the left image may match those of the right one that lie on its row, to the left of it by a disparity
-that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest descriptor is taken
-(`rbpf.sensors.descriptors`), and the place in the right image is refined on grey values (`refine`): a window
-around the left place is moved along the row of the right image until the squared difference of the two is least,
-brightness and contrast left free (Gauss-Newton; B. Lucas, T. Kanade 1981, in one dimension).
+Candidate matches of a left keypoint lie on its row in the right image, at a disparity between zero and that of the nearest
+depth, with a similar scale and orientation. The candidate with the nearest descriptor is taken
+(`rbpf.sensors.descriptors`), and its column is refined on grey values (`refine`): a window around the left keypoint is
+moved along the row of the right image to the least squared difference, with free brightness and contrast (Gauss-Newton; B.
+Lucas, T. Kanade 1981, in one dimension).
 
-The noise of z = (u_left, v, u_right): what a keypoint's place means on the object changes from view to view, with
-standard deviation σ_p per axis. The refinement looks for what lies at the left place, whatever that is: u_right shares
-the error of u_left and adds that of the disparity, σ_d. Both grow with the keypoint's scale,
+The noise of z = (u_left, v, u_right): the point on the object at which a keypoint is detected varies between views, with
+standard deviation σ_p per axis. The refinement matches the left keypoint's window, so that u_right shares the error of
+u_left and adds that of the disparity, σ_d. Both grow with the keypoint's scale,
 
     cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]],    Mathematics (stereo-noise).
 
-Without the refinement both places have their own error, and cov = σ_p² I.
+Without the refinement both keypoints have independent errors, and cov = σ_p² I.
 
-So a point that is known again can be put where its first view is (`aligned`): the window around its first place, enlarged as
-its disparity has grown and turned as the keypoints have, is looked for about the keypoint (`rbpf.sensors.patches`). What
-its place means is then the same in all views, and σ_p² a 2 × 2 covariance: that of the alignment, by its residual.
+A re-observed point can be aligned with its first view (`aligned`): the window around its first pixel, scaled by the growth
+of its disparity and rotated as the keypoints, is searched around the keypoint (`rbpf.sensors.patches`). All views then
+observe the same point, and σ_p² becomes the alignment's 2 × 2 covariance, from its residual.
 """
 
 from dataclasses import dataclass, field, replace
@@ -38,19 +38,19 @@ from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_
 from rbpf.sensors.patches.search import search, warp
 
 LEAP = 40  #: Grey levels between a corrupted pixel and all its neighbours: several times the noise of any usable image.
-PATCH_HALF_PX, TEMPLATE_PX = 15, 15  #: Of a first view, beside its middle; and the side of what is looked for.
+PATCH_HALF_PX, TEMPLATE_PX = 15, 15  #: Half-width of a first view without its middle pixel; and side of its template.
 KEYPOINT_PX = 1.0  #: Standard deviation of a keypoint from its first view, for the search; mostly it is 0.3 to 0.7.
-LEAST_TURN_RAD = 0.1  #: A smaller turn of the image is not made up for: the orientations' median errs by as much.
-TOLERATED_FRACTION = 0.001  #: Fraction of isolated pixels up to which an image is left as it is.
+LEAST_TURN_RAD = 0.1  #: Smaller image rotations are not corrected: the median of the orientations is no more accurate.
+TOLERATED_FRACTION = 0.001  #: Fraction of isolated pixels up to which an image is left unchanged.
 
 
 def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
     """An image (H, W) uint8 without corrupted pixels, and the fraction of the pixels that were replaced.
 
-    A lens spreads a point over neighbouring pixels, so that no camera sees one that differs from all its neighbours. Where
-    more pixels do than a few specks explain, those that stick out are replaced by the median of their surroundings; all
-    others stay as they are to the byte. The dots of a pattern projector look like impulses: a rig that has one should run
-    with `pair.filter_impulses=False`.
+    The optics spread a point over neighbouring pixels, so that no real pixel differs strongly from all its neighbours. If
+    more pixels do than a few specks explain, they are replaced by the median of their neighbourhood; all other pixels are
+    unchanged. The dots of a pattern projector look like impulses: a rig that has one should run with
+    `pair.filter_impulses=False`.
     """
     import cv2
 
@@ -59,7 +59,7 @@ def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
     below = cv2.subtract(cv2.erode(image, ring), image)
     if ((above > LEAP) | (below > LEAP)).mean() <= TOLERATED_FRACTION:
         return image, 0.0
-    # Corrupted pixels beside one another are no peaks, but at the edge of what is around them.
+    # Adjacent corrupted pixels are not single peaks, but lie outside the range of their surroundings.
     median = cv2.medianBlur(image, 3)
     edge = (image >= cv2.dilate(image, ring)) | (image <= cv2.erode(image, ring))
     corrupted = edge & (cv2.absdiff(image, median) > LEAP)
@@ -69,7 +69,7 @@ def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
 @final
 @dataclass(frozen=True)
 class StereoFeatures(RowByRow):
-    """What a pair of images shows, of highest contrast first: the local landmarks {P^L, C^L, α, s, f} of S05 §III-B."""
+    """Features of a stereo pair, highest contrast first: the local landmarks {P^L, C^L, α, s, f} of S05 §III-B."""
 
     z: np.ndarray  #: (K, 3) pixels (u_left, v, u_right).
     cov: np.ndarray  #: (K, 3, 3) of their noise, px².
@@ -78,11 +78,11 @@ class StereoFeatures(RowByRow):
     scale: np.ndarray  #: (K,) of the keypoint, px.
     orientation: np.ndarray  #: (K,) of the keypoint, radians.
     descriptors: np.ndarray  #: (K, 36) or (K, 128) float32 of length 1.
-    #: (K, S, S) uint8, each point's first view: the left image around the pixel where it was seen first; S = 0 where
-    #: places are those of the keypoints.
+    #: (K, S, S) uint8, each point's first view: the left image around the pixel of its first observation; S = 0 without
+    #: alignment to first views.
     patch: np.ndarray
-    #: (K, 4) place in that, from its middle, and the disparity, px; orientation, radians. The disparity is 0 where a point has
-    #: no first view, too near the border.
+    #: (K, 4) position in that, from its middle, and the disparity, px; orientation, radians. The disparity is 0 for a point
+    #: without a first view, too close to the border.
     first: np.ndarray
 
     @classmethod
@@ -97,7 +97,7 @@ class StereoFeatures(RowByRow):
         patch: np.ndarray | None = None,
         first: np.ndarray | None = None,
     ) -> "StereoFeatures":
-        """Features whose points and their covariances follow from the pixels; by default without first views."""
+        """Triangulates features and their covariances from the pixels; by default without first views."""
         points = rig.triangulate(z)
         jac = np.linalg.inv(rig.jacobian(points))  # Mathematics (stereo-slope)
         cov_points = gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2))
@@ -106,14 +106,14 @@ class StereoFeatures(RowByRow):
         return cls(z, cov, points, cov_points, scale, orientation, descriptors, patch, first)
 
     def at(self, rig: RectifiedStereo, z: Array, cov: Array) -> "StereoFeatures":
-        """The same ones at other pixels (K, 3), with covariances (K, 3, 3)."""
+        """The same features at other pixels (K, 3), with covariances (K, 3, 3)."""
         return self.measured(rig, z, cov, self.scale, self.orientation, self.descriptors, self.patch, self.first)
 
 
-SWAPPED, FEWER = 20, 4  #: So many matches the wrong way round, and so many times fewer the right way, are no accident.
-#: So many matches the wrong way round, and such a fraction of all, are no accident either: of KITTI's it is below 0.01.
+SWAPPED, FEWER = 20, 4  #: Swapped images: least matches of negative disparity, and ratio to the positive ones.
+#: The calibration is doubted at such a number and fraction of negative disparities; on KITTI it is below 0.01.
 IMPOSSIBLE, FRACTION = 5, 0.03
-REMEMBERED = 0.9  #: Of the matches that were counted, what still counts a pair later: some ten pairs decide.
+REMEMBERED = 0.9  #: Decay per pair of the counts of matches: about ten pairs have weight.
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ class PairConfig(Ranged):
 
     row_px: NotNegative = 1.0  #: rows of a match differ by at most this …
     row_per_scale: NotNegative = 0.25  #: … and this fraction of the keypoint's scale.
-    nearest_m: Positive = 0.3  #: least depth; disparities above that of this depth are left out.
-    least_disparity_px: Positive = 1.0  #: nor does a smaller disparity than this tell a depth.
+    nearest_m: Positive = 0.3  #: least depth; larger disparities are rejected.
+    least_disparity_px: Positive = 1.0  #: least disparity; a smaller one does not determine the depth.
     scale_ratio: Ratio = 1.5  #: largest ratio of the two scales.
     turn_rad: Annotated[float, Range(gt=0.0, le=7.0)] = 0.35  #: largest difference of the two orientations.
     limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors.
@@ -131,21 +131,21 @@ class PairConfig(Ranged):
     filter_impulses: Annotated[bool, Formerly("mend")] = True
     refine: bool = True  #: whether the disparity is refined on grey values.
     half_px: Annotated[int, Range(ge=1, le=100)] = 5  #: of the refinement's window.
-    #: of the refined windows, else the match is dropped.
+    #: least correlation of the refined windows, else the match is dropped.
     least_correlation: Annotated[float, Range(ge=-1.0, le=1.0)] = 0.8
-    shift_px: Positive = 2.0  #: nor may the refinement move it further than this.
-    align: bool = True  #: whether points that are known again are put where their first view is, with `refine`.
+    shift_px: Positive = 2.0  #: largest change of the column by the refinement.
+    align: bool = True  #: whether re-observed points are aligned with their first view; needs `refine`.
     aligned_px: Positive = 0.05  #: σ_p of first views, and of an alignment …
-    aligned_residual: Positive = 2.0  #: … in quadrature with so many times what its residual explains.
+    aligned_residual: Positive = 2.0  #: … to which this multiple of the residual's share is added in quadrature.
     place_px: Positive = 0.25  #: σ_p of a keypoint of scale 0 …
     place_per_scale: NotNegative = 0.02  #: … and what is added to it in quadrature, as a fraction of the scale.
     disparity_px: Positive = 0.1  #: σ_d of a keypoint of scale 0 …
     disparity_per_scale: NotNegative = 0.025  #: … and what is added to it in quadrature.
 
     def noise(self, scale: np.ndarray, place: np.ndarray | None = None) -> np.ndarray:
-        """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px².
+        """Covariances (K, 3, 3) of (u_left, v, u_right) for keypoints of scales (K,), px².
 
-        Those (K, 2, 2) of the left places are `place`, by default what a keypoint of such a scale has.
+        `place` (K, 2, 2) is the covariance of the left pixels, by default that of a keypoint of this scale.
         """
         if place is None:
             place = (self.place_px**2 + (self.place_per_scale * scale) ** 2)[:, None, None] * np.eye(2)
@@ -158,7 +158,7 @@ class PairConfig(Ranged):
 
 
 def calibration_doubt(wrong: float, matches: float) -> str:
-    """In words, why matches, so many of them of negative disparity, are not of such cameras; empty where they may be."""
+    """A warning if too many matches have a negative disparity for this calibration to be right; else empty."""
     if wrong < IMPOSSIBLE or wrong <= FRACTION * matches:
         return ""
     fraction = f"{100.0 * wrong / matches:.0f} % of the matches"
@@ -167,7 +167,7 @@ def calibration_doubt(wrong: float, matches: float) -> str:
 
 @final
 class StereoMatcher:
-    """Measures pairs of images.
+    """Detects, matches and measures the features of stereo pairs.
 
     Args:
         rig: the two cameras.
@@ -184,13 +184,13 @@ class StereoMatcher:
         self.extractor = extractor or Sift()
         self.config = config or PairConfig()
         self.impulse_fraction = 0.0  #: Fraction of the pixels that were replaced in the last pair.
-        self.rows_px = 0.0  #: By how many rows the last pair is not rectified.
-        #: By which columns of the right image are known to be too large: they are measured without it.
+        self.rows_px = 0.0  #: Row offset of the right image of the last pair; 0 if rectified.
+        #: Known offset of the right image's columns, subtracted from the measurements.
         self.offset_px = 0.0
         self._last: tuple[tuple[np.ndarray, np.ndarray], Features, Features, int] | None = None
 
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
-        """Features of a pair of images (H, W) uint8; none where there is no texture.
+        """Features of a pair of images (H, W) uint8; none without texture.
 
         Raises InputError: the images are not of the camera's size, or they are swapped.
         """
@@ -211,9 +211,9 @@ class StereoMatcher:
 
     @property
     def impossible(self) -> tuple[int, int]:
-        """Matches of the last pair whose disparity is negative, as good as the others, and all of its matches.
+        """Counts of the last pair: matches of negative disparity that pass all other tests, and all matches.
 
-        Nothing is further away than infinity: such are those of cameras that are turned or shifted against each other.
+        No point has a negative disparity: such matches indicate cameras rotated or shifted relative to the calibration.
         """
         if self._last is None:
             return 0, 0
@@ -226,27 +226,27 @@ class StereoMatcher:
 
     @property
     def remark(self) -> str:
-        """In words, what was wrong with the last pair; empty where nothing was."""
+        """A remark on defects of the last pair; empty if there were none."""
         found = list[str]()
         if self.impulse_fraction:
             fraction = f"{100.0 * self.impulse_fraction:.1f} %"
-            found += [f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"]
+            found += [f"{fraction} of the pixels have impulse noise and are replaced by the median around them"]
         if self.rows_px:
             where = f"{abs(self.rows_px):.1f} rows {'lower' if self.rows_px > 0.0 else 'higher'} in the right image"
-            found += [f"the pair is not rectified: things are {where}; rectify the images by the cameras' calibration"]
+            found += [f"the pair is not rectified: points are {where}; rectify the images by the cameras' calibration"]
         return "; ".join(found)
 
     def match(self, images: tuple[np.ndarray, np.ndarray], left: Features, right: Features) -> StereoFeatures:
-        """Features of a pair of images whose keypoints are known. Raises InputError: the images are swapped."""
+        """Matches the given keypoints of a pair of images. Raises InputError: the images are swapped."""
         matches = self._along_rows(left, right)
         self.rows_px = 0.0
-        # A pair is refused whose keypoints match far better the other way round, and one told that does on other rows.
+        # A pair that matches far better when swapped is refused; one that matches on other rows is reported.
         if FEWER * len(matches) < min(len(left), len(right)):
             swapped = len(self._along_rows(right, left))
             if swapped >= SWAPPED and swapped > FEWER * len(matches):
                 raise InputError(
                     f"left and right image seem to be swapped: {swapped} matches have a negative disparity and "
-                    f"{len(matches)} a positive one; exchange the two cameras, unless one of them has frozen"
+                    f"{len(matches)} a positive one; exchange the two cameras, unless one of them delivers a frozen image"
                 )
             anywhere = match_all(left.descriptors, right.descriptors, self.config.limits)
             if len(anywhere) >= SWAPPED:
@@ -268,7 +268,7 @@ class StereoMatcher:
         return StereoFeatures.measured(self.rig, z, cov, *kept, patch, first)
 
     def _refined(self, images: tuple[np.ndarray, np.ndarray], px: Array, u: Array) -> tuple[np.ndarray, np.ndarray]:
-        """Which places px (K, 2) of the left image are found near columns u (K,) of the right one, and where."""
+        """Whether the refinement of columns u (K,) for left pixels px (K, 2) succeeded (K,), and the refined columns."""
         config = self.config
         if not (config.refine and u.size):
             return np.ones(u.size, dtype=bool), u
@@ -276,7 +276,7 @@ class StereoMatcher:
         return (np.abs(found - u) <= config.shift_px) & (correlation >= config.least_correlation), found
 
     def _along_rows(self, left: Features, right: Features) -> DescriptorMatches:
-        """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
+        """Matches along rows, each pixel position used once, even if it has keypoints of several orientations."""
         config = self.config
         reach = config.row_px + config.row_per_scale * left.scale
         k, m = band_pairs(left.px[:, 1], right.px[:, 1], reach)
@@ -287,7 +287,7 @@ class StereoMatcher:
         near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
         pairs = k[near], m[near]
         matches = match_pairs(left.descriptors, right.descriptors, pairs, config.limits)
-        # Of those that share their place in an image the nearest descriptors, in the order of the first.
+        # Of matches that share a pixel position the one with the nearest descriptor, in the order of `left`.
         order = np.argsort(matches.distance, kind="stable")
         for keypoints, rows in ((left, matches.first), (right, matches.second)):
             _, first = np.unique(keypoints.px[rows[order]], axis=0, return_index=True)
@@ -297,7 +297,7 @@ class StereoMatcher:
     def check(self, left: np.ndarray, right: np.ndarray) -> None:
         """Refuses images that these cameras cannot have taken.
 
-        Raises InputError: they are no (H, W) uint8, or not of the camera's size.
+        Raises InputError: they are not (H, W) uint8, or not of the camera's size.
         """
         left, right, camera = checked_image(left), checked_image(right), self.rig.camera
         one, other = (f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))
@@ -308,7 +308,7 @@ class StereoMatcher:
 
 
 def first_views(image: np.ndarray, z: Array, orientation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`StereoFeatures.patch` and `first` of keypoints (K, 3), with orientations (K,), in the left image they are seen in."""
+    """`StereoFeatures.patch` and `first` of keypoints (K, 3), with orientations (K,), cut from the left image."""
     side = 2 * PATCH_HALF_PX + 1
     patch, pixel = np.zeros((len(z), side, side), np.uint8), np.rint(z[:, :2]).astype(np.int64)
     first = np.column_stack([z[:, :2] - pixel, z[:, 0] - z[:, 2], orientation])
@@ -330,27 +330,27 @@ def aligned(
     patch: np.ndarray,
     first: np.ndarray,
 ) -> StereoFeatures:
-    """Features of which some are put where their first views are in the left image, and measured there.
+    """Aligns re-observed features with their first views in the left image, and measures them there.
 
-    A window whose correlation is too low is not found: its point stays where the keypoint is, with that one's noise, and
-    begins anew with its own view.
+    A window whose correlation is too low is not matched: its point keeps the keypoint's pixel and noise, and its first view
+    is replaced by the current one.
 
     Args:
         rig: the two cameras.
         config: settings of the matching.
         images: left and right, (H, W) uint8.
-        offset_px: by which columns of the right one are known to be too large: the features are without it.
+        offset_px: known offset of the right image's columns, already subtracted from the features.
         features: of the pair.
-        rows: (k,) of those that are known again.
-        patch: (k, S, S) uint8 of these, as `StereoFeatures.patch`.
+        rows: (k,) indices of the re-observed features.
+        patch: (k, S, S) uint8 their first views, as `StereoFeatures.patch`.
         first: (k, 4), as `StereoFeatures.first`.
     """
     if not patch.size:
         return features
     px, disparity = features.z[rows, :2], features.z[rows, 0] - features.z[rows, 2]
     has_view = (first[:, 2] > 0.0) & (disparity > 0.0)
-    # How a view has grown is told by its disparity; by how much the camera has turned about its axis by all of them, as an
-    # orientation is known to several degrees.
+    # The disparity gives the change of scale of each point; the median over all points gives the image rotation, as a
+    # single keypoint's orientation is off by several degrees.
     turn = first[:, 3] - features.orientation[rows]
     turn = np.median((turn + np.pi) % (2.0 * np.pi) - np.pi)
     turn = 0.0 if abs(turn) < LEAST_TURN_RAD * max(1.0, 3.0 / np.sqrt(rows.size)) else turn
@@ -362,7 +362,7 @@ def aligned(
     match = search(images[0], templates, px - offset, cov, sigmas=3.0)
     found = has_view & (match.score >= config.least_correlation) & np.isfinite(match.cov).all(axis=(1, 2))
     place = np.where(found[:, None], match.px + offset, px)
-    # What lies there has its own disparity.
+    # The disparity is measured anew at the aligned pixel.
     start = place[:, 0] - disparity
     u, correlation = refine(*images, place, start + offset_px, config.half_px)
     u -= offset_px
@@ -376,21 +376,21 @@ def aligned(
     return replace(features, patch=views[0], first=views[1]).at(rig, z, noise)
 
 
-ITERATIONS = 5  #: Steps; a keypoint is within a pixel of its place, from where three are enough.
-LONGEST_PX = 1.0  #: Of a step.
+ITERATIONS = 5  #: Gauss-Newton steps; keypoints start within a pixel of the solution, where three suffice.
+LONGEST_PX = 1.0  #: Largest step.
 _TINY = 1e-9
 
 
 def refine(
     left: np.ndarray, right: np.ndarray, px: np.ndarray, u_right: np.ndarray, half_px: int = 5
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refines columns u_right (K,), good to a pixel or two, at which places px (K, 2) of the left image are in the right one.
+    """Refines columns u_right (K,) of the right image, good to a pixel or two, that match left pixels px (K, 2).
 
     The window has 2 half_px + 1 pixels along each side; images are (H, W) uint8.
 
     Returns:
         Columns (K,), NaN where a window reaches beyond its image; the normalised correlation (K,) of the two windows, −1 to 1,
-        0 where there is no column or no texture.
+        0 without a column or texture.
     """
     u, v = u_right.astype(float), px[:, 1]
     template = _centred(_windows(left, px[:, 0], v, half_px, half_px))
@@ -410,7 +410,7 @@ def refine(
 
 
 def _windows(image: np.ndarray, u: np.ndarray, v: np.ndarray, high: int, wide: int) -> np.ndarray:
-    """(K, 2 high + 1, 2 wide + 1) float32 around places between pixels; the border goes on beyond the image."""
+    """(K, 2 high + 1, 2 wide + 1) float32 interpolated at subpixel positions; border pixels are repeated beyond the image."""
     column, line = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     across = (u - column).astype(np.float32)[:, None, None]
     down = (v - line).astype(np.float32)[:, None, None]

@@ -100,16 +100,16 @@ def test_an_option_that_is_out_of_its_range(capsys, arguments, words):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("particles: 3\nseed: 1\nparticles: 4\n", "line 3: particles comes a second time"),
-        ("search:\n  noise_px: 3\n  noise_px: 4\n", "line 3: noise_px comes a second time"),
+        ("particles: 3\nseed: 1\nparticles: 4\n", "line 3: particles occurs twice"),
+        ("search:\n  noise_px: 3\n  noise_px: 4\n", "line 3: noise_px occurs twice"),
         ("\n".join(" " * depth + "a:" for depth in range(1200)), "line 21: .* nested"),
         ("- " * 400_000, "line 1: .* nested"),
         ("{a: " * 200_000, "line 1: .* nested"),
         ("a: " + "[" * 5000 + "\n", "line 1: .* nested"),
         ("particles: !!python/object/apply:os.system ['touch pwned']\n", "line 1: expected plain values"),
         ("a: &a [x]\nb: [*a, *a]\n", "alias"),
-        ("particles: !!timestamp x\n", "none of its type"),
-        ("particles: 2001-99-99\n", "none of its type"),
+        ("particles: !!timestamp x\n", "does not fit its type"),
+        ("particles: 2001-99-99\n", "does not fit its type"),
         ("#" * (2 << 20), "larger than 1 MiB"),
     ],
 )

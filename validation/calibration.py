@@ -1,8 +1,8 @@
-"""A camera from pictures of a chessboard: camera.yaml for the readers, figures, a picture of corners and residuals.
+"""Camera calibration from images of a chessboard: camera.yaml, figures, and a plot of corners and residuals.
 
 camera.yaml        the camera, as `rbpf.sensors.readers.images.calibration` reads it
 calibration.json   reprojection error, standard deviations, which images were used
-calibration.png    where corners were found, and by how much the camera misses them
+calibration.png    detected corners, and reprojection residuals
 """
 
 import json
@@ -19,7 +19,7 @@ from rbpf.sensors.readers.images.calibration import MODELS, NAME, camera_text, m
 from rbpf.sensors.readers.images.video import read_uncalibrated
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
-#: Images that are looked at, and views that take part; more change nothing but the time.
+#: Maximum images searched, and views used; more only take longer.
 MOST_SHOTS, MOST_VIEWS = 150, 40
 _INTRINSICS = "fx", "fy", "cx", "cy"
 
@@ -27,10 +27,10 @@ _INTRINSICS = "fx", "fy", "cx", "cy"
 def calibrate_images(
     images: Path, board: Board, on_image: OnDone | None = None, model: str = "pinhole"
 ) -> tuple[BoardCalibration, int]:
-    """The camera, pinhole or fisheye, that took pictures of a board, a folder or a video, and how many were looked at.
+    """Calibrates a pinhole or fisheye camera from a folder or video of a board; also returns the number of images searched.
 
-    `on_image` is called with the images looked at and their number. An InputError says that no or too few images show the
-    board, that they differ in size, or that they do not determine the camera.
+    `on_image` is called with the images searched and their number. Raises InputError: no or too few images show the
+    board, they differ in size, or do not determine the camera.
     """
     total, shots = read_uncalibrated(images, MOST_SHOTS)
     views, size, looked_at, empty = list[BoardView](), (0, 0), 0, None

@@ -5,7 +5,7 @@ kitti    trajectory_kitti.txt: the upper 3 × 4 block of each pose's matrix, wit
 ply      map.ply: landmarks, coloured by their standard deviation, which is also the property sigma_m; path.ply: positions
          of the body, joined by lines. Binary little-endian (G. Turk, 1994), for MeshLab, CloudCompare, Blender
 colmap   colmap/sparse/0: cameras, images, points and their errors (`cameras`, `images`, `points3D`, `rigs`, `frames`; .bin
-         or .txt), with the tracks of what was measured, where the run left them; colmap/images: links to the recording's
+         or .txt), with the tracks of the measurements, if the run has them; colmap/images: links to the recording's
          images, or the images of a video or a bag, rectified or resized ones, as PNG files
 rerun    run.rrd: path and map for the Rerun viewer
 npz      run.npz: stamps_ns (T,), world_from_body (T, E), cov_poses (T, d, d); landmark_ids (M,), landmarks (M, D),
@@ -37,7 +37,7 @@ from rbpf.validation.report.live import AXIS_M, ellipsoids, log_pose, log_time, 
 
 _log = logging.getLogger(__name__)
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
-#: Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing.
+#: Camera that represents a robot's sensor in a COLMAP model: it looks along the robot's x axis, without measurements.
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
 _BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
@@ -49,7 +49,7 @@ _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
     """Writes a run, the folder that `rbpf run` left, in some of the `FORMATS` to a folder; returns the files.
 
-    Raises InputError: it is no run folder, a format is not known, or its library is not installed.
+    Raises InputError: it is not a run folder, a format is unknown, or its library is not installed.
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
@@ -122,7 +122,7 @@ def export_colmap(
         if len(problem.frames) != len(estimate.stamps_ns):
             counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
             raise InputError(f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run.")
-        # The observations of the map's landmarks, with the places of these in the map.
+        # The observations of the map's landmarks, with their rows in the map.
         table, poses = observation_table(problem), estimate.world_from_body
         order, kept = np.argsort(ids, kind="stable"), np.isin(table.names, ids)[table.index]
         place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
@@ -171,7 +171,7 @@ def colours_by_sigma(std: Array) -> NDArray[np.uint8]:
 def write_ply(
     path: Path, points: Array, colours: np.ndarray, sigmas: Array | None = None, edges: np.ndarray | None = None
 ) -> None:
-    """Writes finite points (M, 3) [m] with colours (M, 3) uint8, and lines between them; the file appears when complete.
+    """Writes finite points (M, 3) [m] with colours (M, 3) uint8, and lines between them; writes atomically.
 
     `sigmas` (M,) are a further property sigma_m of each point, `edges` (L, 2) rows of the points that a line connects.
     """

@@ -1,4 +1,4 @@
-"""From a run to its report: files, batch optimum, scores, pictures, video, verdict; and what a run is compared with.
+"""From a run to its report: files, batch optimum, scores, pictures, video, verdict; and the comparisons of a run.
 
 Everything after the files of the run itself is made from its folder, so that it can be made again without the recording;
 only the annotated video needs the images once more.
@@ -49,7 +49,7 @@ def finish_run(
     on_iteration: Callable[[int, float], None] | None = None,
     most_iterations: int | None = None,
 ) -> dict[str, Any]:
-    """Writes everything that a run leaves; returns the entries of summary.json and the verdict.
+    """Writes all results of a run; returns the entries of summary.json and the verdict.
 
     The run's own files are complete before the batch adjustment begins. `sources` is what was filtered, for
     config.yaml; `recording` is one of them. `video` and `batch` also make the annotated video, of a run over images,
@@ -58,7 +58,7 @@ def finish_run(
     Raises InputError: a file cannot be written.
     """
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
-    if run.system.name not in COMPARISONS["gtsam"]:  # it measures nothing that a batch optimiser takes
+    if run.system.name not in COMPARISONS["gtsam"]:  # no measurements for a batch optimiser
         wanted, batch = {}, False
     # What is not made is an entry of config.yaml, so that a repetition does not make it either.
     entries = write_run(run, out, dict(sources) | {name: False for name, asked in wanted.items() if not asked})
@@ -113,19 +113,19 @@ def add_batch(found: RunFolder, most: int | None, on_iteration: Callable[[int, f
         entries |= {f"batch_{name}": v for name, v in scores.items()}
     try:
         figures = compare_gtsam(found, optimum).figures
-    except InputError as error:  # too short, or its camera stays where it began
+    except InputError as error:  # too short, or its camera does not move
         return entries | {"batch_problem": str(error)}
     shown = ("filter_minus_batch_rmse_m", "log_evidence_batch", "log_evidence_batch_error", "posterior_draws_ess")
     return entries | {name: figures[name] for name in shown if name in figures}
 
 
-#: Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do.
+#: Maximum frames for COLMAP: matching takes minutes for this many, and grows faster than linearly.
 KEY_FRAMES = 60
 Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folder.
 
 
 def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Comparison:
-    """A run beside the batch posterior, see `compare_with_batch`: written into its folder, with pictures."""
+    """Compares a run with the batch posterior, see `compare_with_batch`; written into its folder, with plots."""
     from rbpf.validation.consistency.against_batch import compare_with_batch
     from rbpf.validation.report.comparison_pictures import plot_against_batch
 
@@ -136,7 +136,7 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
 
 
 def _camera_colmap(record: RunFolder) -> Comparison:
-    """A run over images beside COLMAP's reconstruction of every n-th."""
+    """Compares a run over images with COLMAP's reconstruction of every n-th."""
     from rbpf.validation.colmap.compare import ReconstructionOptions, compare_folder_with_colmap
     from rbpf.validation.report.comparison_pictures import plot_against_colmap
 
@@ -151,7 +151,7 @@ def _camera_colmap(record: RunFolder) -> Comparison:
 
 
 def _relations(record: RunFolder, file: Path) -> Comparison:
-    """A run's paths by the relations of a file; the figures go into its summary.json, too."""
+    """Evaluates a run's paths by the relations of a file; the figures go into its summary.json, too."""
     from rbpf.validation.metrics import relations as relative
 
     known = relative.read_relations(file)
@@ -163,7 +163,7 @@ def _relations(record: RunFolder, file: Path) -> Comparison:
 
 
 def _path(record: RunFolder, file: Path) -> Comparison:
-    """A run beside another path of the same recording, rigidly aligned."""
+    """Compares a run with another path of the same recording, rigidly aligned."""
     estimate, reference = associate(record.trajectory, read_tum(file))
     apart, moved = ate(estimate, reference, "rigid"), rpe(estimate, reference)
     figures = {

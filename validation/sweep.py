@@ -1,6 +1,6 @@
 """Sweeps: particles × seeds × sequences × options from a YAML file, run in parallel on this machine or on a cluster.
 
-What stands in the file, and what comes of it, docs/how_to/sweep.md says.
+The file and the results are described in docs/how_to/sweep.md.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate
 
 ROWS = "rows.jsonl"
 TABLE = "table.csv"
-SECONDS = 20  #: That a scheduler may take to answer.
+SECONDS = 20  #: Timeout of a scheduler's answer.
 MOST_RUNS = 100_000
 Value = str | int | float | bool | None
 Row = dict[str, Any]
@@ -39,13 +39,13 @@ Named = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What the YAML file holds."""
+    """The content of the YAML file."""
 
     system: str  #: which one is run.
     sequences: list[str | dict[str, str]]  #: paths, or mappings of the system's fields to paths.
     particles: list[int] = field(default_factory=list)  #: numbers of particles; empty for the system's own.
     seeds: int | list[int] = 1  #: how many, or which.
-    #: by a name, settings by theirs.
+    #: named options, each a mapping of settings.
     options: dict[str, dict[str, Value]] = field(default_factory=lambda: {"as it is": {}})
     settings: dict[str, Value] = field(default_factory=dict)  #: of all runs.
 
@@ -219,7 +219,7 @@ def run_job(job: Job) -> Row:
 
 
 def _figures(run: Run) -> Row:
-    """What a run's summary and scores say, without writing them."""
+    """A run's summary and scores, without writing them."""
     figures, log, truth = summarise(run), run.log, run.truth
     if truth is not None:
         anonymous, others = getattr(run.system.config, "association", "") == "ml", {}
@@ -235,7 +235,7 @@ def _figures(run: Run) -> Row:
 
 
 def _results(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterator[Row]:
-    """Rows as they are done."""
+    """Yields rows as they are completed."""
     from joblib import Parallel, delayed, parallel_config
 
     if not jobs:

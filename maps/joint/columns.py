@@ -1,4 +1,4 @@
-"""Which landmarks and clones a joint map holds, and in which columns of its Gaussian; and old landmarks beside these."""
+"""Landmarks and clones of a joint map and their columns in its Gaussian; and old landmarks beside them."""
 
 from collections.abc import Mapping
 from copy import copy
@@ -14,12 +14,12 @@ from rbpf.maps.rows import fused_kernel
 
 
 class Table(NamedTuple):
-    """What is held of landmarks (M,): names, kinds by number, first columns, and rows of the clones they are anchored at."""
+    """Table of landmarks (M,): names, numbers of kinds, first columns, and rows of their anchor clones."""
 
     ids: np.ndarray
     kind: np.ndarray
     first: np.ndarray
-    clone: np.ndarray  #: −1 where they are not.
+    clone: np.ndarray  #: −1 if not anchored.
 
 
 class Kind(NamedTuple):
@@ -28,22 +28,22 @@ class Kind(NamedTuple):
     landmark: Landmark
     rows: np.ndarray
     columns: np.ndarray  #: (K, D) of their means.
-    clones: np.ndarray  #: (K, d) columns of what they are anchored at; (K, 0) where they are not.
-    origins: np.ndarray  #: (K, E) K of these clones; (K, 0) where there are none.
+    clones: np.ndarray  #: (K, d) columns of their anchor clones; (K, 0) if not anchored.
+    origins: np.ndarray  #: (K, E) linearisation points of these clones; (K, 0) if none.
 
 
 class JointColumns:
-    """Finds landmarks by name and by kind.
+    """Index of landmarks by name and by kind.
 
     Args:
-        space: of the clones, which have its d columns each.
-        first: columns before those of landmarks and clones: the frame's pose and the substate.
+        space: space of the clones, which have d columns each.
+        first: number of columns before landmarks and clones: the frame's pose and the substate.
         kinds: the parametrisations, by their numbers.
 
     Attributes:
-        size: n, columns in all.
-        table: the landmarks held; `hold` replaces it.
-        clones: (C, E) K of the clones.
+        size: n, total number of columns.
+        table: the landmarks; replaced by `hold`.
+        clones: (C, E) linearisation points K of the clones.
         clone_first: (C,) their first columns.
     """
 
@@ -54,7 +54,7 @@ class JointColumns:
         self.hold(Table(none, none, none, none))
 
     def add(self, ids: np.ndarray, landmark: Landmark, clone: np.ndarray, origins: np.ndarray) -> np.ndarray:
-        """Takes landmarks (K,) behind all others and behind new clones (C, E), of which each is at one by its row, or −1.
+        """Appends new clones (C, E), then landmarks (K,), each anchored at a clone by its row, or −1.
 
         Returns their columns (K, D).
         """
@@ -68,7 +68,7 @@ class JointColumns:
         return first[:, None] + np.arange(landmark.dim)
 
     def drop(self, rows: np.ndarray) -> np.ndarray:
-        """Lets landmarks go by their rows, and clones at which nothing is anchored any more; the columns that are kept."""
+        """Drops landmarks by row, and clones without anchored landmarks; returns the columns that are kept."""
         gone = np.isin(np.arange(self.table.ids.size), rows)
         columns = [kind.columns[gone[kind.rows]].ravel() for kind in self.by_kind()]
         table = Table(*(column[~gone] for column in self.table))
@@ -86,30 +86,30 @@ class JointColumns:
         self._row_of = {landmark: row for row, landmark in enumerate(table.ids.tolist())}
 
     def holds(self, ids: np.ndarray) -> np.ndarray:
-        """Which landmarks (K,) there are."""
+        """Mask of the landmarks (K,) in the table."""
         return np.array([landmark in self._row_of for landmark in np.asarray(ids).tolist()], dtype=bool)
 
     def rows_of(self, ids: np.ndarray) -> np.ndarray:
-        """Rows (K,) of landmarks in the table. Raises InputError: the map does not hold one of them."""
+        """Rows (K,) of landmarks in the table. Raises InputError: one of them is not in the map."""
         try:
             return np.array([self._row_of[landmark] for landmark in np.asarray(ids).tolist()], dtype=np.int64)
         except KeyError as error:
-            raise InputError(f"the map holds no landmark {error.args[0]}") from error
+            raise InputError(f"the map has no landmark {error.args[0]}") from error
 
     def number(self, landmark: Landmark) -> int:
-        """Of a parametrisation; −1 for one that the map does not know."""
+        """Number of a parametrisation; −1 if it is unknown to the map."""
         return self.kinds.index(landmark) if landmark in self.kinds else -1
 
     def of_one_kind(self, ids: np.ndarray) -> Kind:
-        """Landmarks (K,) of one kind, in their order. Raises InputError: the map does not hold one, or their kinds differ."""
+        """Landmarks (K,) of one kind, in their order. Raises InputError: one is not in the map, or kinds differ."""
         rows = self.rows_of(ids)
         kinds = self.table.kind[rows]
         if (kinds != kinds[:1]).any():
-            raise InputError("a joint map is asked for landmarks of one parametrisation at a time: see `landmark_of`")
+            raise InputError("a joint map reads landmarks of one parametrisation at a time: see `landmark_of`")
         return self._of_kind(int(kinds[0]) if kinds.size else 0, rows)
 
     def by_kind(self) -> list[Kind]:
-        """All landmarks."""
+        """All landmarks, grouped by kind."""
         numbers = np.unique(self.table.kind).tolist()
         return [self._of_kind(number, np.flatnonzero(self.table.kind == number)) for number in numbers]
 
@@ -118,32 +118,32 @@ class JointColumns:
         return self.clone_first[clones, None] + np.arange(self.space.dim)
 
     def poses(self, kind: Kind, mean: np.ndarray) -> np.ndarray:
-        """Where anchored landmarks are anchored (…, K, E), in the frame, by means (…, n)."""
+        """Anchor poses (…, K, E) of anchored landmarks in the frame, from means (…, n)."""
         return self.space.retract(kind.origins, mean[..., kind.clones])
 
     def kernel(self, model: ObservationModel, kind: Kind | None) -> FusedKernel | None:
-        """That of a model of landmarks of a kind, where `linearise_group` knows how they are anchored."""
+        """The model's kernel for a kind of landmark, if `linearise_group` supports its anchoring."""
         if kind is None or (Part.SUBSTATE in model.reads and model.about is None):
             return None
         return fused_kernel(model) if not kind.landmark.anchored or isinstance(self.space, SE3Group) else None
 
     def points(self, kind: Kind, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks as points (…, K, dim) in the frame, of means (…, n), and how they move by their columns and clones."""
+        """Landmarks as points (…, K, dim) in the frame, from means (…, n), and their Jacobian by their columns and clones."""
         if not kind.landmark.anchored:
             return kind.landmark.point(mean[..., kind.columns])
         anchor = self.poses(kind, mean)
         points, slope = kind.landmark.point(mean[..., kind.columns], anchor)
-        # p = K Exp(δ) l: ∂p/∂δ = R [l's turn | I] J_r.
+        # p = K Exp(δ) l: ∂p/∂δ = R [−[l]× | I] J_r.
         near = self.space.inverse_transform(anchor, points)
         by_clone = self.space.rotation(anchor) @ self.space.transform_jacobian(near)
         return points, np.concatenate([slope, by_clone @ self.space.right_jacobian(mean[..., kind.clones])], axis=-1)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         return {"clones": self.clones, "clone_first": self.clone_first, **self.table._asdict()}
 
     def restore(self, arrays: dict[str, np.ndarray], prefix: str, size: int) -> None:
-        """Takes up what `arrays` gave, of n columns. Raises InputError: it is damaged."""
+        """The inverse of `arrays`, for n columns. Raises InputError: they are damaged."""
         rows, kinds = checkpoint.integers("landmarks", least=0), len(self.kinds)
         schema = {
             "ids": checkpoint.integers("landmarks"), "first": rows,
@@ -174,10 +174,10 @@ class JointColumns:
 
 
 class Beside(NamedTuple):
-    """Old landmarks (K,) at `points` (K, D) as seen from the end of the present sub-map, which does not have them.
+    """Old landmarks (K,) that are not in the current sub-map, at `points` (K, D) relative to its end.
 
-    Its own landmarks (M,) are at `theirs` (M, D): as these move, so do the others, by `slope` (KD, MD); `rest` (KD, KD) is
-    what is then uncertain about them.
+    The current sub-map's landmarks (M,) are at `theirs` (M, D). The old ones depend on them by regression: Jacobian `slope`
+    (KD, MD) and remaining covariance `rest` (KD, KD).
     """
 
     ids: np.ndarray
@@ -188,7 +188,7 @@ class Beside(NamedTuple):
     rest: np.ndarray
 
     def widened(self, held: JointColumns, mean: np.ndarray, cov: Array) -> tuple[JointColumns, np.ndarray, Array]:
-        """What is held, of means (N, n) and covariance (n, n), and beside it what is not."""
+        """Columns, means (N, n) and covariance (n, n) of the current sub-map, extended by these old landmarks."""
         own, new, dim = held.holds(self.own), ~held.holds(self.ids) & (self.ids >= 0), self.points.shape[1]
         columns = held.of_one_kind(self.own[own]).columns.ravel()
         at, rows = np.repeat(own, dim), np.repeat(new, dim)
@@ -201,7 +201,7 @@ class Beside(NamedTuple):
 
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray], dim: int) -> "Beside":
-        """What a checkpoint has held of D numbers for each landmark. Raises InputError: it is damaged."""
+        """From a checkpoint, D numbers per landmark. Raises InputError: it is damaged."""
         schema = {
             "ids": checkpoint.integers("others", least=0), "points": checkpoint.numbers("others", dim),
             "own": checkpoint.integers("own", least=0), "theirs": checkpoint.numbers("own", dim),
@@ -209,5 +209,5 @@ class Beside(NamedTuple):
         }  # fmt: skip
         found = cls(**checkpoint.read(arrays, schema, "joint/beside/"))
         if found.slope.shape != (found.points.size, found.theirs.size):
-            raise InputError("the array joint/beside/slope does not fit the landmarks beside it")
+            raise InputError("the array joint/beside/slope does not fit its landmarks")
         return found

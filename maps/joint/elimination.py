@@ -1,7 +1,7 @@
-"""A symmetric positive definite matrix that is a sum of dense blocks, eliminated in dense blocks (I. Duff and J. Reid 1983).
+"""Multifrontal Cholesky elimination of a symmetric positive definite sum of dense blocks (I. Duff and J. Reid 1983).
 
-Columns that are in the same blocks of the sum are eliminated together, those with the fewest neighbours first. What has then
-to be known of a matrix is a tree of *cliques*: columns that are eliminated, and those of later ones that hang on them.
+Columns that occur in the same blocks of the sum are eliminated together, those with the fewest neighbours first. The
+elimination tree consists of *cliques*: eliminated columns, and the later columns coupled to them.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from rbpf.kernels.dense import add_principal
 
 
 class Clique(NamedTuple):
-    """Columns (o,) that are eliminated, later ones (s,) that hang on them, blocks that begin here, the next clique or -1."""
+    """Eliminated columns (o,), later ones coupled to them (s,), blocks that are added here, the parent clique or -1."""
 
     own: np.ndarray
     behind: np.ndarray
@@ -22,7 +22,7 @@ class Clique(NamedTuple):
 
 
 def cliques_of(size: int, blocks: list[np.ndarray]) -> list[Clique]:
-    """In which order columns (size,) are eliminated, of which each block (b,) has some, none twice.
+    """The elimination order of columns (size,); each block (b,) lists distinct columns.
 
     Memory is the square of the number of groups of columns that are in the same blocks, a byte for each pair.
     """
@@ -41,7 +41,7 @@ def cliques_of(size: int, blocks: list[np.ndarray]) -> list[Clique]:
         every = np.flatnonzero(touches[degree.argmin()])
         touches[np.ix_(every, every)] = True
         degree[every] = touches[every] @ sizes
-        # Those that hang on nothing else go at the same time.
+        # Columns coupled to no others are eliminated at the same time.
         now = degree[every] == sizes[every].sum()
         own, behind = every[now], every[~now]
         touches[np.ix_(behind, own)] = False
@@ -65,11 +65,11 @@ def cliques_of(size: int, blocks: list[np.ndarray]) -> list[Clique]:
 
 
 class Elimination:
-    """The Cholesky factor of a sum of matrices (b, b), each of the columns of its block. Raises LinAlgError: it has none."""
+    """The Cholesky factor of a sum of matrices (b, b), each in the columns of its block. Raises LinAlgError: it has none."""
 
     def __init__(self, size: int, blocks: list[np.ndarray], cliques: list[Clique], summands: list[np.ndarray]) -> None:
         self.size, self.blocks, self.cliques = size, blocks, cliques
-        self.factors = list[tuple[np.ndarray, np.ndarray]]()  # of each clique L (o, o) and L⁻¹ of what is behind (o, s)
+        self.factors = list[tuple[np.ndarray, np.ndarray]]()  # of each clique L (o, o), L⁻¹ times its coupling (o, s)
         waiting: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in cliques]
         place = np.zeros(size, dtype=np.int64)
         for clique, theirs in zip(cliques, waiting, strict=True):
@@ -88,7 +88,7 @@ class Elimination:
                 waiting[clique.parent].append((clique.behind, front[o:, o:] - across.T @ across))
 
     def _forward(self, right: np.ndarray) -> np.ndarray:
-        """L⁻¹ of (size, k), in place; cliques that it does not reach are left out."""
+        """L⁻¹ of (size, k), in place; cliques with a zero right-hand side are skipped."""
         for clique, (lower, across) in zip(self.cliques, self.factors, strict=True):
             if right[clique.own].any():
                 right[clique.own] = own = solve_triangular(lower, right[clique.own], lower=True, check_finite=False)
@@ -96,7 +96,7 @@ class Elimination:
         return right
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """What gives (size,) when multiplied."""
+        """The solution (size,) of the linear system."""
         out = self._forward(right.copy())
         for clique, (lower, across) in zip(self.cliques[::-1], self.factors[::-1], strict=True):
             rest = out[clique.own] - across @ out[clique.behind]
@@ -104,14 +104,14 @@ class Elimination:
         return out
 
     def marginal(self, columns: np.ndarray) -> np.ndarray:
-        """Some entries (c, c) of the inverse."""
+        """The block (c, c) of the inverse for some columns."""
         unit = np.zeros((self.size, columns.size))
         unit[columns, np.arange(columns.size)] = 1.0
         half = self._forward(unit)
         return np.asarray(half.T @ half)
 
     def within(self) -> list[np.ndarray]:
-        """The inverse within each block (b, b), from the last clique back (K. Takahashi, J. Fagan and M. Chin 1973)."""
+        """The inverse within each block (b, b), backwards from the last clique (K. Takahashi, J. Fagan and M. Chin 1973)."""
         out, held = [np.zeros((0, 0))] * len(self.blocks), [np.zeros((0, 0))] * len(self.cliques)
         place = np.zeros(self.size, dtype=np.int64)
         for number in range(len(self.cliques) - 1, -1, -1):

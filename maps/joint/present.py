@@ -1,7 +1,7 @@
-"""The sub-map that a joint map is making, where all its particles are alike, and what it exchanges with finished ones.
+"""The current sub-map of a joint map at the end of a window, and its exchange with finished sub-maps.
 
-That is whenever a window has ended: what leaves goes over exactly, and comes back with all that is known of it,
-Mathematics (passed-on).
+At the end of a window all particles are equal: landmarks are passed to finished sub-maps exactly, and return with all
+information about them, Mathematics (passed-on).
 """
 
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ from rbpf.maps.joint.submaps import SubMaps
 
 @dataclass
 class Present:
-    """One Gaussian of frame, substate, landmarks and clones; what is done with finished sub-maps changes it in place."""
+    """The Gaussian of frame, substate, landmarks and clones; exchanges with finished sub-maps change it in place."""
 
-    origin: np.ndarray  #: (E,) the frame's mean pose, as seen from where the sub-map begins.
-    held: JointColumns  #: which landmarks and clones there are, and in which columns.
+    origin: np.ndarray  #: (E,) the frame's mean pose, relative to the sub-map's start.
+    held: JointColumns  #: its landmarks and clones, and their columns.
     mean: np.ndarray  #: (n,).
     cov: np.ndarray  #: (n, n).
-    given: np.ndarray  #: (K,) landmarks of which finished sub-maps have told it something.
-    walked: dict[int, np.ndarray]  #: by which covariance (D, D) landmarks have walked in it, as seen from its start.
+    given: np.ndarray  #: (K,) landmarks with a prior from finished sub-maps.
+    walked: dict[int, np.ndarray]  #: covariance (D, D) of the landmarks' random walk in it, relative to its start.
 
     def finished(self, old: SubMaps) -> SubMap:
-        """As it would be if it ended here."""
+        """The sub-map, if it ended here."""
         points = self.held.table.ids[self.held.table.kind == 0]
         columns, given = self.held.of_one_kind(points).columns, np.intersect1d(self.given, points)
         d, constants = self.held.space.dim, self.constants(old)
@@ -44,18 +44,18 @@ class Present:
         )
 
     def constants(self, old: SubMaps) -> np.ndarray:
-        """Columns (k,) of what is the same in all sub-maps: the last ones of the substate."""
+        """Columns (k,) of the constants common to all sub-maps: the last ones of the substate."""
         return np.arange(self.held.first - old.about.constants.size, self.held.first)
 
     def pass_on(self, old: SubMaps, leaving: np.ndarray, wanted: np.ndarray | None, seen: Given | None = None) -> None:
-        """Ends it, and begins the next one; what does not leave goes over as it is.
+        """Ends it, and starts the next one with all landmarks that are not `leaving`, unchanged.
 
-        All are solved for if landmarks are `wanted` from afar. What is `seen` of old landmarks besides stays behind.
+        All sub-maps are solved jointly if distant landmarks are `wanted`. Old landmarks `seen` are added to the ended one.
         """
         held, d, constants = self.held, self.held.space.dim, self.constants(old)
         point, dim, driving = held.kinds[0], held.kinds[0].dim, held.first - d - constants.size
         seams = held.table.ids[held.table.ids < 0]
-        # What drives the motion ties the two as landmarks do: as it is here it is held on, in numbers taken for places.
+        # The driving substate ties the two like landmarks do: it is copied into pseudo-landmarks.
         count = -(-driving // dim)
         names = -1 - np.arange(count) - count * len(old.maps)
         taken = np.append(np.arange(self.mean.size), d + np.arange(driving))
@@ -72,16 +72,16 @@ class Present:
         self.mean[:d], self.cov[:d], self.cov[:, :d] = 0.0, 0.0, 0.0
         self.given = held.table.ids[held.table.kind == 0]
         if (known := old.given(self.given)) is not None:
-            # All sub-maps together may say more of these, if landmarks were begun anew, or what differs in the second order.
+            # The joint solution may know more of these, if landmarks were initialised again, or differ in second order.
             columns = np.append(held.of_one_kind(known.ids).columns, constants)
             own, off = principal(self.cov, columns), np.append(known.points, known.constants) - self.mean[columns]
-            if off.any() or not np.array_equal(known.cov, own):  # mostly they say the same
+            if off.any() or not np.array_equal(known.cov, own):  # usually they agree
                 gain = np.linalg.solve(own, self.cov[columns]).T
                 self.mean = self.mean + gain @ off
                 self.cov = gaussian.symmetrise(self.cov + gain @ (known.cov - own) @ gain.T)
 
     def bring_in(self, old: SubMaps, returning: np.ndarray) -> None:
-        """Landmarks (K,) about the start are held again."""
+        """Adds old landmarks (K,) around the start to the current sub-map."""
         if returning.size:
             ended = self.finished(old)
             seen, slope, rest = old.brought_back(returning, ended)
@@ -92,9 +92,9 @@ class Present:
             self.cov = np.block([[self.cov, cross.T], [cross, rest + cross[:, columns] @ slope.T]])
 
     def begin_again(self, old: SubMaps, seen: Given) -> None:
-        """Ends it, and begins one about old landmarks that are seen from the frame: how the robot came there is not known.
+        """Ends it, and starts one at old landmarks observed from the frame, without odometry between the two.
 
-        The substate alone is held on.
+        Only the substate is kept.
         """
         space, first, none = self.held.space, self.held.first, seen.ids[:0]
         old.join(self.finished(old))
@@ -106,7 +106,7 @@ class Present:
         self.walked = {}
         self.mean, self.cov = self.mean[:first].copy(), self.cov[:first, :first].copy()
         self.mean[: space.dim], self.cov[: space.dim], self.cov[:, : space.dim] = 0.0, 0.0, 0.0
-        # From where it begins, they are what all sub-maps say of them; what drove the motion is told by none.
+        # Landmarks and constants have the joint estimate of all sub-maps; the driving substate is in none of them.
         known, columns = old.given(seen.ids), self.constants(old)
         assert known is not None
         self._hold(seen.ids, known.points)
@@ -121,7 +121,7 @@ class Present:
         self.mean, self.given = np.append(self.mean, points), np.union1d(self.given, ids)
 
     def landmarks(self, old: SubMaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Names (M,) of all landmarks, finished sub-maps' too, means (M, D) and covariances (M, D, D) in the world."""
+        """Names (M,) of all landmarks, also of finished sub-maps, means (M, D) and covariances (M, D, D) in the world."""
         held, space, cov, origin = self.held, self.held.space, self.cov, self.origin
         d, dim, names, rays = space.dim, held.kinds[0].dim, held.table.ids, held.table.kind != 0
         if old.maps:
@@ -136,7 +136,7 @@ class Present:
         means, covs = np.empty((names.size, dim)), np.empty((names.size, dim, dim))
         for kind in held.by_kind():
             points, slope = held.points(kind, self.mean)
-            # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
+            # p = G Exp(ξ) l: ∂p/∂ξ = R [−[l]× | I], ∂p/∂l = R.
             columns = [np.broadcast_to(np.arange(d), (len(points), d)), kind.columns, kind.clones]
             blocks = diagonal_blocks(cov, np.concatenate(columns, axis=1))
             by_all = turn @ np.concatenate([space.transform_jacobian(points), slope], axis=-1)

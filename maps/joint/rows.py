@@ -1,6 +1,6 @@
-"""The rows of a step of a joint map: linearised and stacked, what a Kalman update takes of them, and which are outliers.
+"""The rows of a step of a joint map: linearised and stacked, their Kalman update, and the outliers among them.
 
-Observations of one Gaussian are judged together, once for all particles, Mathematics (joint-outliers).
+Outliers are classified jointly, once for all particles, as all observe one Gaussian, Mathematics (joint-outliers).
 """
 
 from collections.abc import Sequence
@@ -25,35 +25,35 @@ from rbpf.maps.joint.columns import JointColumns, Kind
 from rbpf.maps.rows import GAUSSIAN
 
 QUICK = 30_000_000
-"""Multiplications up to which a product is the same on any number of threads; BLAS is ten times as fast on larger ones."""
+"""Multiplications up to which products are independent of the number of threads; beyond, BLAS is ten times as fast."""
 WHOLE = 128
-"""Rows up to which a covariance is not worth being quartered."""
+"""Rows below which splitting a covariance into quarters does not pay."""
 TINY = float(np.finfo(float).tiny)
 WIDE = 3.0
-"""Standard deviations of what is learnt alone, by which all else is measured the less."""
+"""Standard deviations of coordinates learnt alone that are added to the noise for everything else."""
 LINEARISATIONS = 3
 SETTLED = 0.1
-"""Of what is learnt alone, at most so often and until its mean moves by less than this many standard deviations."""
+"""Maximum linearisations of coordinates learnt alone, and the step, in standard deviations, that ends them."""
 ROUNDS, SAME, STRIDE = 10, 0.02, 1.5
-"""In which the noise of each measurement is learnt, at most and until none changes by more than this fraction; by so many
-times what a round says it is changed, in its logarithm: a third of the rounds less, and nearer to where they lead."""
+"""Variational rounds that learn each measurement's noise: maximum number, relative change that ends them, and factor of
+over-relaxation in the logarithm, which saves a third of the rounds and ends closer to the fixed point."""
 IN_WORLD = frozenset({Part.STATE})
-"""What a model reads that measures the pose in the world."""
+"""What a model reads that measures the world pose."""
 
 
 class Group(NamedTuple):
-    """Observations of a step that are weighed alike: their rows (K, p) among all, and the log-odds (K,) of an inlier."""
+    """Observations of a step with one likelihood: their rows (K, p), and the log-odds (K,) that they are inliers."""
 
     likelihood: Likelihood
     rows: np.ndarray
     log_odds: np.ndarray
-    kind: Kind | None  #: of the landmarks, where there are some.
-    #: (K, p) by what `WIDE` standard deviations of a coordinate that is learnt alone move them, where there is one.
+    kind: Kind | None  #: of the landmarks, or None.
+    #: (K, p) their change by `WIDE` standard deviations of a coordinate learnt alone, or None.
     along: np.ndarray | None = None
 
 
 class Rows(NamedTuple):
-    """All rows of a step: ν and H in one (R, 1 + d, N), and what all particles share: J P (R, n), S (R, R).
+    """All rows of a step: ν and H in one (R, 1 + d, N), and, common to all particles, J P (R, n), S (R, R).
 
     J is sparse: a row reads the map in columns `at` (R, q), by slopes (R, q).
     """
@@ -77,7 +77,7 @@ class Rows(NamedTuple):
         return out
 
     def set_apart(self) -> "Rows":
-        """As all else reads them: uncertain by what is learnt alone besides, Mathematics (learnt-alone)."""
+        """The rows for all other variables: with coordinates learnt alone as additional noise, Mathematics (learnt-alone)."""
         if all(group.along is None for group in self.groups):
             return self
         cov = self.cov.copy()
@@ -87,7 +87,7 @@ class Rows(NamedTuple):
         return self._replace(cov=cov)
 
     def inliers(self) -> np.ndarray | slice:
-        """The rows that update, those of the surest observations first."""
+        """The rows of inliers, in descending order of log-odds."""
         if all(group.likelihood.kernel_id == 0 for group in self.groups):
             return slice(None)
         pairs = [pair for group in self.groups for pair in zip(group.log_odds, group.rows, strict=True)]
@@ -95,18 +95,18 @@ class Rows(NamedTuple):
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
     def factor(self) -> tuple[np.ndarray | slice, np.ndarray]:
-        """The `inliers`, and Cholesky's factor of their covariance."""
+        """The `inliers`, and the Cholesky factor of their covariance."""
         inside = self.inliers()
         cov = self.cov[inside][:, inside]
         return inside, gaussian.cholesky(cov) if len(cov) else cov
 
     def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
-        """The same where all that is held moves with the state, by gain (n, d) times turn (N, d, d)."""
+        """Adds to the state Jacobian that the map moves with the state, by gain (n, d) times turn (N, d, d), in place."""
         add_turned(self.said, self.through(gain), turn)
         return self
 
     def information(self) -> Information:
-        """What the rows say of the state."""
+        """The rows' information about the state."""
         inside, chol = self.factor()
         _, size, n = self.said.shape
         info, vector, quad = np.empty((n, size - 1, size - 1)), np.empty((n, size - 1)), np.empty(n)
@@ -118,7 +118,7 @@ class Rows(NamedTuple):
                 count = int((log_odds >= 0.0).sum())
                 log_factor += count * likelihood.log_inlier() + (len(own) - count) * likelihood.log_outlier()
                 is_density[own] = likelihood.normalised
-        nothing = 0.0  # is said by so many of the rows that are set apart
+        nothing = 0.0  # effective number of rows used up by coordinates learnt alone
         for group in self.groups:
             if group.along is not None:
                 taken = group.log_odds >= 0.0
@@ -128,7 +128,7 @@ class Rows(NamedTuple):
         return Information(info, vector, quad, *np.full((n, 3), of_all).T)
 
     def update(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """One gain for all: log p(z | x) (N,), by what the means move (N, n), and the covariance after, in its memory."""
+        """One gain for all: log p(z | x) (N,), the means' change (N, n), and the updated covariance, in place."""
         inside, chol = self.factor()
         nu = whitened(chol, self.said[inside, 0]).T
         total = self.log_factor - 0.5 * (np.square(nu).sum(axis=1) + log_det(np.diagonal(chol)))
@@ -139,10 +139,10 @@ class Rows(NamedTuple):
 
 
 class Reading:
-    """What the observations of a step read of a joint map: the same wherever they are linearised.
+    """The structure of a step's observations of a joint map, independent of the linearisation point.
 
     Args:
-        held: which columns there are.
+        held: the map's columns.
         cov: (n, n) of the map.
         groups: the observations.
         compiled: use the models' fused kernels where they have one.
@@ -151,7 +151,7 @@ class Reading:
     def __init__(self, held: JointColumns, cov: np.ndarray, groups: Sequence[Observations], compiled: bool) -> None:
         self._table, self._groups, self._of, self.held = held.table, groups, cov, held
         self._cov, self._log_factor = np.ascontiguousarray(cov), 0.0
-        # Which measurements, of what, rows (K, p), and the kernel that they are linearised by.
+        # Measurements, their kind of landmark, rows (K, p), and kernel.
         self._parts = list[tuple[np.ndarray, Kind | None, np.ndarray, FusedKernel | None]]()
         read, noises, first = list[np.ndarray](), list[np.ndarray](), 0
         for group in groups:
@@ -181,7 +181,7 @@ class Reading:
             self._noise[rows[:, :, None], rows[:, None]] = noise
 
     def is_of(self, held: JointColumns, cov: np.ndarray, groups: Sequence[Observations]) -> bool:
-        """Whether it is of these observations, whatever their likelihoods are, and of a map that has not changed."""
+        """Whether it was built for these observations, ignoring likelihoods, and the map is unchanged."""
         same = held is self.held and held.table is self._table and cov is self._of and len(groups) == len(self._groups)
         return same and all(
             one.model is two.model and one.z is two.z and one.ids is two.ids and one.cov is two.cov
@@ -191,8 +191,7 @@ class Reading:
     def rows(self, groups: Sequence[Observations], state: np.ndarray, mean: np.ndarray, origin: Array | None) -> Rows:
         """Linearises all groups, at states (N, E) and the particles' own means (N, n).
 
-        Jacobians by what is held are averaged over the particles. `origin` is None where nothing may be observed in the
-        world.
+        Jacobians by the map are averaged over the particles. `origin` is None if nothing may be observed in the world.
         """
         held, space, (n, d) = self.held, self.held.space, (len(state), self.held.space.dim)
         state, mean = numbers(state, "states"), numbers(mean, "the map's means")
@@ -207,7 +206,7 @@ class Reading:
                 first = int(rows[0, 0]) if rows.size else 0
                 linearise_group(kernel.function.address, kernel.params, state, mean, *columns, z, first, said, by_held)
                 if model.about is not None and rows.size:
-                    # By what all particles have in common: in the slope they differ in the second order.
+                    # Averaged over the particles: their Jacobians differ only in second order.
                     centre, middle = space.mean(state, np.full(n, 1.0 / n)), mean.mean(axis=0)
                     const = held.poses(kind, middle) if kind.landmark.anchored else None
                     by_substate = model.by_substate(centre, middle[kind.columns], const).reshape(rows.size, -1)
@@ -224,16 +223,16 @@ class Reading:
             if in_world := model.reads == IN_WORLD:
                 if origin is None:
                     name = type(model).__name__
-                    raise InputError(f"{name} observes the pose in the world: sub-maps do not take that")
+                    raise InputError(f"{name} observes the pose in the world, which sub-maps do not support")
                 at = space.compose(space.retract(origin, mean[:, :d]), state)[:, None]
             found, jac = linearise(model, space, z, at, landmarks, anchors, substate)
-            # By what slope each observation reads the Gaussian, in the order of its columns.
+            # Jacobian of each observation by the Gaussian, in the order of its columns.
             used = list[np.ndarray]()
             if kind is not None:
                 assert jac.landmark is not None
                 used.append(jac.landmark.mean(axis=0))
             if kind is not None and anchors is not None and jac.state is not None:
-                # To move the clone is to move the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
+                # Moving the clone is moving the state the other way: ∂h/∂C = −∂h/∂y Ad(y⁻¹ C), and C = K Exp(δ).
                 turn = space.adjoint(space.between(at, anchors)) @ space.right_jacobian(mean[:, kind.clones])
                 used.append(-(jac.state @ turn).mean(axis=0))
             if jac.substate is not None:
@@ -260,7 +259,7 @@ class Reading:
                 column = part.kind.columns[:, alone]
                 if (np.bincount(column) > 1).any():
                     raise InputError(
-                        "a group observes a landmark of unknown depth twice: give the second observation in another group"
+                        "a group observes a landmark of unknown depth twice: put the second one into another group"
                     )
                 std = WIDE * np.sqrt(self._cov[column, column])
                 parts[number] = part._replace(along=std[:, None] * by_held[part.rows, alone])
@@ -269,10 +268,10 @@ class Reading:
     def learn_alone(
         self, group: Observations, seen: Group, state: np.ndarray, mean: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Gives what `Rows.set_apart` has left of the one group that is read to the coordinates that are learnt alone.
+        """Updates the coordinates learnt alone with the remaining information of one group, see `Rows.set_apart`.
 
-        It is linearised anew where they come to lie; `seen` are its rows as they were before. Returns the log-density, one of
-        all particles, means (N, n) and the covariance (n, n), Mathematics (learnt-alone).
+        The update is iterated; `seen` has the group's rows of the joint update. Returns the log-density common to all
+        particles, means (N, n) and covariance (n, n), Mathematics (learnt-alone).
         """
         assert seen.kind is not None and seen.along is not None
         alone = seen.kind.landmark.learnt_alone
@@ -284,9 +283,9 @@ class Reading:
         while True:
             rows = self.rows([group], state, at, None)
             own = rows.groups[0].rows
-            # Without any parallax there is no line, and nothing along it.
+            # Without parallax there is no epipolar line, and no information along it.
             noise = np.maximum(np.einsum("kp,kpq,kq->k", along, diagonal_blocks(self._noise, own), along), TINY)
-            # Of the information 1/r along the line 1/(r + w²) has been used.
+            # Of the information 1/r along the epipolar line 1/(r + w²) has already been used.
             ratio = np.where(seen.log_odds >= 0.0, np.square(wide) / noise, 0.0)
             information = ratio / (1.0 + ratio) / noise
             slope = np.einsum("kp,kpq->kq", along, rows.slope[own])
@@ -302,7 +301,7 @@ class Reading:
             if done == LINEARISATIONS or (np.abs(moved - at)[:, column] <= SETTLED * std).all():
                 break
             at = moved
-        # Schmidt's filter: rows of the gain are zero but where a row is the coordinate's own.
+        # Schmidt-Kalman update: only the coordinate's own rows of the gain are not zero.
         after, mine = self._cov.copy(), np.ix_(column, column)
         after[column] -= gain[:, None] * carried
         after[:, column] = after[column].T
@@ -316,7 +315,7 @@ class Reading:
 
 
 def checked_ids(group: Observations) -> np.ndarray | None:
-    """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
+    """Landmarks (K,) of a group, or None. Raises InputError: the association differs between particles."""
     name, ids = type(group.model).__name__, group.ids
     if group.updates != frozenset({Part.STATE, Part.LANDMARK}):
         raise InputError(f"a joint map's observations update state and landmarks, {name}'s do not")
@@ -336,21 +335,21 @@ def log_det(diagonal: np.ndarray) -> float:
 
 
 def diagonal_blocks(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The blocks (K, p, p) on the diagonal that belong to rows and columns (K, p)."""
+    """The diagonal blocks (K, p, p) of rows and columns (K, p)."""
     return matrix[rows[:, :, None], rows[:, None, :]]
 
 
 def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: list[Group]) -> list[Observations]:
-    """The groups, measurements with the noise R / λ in place of R where that is Student's t, Mathematics (joint-tails).
+    """The groups, with the noise R / λ instead of R for Student-t measurements, Mathematics (joint-tails).
 
-    Of λ ~ Γ(ν/2, ν/2) it is the mean, given all such measurements (variational Bayes: R. Piché, S. Särkkä and J. Hartikainen
-    2012), and `log_factor` makes of their log-density a bound of what it is under the distribution of λ.
+    λ is the mean of λ ~ Γ(ν/2, ν/2) given all such measurements (variational Bayes: R. Piché, S. Särkkä and J. Hartikainen
+    2012), and `log_factor` turns their log-density into a lower bound of the true one.
 
     Args:
         groups: of a step.
         nu: (R,) mean of the innovations under all particles.
         cov: (R, R) their covariance.
-        parts: whose rows they are.
+        parts: their groups of rows.
     """
     heavy = [
         at for at, group in enumerate(groups) if group.likelihood is not None and np.isfinite(group.likelihood.dof)
@@ -365,10 +364,10 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
     scales = {at: np.ones(len(parts[at].rows)) for at in heavy}
     weights = {at: np.linalg.inv(groups[at].cov[taken[at]]) for at in heavy}
     for _ in range(ROUNDS if of_heavy.size else 0):
-        half, settled = _inverse_root(cov), True  # of cov⁻¹ no more is wanted than blocks on the diagonal
+        half, settled = _inverse_root(cov), True  # only the diagonal blocks of cov⁻¹ are needed
         solved = half @ (nu @ half)
         for at in heavy:
-            # Of the noise given all measurements, mean R S⁻¹ν and covariance R − R (S⁻¹) R; then by how much it is stated.
+            # Noise given all measurements: mean R S⁻¹ν and covariance R − R (S⁻¹) R; then its expected scale.
             own, stated, dof = place[parts[at].rows], groups[at].cov[taken[at]], parts[at].likelihood.dof
             now, p = stated / scales[at][:, None, None], own.shape[1]
             mean = (now @ solved[own][..., None])[..., 0]
@@ -389,7 +388,7 @@ def with_tails(groups: Sequence[Observations], nu: Array, cov: Array, parts: lis
 
 
 def _inverse_root(cov: np.ndarray) -> np.ndarray:
-    """L⁻ᵀ (n, n) of a covariance L Lᵀ, by quarters: BLAS multiplies several times as fast as LAPACK solves."""
+    """L⁻ᵀ (n, n) of a covariance L Lᵀ, by recursive quarters: BLAS products are faster than LAPACK's solves."""
     if len(cov) < WHOLE:
         return np.asarray(dtrtri(gaussian.cholesky(cov).T, overwrite_c=True)[0])
     out, first = np.zeros(cov.shape), slice(len(cov) // 32 * 16)  # lanes of BLAS stay whole
@@ -402,9 +401,9 @@ def _inverse_root(cov: np.ndarray) -> np.ndarray:
 
 
 def _bound_of(scale: np.ndarray, dof: float, p: int) -> float:
-    """What the bound has beside the log-density of K measurements of p numbers with means λ (K,), at most 0.
+    """The bound's terms besides the log-density, for K measurements of p numbers with means λ (K,); at most 0.
 
-    E log λ in place of log E λ, half of it for each number, and how far what is known of λ is from its prior.
+    E log λ instead of log E λ, times p/2, and the Kullback-Leibler divergence of λ's posterior from its prior.
     """
     prior, shape = 0.5 * dof, 0.5 * (dof + p)
     rate = shape / scale
@@ -414,9 +413,9 @@ def _bound_of(scale: np.ndarray, dof: float, p: int) -> float:
 
 
 def log_odds_of(nu: np.ndarray, cov: np.ndarray, groups: list[Group]) -> list[np.ndarray]:
-    """Log-odds (K,) of every group's observations, each given all others that are inliers, of which no change of one adds.
+    """Log-odds (K,) of all observations given the other inliers, at a local optimum of the set of inliers.
 
-    Begins with those that are inliers when seen alone; then the one that is most at odds with its place changes it.
+    Starts with the inliers by individual tests; then the observation that contradicts its class most is moved, repeatedly.
     """
     alone = [group.likelihood.log_odds(nu[group.rows], diagonal_blocks(cov, group.rows)) for group in groups]
     taken = [odds >= 0.0 for odds in alone]
@@ -425,7 +424,7 @@ def log_odds_of(nu: np.ndarray, cov: np.ndarray, groups: list[Group]) -> list[np
     for _ in range(2 * sum(len(each) for each in taken) + 1):
         found = []
         for (likelihood, rows, *_), took in zip(groups, taken, strict=True):
-            # An inlier is left out of what it is judged by: ν = Π⁻¹ (S⁻¹ν) with covariance Π⁻¹, Π its block of S⁻¹.
+            # An inlier is tested without itself: ν = Π⁻¹ (S⁻¹ν) with covariance Π⁻¹, Π its block of S⁻¹.
             own, spread = given[rows, -1], diagonal_blocks(given, rows)
             spread[took] = -np.linalg.inv(spread[took])
             own[took] = (spread[took] @ own[took][..., None])[..., 0]
@@ -443,9 +442,9 @@ def log_odds_of(nu: np.ndarray, cov: np.ndarray, groups: list[Group]) -> list[np
 
 
 def _swept(given: np.ndarray, rows: np.ndarray, back: bool) -> np.ndarray:
-    """[S | ν] (R, R + 1) swept by some rows k, or `back`: what is given all rows U that it is swept by.
+    """[S | ν] (R, R + 1) swept by some rows k, or `back`: conditional moments given all swept rows U.
 
-    Then it has −S_UU⁻¹ in U, S_UU⁻¹ν beside it, and elsewhere covariance and innovation given U (J. Goodnight 1979).
+    It holds −S_UU⁻¹ in U, S_UU⁻¹ν beside it, and elsewhere covariance and innovation given U (J. Goodnight 1979).
     """
     inverse, sign = np.linalg.inv(given[np.ix_(rows, rows)]), -1.0 if back else 1.0
     gain, beside = given[:, rows] @ inverse, given[rows]
@@ -456,9 +455,9 @@ def _swept(given: np.ndarray, rows: np.ndarray, back: bool) -> np.ndarray:
 
 
 def beyond_gaussian(rows: Rows, inside: np.ndarray | slice, chol: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """What likelihoods other than the Gaussian add to log N (N,) of the inliers, Mathematics (joint-outlier-weight).
+    """Terms (N,) of non-Gaussian likelihoods in addition to log N of the inliers, Mathematics (joint-outlier-weight).
 
-    Each inlier's own log-density in place of the Gaussian, given the inliers before it; and each outlier's, given all inliers.
+    Each inlier's own log-density instead of the Gaussian, given the previous inliers; each outlier's, given all inliers.
     """
     total, place = np.zeros(len(white)), np.empty(rows.nu.shape[1], dtype=np.int64)
     place[inside] = np.arange(len(chol))
@@ -481,12 +480,12 @@ def whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """L⁻¹ (R, R) of rows (R, k), C-contiguous."""
     if not rows.size:
         return rows
-    # Of transposed matrices, which are as BLAS wants them.
+    # Transposed, to match the column-major layout of BLAS.
     return np.asarray(dtrsm(1.0, chol.T, np.ascontiguousarray(rows).T, side=1, lower=0).T)
 
 
 def plus_gram(cov: np.ndarray, rows: np.ndarray, sign: float = 1.0) -> np.ndarray:
-    """Cov (n, n) ± rowsᵀ rows, of rows (k, n), in its memory; exactly symmetric, and of cov the lower triangle counts."""
+    """Cov (n, n) ± rowsᵀ rows, of rows (k, n), in place; exactly symmetric; only the lower triangle of cov is read."""
     if rows.size * len(cov) > QUICK:
         cov = dsyrk(sign, rows.T, beta=1.0, c=cov.T, overwrite_c=True).T  # of the transposed, the upper triangle
     else:
@@ -506,7 +505,7 @@ def turned(cov: np.ndarray, blocks: list[tuple[np.ndarray, np.ndarray]]) -> np.n
 
 
 def spread_of(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Covariance (k, k) that weighted values (N, k) are a sample of: Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
+    """Unbiased covariance (k, k) of weighted samples (N, k): Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
     return plus_gram(np.zeros((values.shape[1],) * 2), apart(values, weights))
 
 

@@ -1,4 +1,4 @@
-"""What finished sub-maps say together: all their starts and landmarks by Gauss-Newton, Mathematics (submaps)."""
+"""Joint solution of finished sub-maps: all starts and landmarks by Gauss-Newton, Mathematics (submaps)."""
 
 from typing import NamedTuple
 
@@ -12,22 +12,22 @@ from rbpf.kernels.dense import principal
 from rbpf.maps.joint.elimination import Elimination, cliques_of
 
 ENOUGH, ITERATIONS = 0.1, 20
-"""Length of the last step to a solution, in standard deviations of all of it together, and how many there are at most."""
+"""Norm of the last Gauss-Newton step, in standard deviations of the joint solution, and maximum number of steps."""
 LESS = {1.0: 0.99, 0.99: 0.9, 0.9: 0.0}
-"""Of what sub-maps were given, the fraction that is taken off where that before is more than they say."""
+"""The next smaller fraction of the sub-maps' priors to subtract if the difference is not positive definite."""
 FORGOTTEN = -(2**40)
-"""Below it are names of what is no landmark any more."""
+"""Smaller names are those of landmarks that have been removed."""
 EXACT, AT_REST = 1e-5, 1e-7
-"""Standard deviations [m, rad] of what drives the motion where it is known exactly, and of an end as that of a robot at rest.
+"""Standard deviations [m, rad] added to the driving substate if it is known exactly, and to the end of a robot at rest.
 
-Landmarks are known to some micrometres from each other: what is taken for exact must not matter beside that.
+The relative accuracy of landmarks is some micrometres, in comparison to which these must be negligible.
 """
 
 
 class Given(NamedTuple):
-    """What was known before a sub-map of landmarks (K,), at `points` (K, D) as seen from its start, and of `constants` (k,).
+    """The prior given to a sub-map: landmarks (K,) at `points` (K, D) relative to its start, and `constants` (k,).
 
-    `cov` is that of both, (KD + k, KD + k); landmarks have `walked` since, by a covariance (K, D, D).
+    `cov` is the joint covariance (KD + k, KD + k); `walked` (K, D, D) is the landmarks' random walk since then.
     """
 
     ids: np.ndarray
@@ -38,7 +38,7 @@ class Given(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What is the same in all sub-maps, Mathematics (submap-constants): mean (k,) and covariance (k, k)."""
+    """Constants common to all sub-maps, Mathematics (submap-constants): mean (k,) and covariance (k, k)."""
 
     mean: np.ndarray
     cov: np.ndarray
@@ -50,9 +50,9 @@ NOTHING = Constants(np.zeros(0), np.zeros((0, 0)))
 def exchanged(
     mean: np.ndarray, cov: np.ndarray, own: slice, before: Constants, after: Constants
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A Gaussian (…, n), (n, n) had the constants that are `own` of it this prior `after`, Mathematics (exchange).
+    """Replaces the prior `before` of a Gaussian's constants `own` by `after`; mean (…, n), cov (n, n): Mathematics (exchange).
 
-    What the draws of paths seem to have told without there being anything to tell it by is no information.
+    Spurious shifts by sampled paths, along directions without information, are ignored.
     """
     here, unit = inverse_of(cov[own, own]), gaussian.cholesky(after.cov)
     values, vectors = np.linalg.eigh(unit.T @ (here - inverse_of(before.cov)) @ unit)
@@ -68,7 +68,7 @@ def exchanged(
 
 
 def gain_of(found: Constants, before: Constants, after: Constants) -> float:
-    """By how many nats what led from a prior `before` to what is `found` is likelier `after`, Mathematics (exchange-gain)."""
+    """Gain in log-evidence (nats) if the prior were `after` instead of `before`, Mathematics (exchange-gain)."""
     info, infos = inverse_of(found.cov), [inverse_of(prior.cov) for prior in (before, after)]
     told, by_told = info - infos[0], info @ found.mean - infos[0] @ before.mean
     nats = []
@@ -80,13 +80,13 @@ def gain_of(found: Constants, before: Constants, after: Constants) -> float:
 
 
 def moved(space: RigidSpace, pose: np.ndarray, by: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A pose (E,) moved by (d,) in its right chart, and the covariance (n, n) that begins with its own, there."""
+    """A pose (E,) moved by (d,) in its right chart, and the covariance (n, n), whose first block is the pose's, there."""
     turn = block_diag(space.right_jacobian(by), np.eye(len(cov) - len(by)))
     return space.retract(pose, by), turn @ cov @ turn.T
 
 
 class SubMap(NamedTuple):
-    """A finished sub-map: where it ends as seen from its start (E,), landmarks (M,) at `points` (M, D) as seen from its end.
+    """A finished sub-map: its end (E,) relative to its start, landmarks (M,) at `points` (M, D) relative to its end.
 
     `cov` is that of the end, in its right chart, the points and the `constants` (k,), (d + MD + k, d + MD + k).
     """
@@ -95,40 +95,40 @@ class SubMap(NamedTuple):
     ids: np.ndarray
     points: np.ndarray
     cov: np.ndarray
-    tied: bool = True  #: begins where the one before ends; else `end` and its part of `cov` say nothing.
-    given: Given | None = None  #: what of all this is not its own; None where it began with nothing.
+    tied: bool = True  #: starts at the end of the previous one; else `end` and its block of `cov` are not used.
+    given: Given | None = None  #: the prior it started with; None without one.
     constants: np.ndarray = NOTHING.mean
 
     @property
     def mean(self) -> np.ndarray:
-        """Of what `cov` is about."""
+        """The mean that belongs to `cov`."""
         pose = len(self.cov) - self.points.size - self.constants.size
         return np.concatenate([np.zeros(pose), self.points.ravel(), self.constants])
 
     @property
     def inherited(self) -> np.ndarray:
-        """Names (K,) of the landmarks that it began with."""
+        """Names (K,) of the landmarks in its prior."""
         return self.ids[:0] if self.given is None else self.given.ids
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
-        """Of its landmarks (K,)."""
+        """Rows of landmarks (K,)."""
         row_of = {landmark: row for row, landmark in enumerate(self.ids.tolist())}
         return np.array([row_of[landmark] for landmark in ids.tolist()], dtype=np.int64)
 
     def columns(self, rows: np.ndarray) -> np.ndarray:
-        """Of `cov` those (d + KD + k,) of the end, of landmarks by row (K,), and of the constants."""
+        """Columns (d + KD + k,) of `cov`: the end's, those of landmarks by row (K,), and the constants'."""
         size, dim, last = len(self.cov), self.points.shape[1], len(self.cov) - self.constants.size
         d = last - self.points.size
         points = (d + dim * rows[:, None] + np.arange(dim)).ravel()
         return np.concatenate([np.arange(d), points, np.arange(last, size)])
 
     def of(self, rows: np.ndarray) -> "SubMap":
-        """Without its other landmarks."""
+        """The sub-map with only the landmarks in these rows."""
         columns = self.columns(rows)
         return self._replace(ids=self.ids[rows], points=self.points[rows], cov=principal(self.cov, columns))
 
     def seeing(self, seen: Given) -> "SubMap":
-        """With landmarks that are seen from its end besides."""
+        """The sub-map with further landmarks observed from its end."""
         last = len(self.cov) - self.constants.size
         order = np.insert(np.arange(len(self.cov)), last, len(self.cov) + np.arange(seen.points.size))
         cov = principal(block_diag(self.cov, seen.cov), order)
@@ -136,7 +136,7 @@ class SubMap(NamedTuple):
 
 
 def inverse_of(cov: np.ndarray) -> np.ndarray:
-    """Of a sub-map's covariance. Raises InputError: it is singular, or none."""
+    """Inverse of a sub-map's covariance. Raises InputError: it is singular or not a covariance."""
     try:
         return gaussian.inverse(cov)
     except InputError as error:
@@ -146,9 +146,9 @@ def inverse_of(cov: np.ndarray) -> np.ndarray:
 
 
 class Factor(NamedTuple):
-    """What a sub-map says of starts and landmarks in `columns` (c,): a residual (r,), its information and slope (r, c).
+    """A sub-map's factor on starts and landmarks in `columns` (c,): residual (r,), information (r, r), Jacobian (r, c).
 
-    `own` (r,) are the columns of the sub-map's Gaussian that it is of. The slope is `by_ends` (r, 2d), then Rᵀ for each of the
+    `own` (r,) are its columns in the sub-map's Gaussian. The Jacobian is `by_ends` (r, 2d), then Rᵀ for each of the
     landmarks' `rows`, and 1 for constants.
     """
 
@@ -161,7 +161,7 @@ class Factor(NamedTuple):
     rows: slice
 
     def through(self, left: np.ndarray) -> np.ndarray:
-        """(m, r) times the slope."""
+        """A matrix (m, r) times the Jacobian."""
         out = np.concatenate([left @ self.by_ends, left[:, self.rows.start :]], axis=1)
         turned = left[:, self.rows].reshape(len(left), -1, len(self.rotation)) @ self.rotation.T
         first = self.by_ends.shape[1]
@@ -170,7 +170,7 @@ class Factor(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Landmarks (M,) in the world (M, D), all starts, the constants, and the information (n, n) of all, eliminated."""
+    """Landmarks (M,) in the world (M, D), all starts, the constants, and the factorised joint information (n, n)."""
 
     ids: np.ndarray
     world: np.ndarray
@@ -178,10 +178,10 @@ class Solution(NamedTuple):
     constants: np.ndarray
     factors: list[Factor]
     eliminated: Elimination
-    is_whole: bool  #: is a minimum of all that is known, and next to nothing counts twice.
+    is_whole: bool  #: whether it is a minimum with the priors subtracted: (almost) no information is counted twice.
 
     def seen_from(self, space: RigidSpace, number: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks by rows (K,) as seen from a start by number (K, D), and the covariance of it, them and the constants."""
+        """Landmarks by row (K,) relative to a start (K, D), and the joint covariance of the start, them and the constants."""
         d, dim = space.dim, self.world.shape[1]
         start, first = self.starts[number], d * (len(self.starts) - 1)
         seen = space.inverse_transform(start, self.world[rows])
@@ -202,18 +202,19 @@ def solve(
     constants: np.ndarray,
     off: float = 1.0,
 ) -> Solution:
-    """Gauss-Newton over all starts and some landmarks (M,); the others of a sub-map are left out of its factor.
+    """Gauss-Newton over all starts and some landmarks (M,); other landmarks of a sub-map are marginalised out.
 
-    It begins at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
-    `constants` (k,). What sub-maps but the first were given is taken `off`. It was linearised elsewhere: where that leaves
-    no minimum, a little of it stays; where a tenth does not help, as when a filter has diverged, all of it.
+    It starts at `starts` (T + 1, E), of T sub-maps and of the next one, at landmarks in the `world` (M, D), and at
+    `constants` (k,). The priors of all sub-maps but the first are subtracted with the factor `off`. They were linearised
+    elsewhere: if the difference has no minimum, slightly less is subtracted; if a tenth less does not help, as after
+    divergence, nothing.
     """
     d, dim, k, first_guess = space.dim, world.shape[1], constants.size, (starts, world, constants)
     starts, world = starts.copy(), world.copy()
     place = {landmark: row for row, landmark in enumerate(ids.tolist())}
     first = d * len(maps)
     size = first + dim * ids.size + k
-    common, parts, loose = np.arange(size - k, size), [], _looser(space, maps, starts)
+    common, parts, loose = np.arange(size - k, size), [], _added_covariances(space, maps, starts)
     for number, each in enumerate(maps):
         rows = np.array([row for row, landmark in enumerate(each.ids.tolist()) if landmark in place], dtype=np.int64)
         own = each.columns(rows)
@@ -229,7 +230,7 @@ def solve(
             info, columns[:d] = np.zeros(cov.shape), np.arange(-d, 0)
             info[d:, d:] = inverse_of(cov[d:, d:])
         parts.append((rows, at, own, columns, info))
-    # What a sub-map was given is not its own: others say it.
+    # Subtract each sub-map's prior: it is information of other sub-maps.
     taken = []
     for number, each in enumerate(maps):
         if number and each.given is not None and off:
@@ -239,7 +240,7 @@ def solve(
             cov = loosened(each.given.cov, 0, loose[number][1])
             taken.append((number, each.given, at, columns, off * inverse_of(cov)))
     blocks = [columns for *_, columns, _ in parts] + [columns for *_, columns, _ in taken]
-    free = [columns >= 0 for columns in blocks]  # the first start is where the world is
+    free = [columns >= 0 for columns in blocks]  # the first start is the world's origin
     blocks = [columns[own] for columns, own in zip(blocks, free, strict=True)]
     cliques = cliques_of(size, blocks)
     for _ in range(ITERATIONS):
@@ -256,7 +257,7 @@ def solve(
             by_ends[d : d + seen.size, d:] = -space.transform_jacobian(seen).reshape(-1, d)
             half, product = _weighed(info, by_ends, space.rotation(end), d, k)
             summands.append(product)
-            gradient[columns] += half @ residual  # columns below zero fall behind the end
+            gradient[columns] += half @ residual  # negative columns index the padding at the end
             factors.append(Factor(own, columns, info, residual, by_ends, space.rotation(end), slice(d, d + seen.size)))
         for number, given, at, columns, info in taken:
             seen = space.inverse_transform(starts[number], world[at])
@@ -280,10 +281,12 @@ def solve(
     return Solution(ids, world, starts, constants, factors, eliminated, is_whole=off > 0.0)
 
 
-def _looser(space: RigidSpace, maps: list[SubMap], starts: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """By how much less is known of each sub-map's landmarks (M, D, D), and of those it was given (K, D, D), than it was.
+def _added_covariances(
+    space: RigidSpace, maps: list[SubMap], starts: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Covariances to add to each sub-map's landmarks (M, D, D), and to those of its prior (K, D, D).
 
-    They have walked since, Mathematics (passed-on-walk); and what drives the motion is never taken for exact.
+    They are the landmarks' later random walk, Mathematics (passed-on-walk), and a minimum for the driving substate.
     """
     dim, since, found = maps[0].points.shape[1], dict[int, np.ndarray](), []
     none = np.zeros((dim, dim))
@@ -294,7 +297,7 @@ def _looser(space: RigidSpace, maps: list[SubMap], starts: np.ndarray) -> list[t
                 walked = turn @ each.given.walked @ turn.T
                 since |= {name: since.get(name, none) + by for name, by in zip(ids.tolist(), walked, strict=True)}
             by_all = np.array([since.get(name, none) for name in ids.tolist()]).reshape(-1, dim, dim)
-            # No landmarks, but what drove the motion where one sub-map ended and another began.
+            # Pseudo-landmarks that hold the driving substate at the seam of two sub-maps.
             are_seams = (ids < 0) & (ids > FORGOTTEN)
             both.append(turn.T @ by_all @ turn + EXACT**2 * are_seams[:, None, None] * np.eye(dim))
         found.append((both[0], both[1]))
@@ -302,7 +305,7 @@ def _looser(space: RigidSpace, maps: list[SubMap], starts: np.ndarray) -> list[t
 
 
 def loosened(cov: np.ndarray, first: int, by: np.ndarray) -> np.ndarray:
-    """A covariance of which points, in columns from the `first` on, are known less, by (M, D, D)."""
+    """Adds (M, D, D) to the covariance of points in columns from `first` on."""
     at = first + np.arange(by.shape[0] * by.shape[1]).reshape(by.shape[:2])
     cov = cov.copy()
     cov[at[:, :, None], at[:, None, :]] += by
@@ -312,10 +315,10 @@ def loosened(cov: np.ndarray, first: int, by: np.ndarray) -> np.ndarray:
 def _weighed(
     info: np.ndarray, by_poses: np.ndarray, rotation: np.ndarray, first: int, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jᵀ I and Jᵀ I J of a residual of slope J whose information is I (r, r), at the work of their entries.
+    """Jᵀ I and Jᵀ I J for information I (r, r) and a sparse Jacobian J, computed without its zeros.
 
-    J has columns of poses (r, c), then those of landmarks, each with Rᵀ in rows of its own from the `first` on, then those
-    of k constants, each with 1 in one of the last rows.
+    J has columns of poses (r, c), then of landmarks, each with Rᵀ in rows of its own from `first` on, then of k constants,
+    each with 1 in one of the last rows.
     """
     rows, dim = len(info), len(rotation)
     last = rows - k
@@ -328,9 +331,9 @@ def _weighed(
 
 
 def fused(space: RigidSpace, new: SubMap, old: SubMap, between: np.ndarray) -> SubMap:
-    """What two say of their landmarks, as seen from the end of the new one; the old one ends `between` from there.
+    """Fuses two sub-maps into one relative to the new one's end; the old one's end is at `between` relative to it.
 
-    They are solved for with the new one's end and how the old one lies. Where the old one began is left out.
+    Landmarks, the new one's end and the old one's are solved for jointly; the old one's start is marginalised out.
     """
     ids = np.append(new.ids, np.setdiff1d(old.ids, new.ids))
     points = np.concatenate([new.points, space.transform(between, old.points[old.rows(ids[new.ids.size :])])])

@@ -1,12 +1,12 @@
-"""Finished parts of a joint map: Gaussians of their own, tied by the landmarks that they share.
+"""Finished sub-maps of a joint map: independent Gaussians, tied by shared landmarks.
 
-A map that stays one Gaussian costs the square of its landmarks in every step. A *sub-map* begins at the robot with nothing
-that is known before, and ends when it is large; so all of them are independent, and each is one factor on where it begins,
-where it ends, and its landmarks. What they say together is sparse (S. Huang, Z. Wang and G. Dissanayake 2008, "Sparse local
-submap joining filter"). While the robot explores, the last end and the landmarks about it are enough to go on with: one
-Gaussian, to which a finished sub-map is joined at a cost that does not grow (J. Tardós, J. Neira, P. Newman and J. Leonard
-2002). When landmarks return that are not among those, all sub-maps are solved for, linearised anew, Mathematics (submaps).
-Sub-maps of the same place become one, so that there are as many as the ground takes, and not the time.
+The cost of a step with one joint Gaussian is quadratic in its landmarks. A *sub-map* starts at the robot without prior and
+ends when it is large; so sub-maps are independent, and each is one factor on its start, its end, and its landmarks. Their
+joint information is sparse (S. Huang, Z. Wang and G. Dissanayake 2008, "Sparse local submap joining filter"). While the robot
+explores, the last end and the landmarks around it suffice to continue: one Gaussian, to which a finished sub-map is joined at
+constant cost (J. Tardós, J. Neira, P. Newman and J. Leonard 2002). When other landmarks are re-observed, all sub-maps are
+solved jointly with new linearisation points, Mathematics (submaps). Sub-maps of the same place are fused, so that their
+number grows with the area, not with time.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,17 +44,18 @@ from rbpf.maps.joint.solution import (
 )
 
 CLOSE_ENOUGH = 1e-6
-"""Largest step [m, rad] at which two Gaussians are tied."""
+"""Step [m, rad] below which the iterated update that ties two Gaussians has converged."""
 ROUNDING = 1e-15
-"""Variance [m²] below which nothing is told apart."""
+"""Variance [m²] of rounding errors."""
 FIRM = 6
-"""Shared landmarks by which one sub-map lies beside another even without an end that is the other's start."""
+"""Least number of shared landmarks that tie two sub-maps without a common end and start."""
 
 
 class _Tied(NamedTuple):
-    """Start, landmarks `about` it, new end and landmarks: mean, and covariance before they are one, less halfᵀ half after.
+    """Start, landmarks `about` it, new end and landmarks: mean, covariance before the update, its decrease halfᵀ half.
 
-    Those about the start that were given to the new map are left out: it has them. It has those by number `mine`, too.
+    Landmarks about the start that are in the new map's prior are left out, as the new map has them; `mine` are rows it
+    shares.
     """
 
     about: SubMap
@@ -66,21 +67,21 @@ class _Tied(NamedTuple):
 
 @final
 class SubMaps:
-    """The sub-maps that are finished, and what they say together about the place where the present one begins.
+    """The finished sub-maps, and their joint estimate around the start of the current one.
 
     Args:
         space: SE2, SE3 or Euclidean(n).
         dim: D, of a point.
-        most: landmarks that are kept about the start of the present sub-map, besides those of the last one.
-        unnamed: keep what is `beside` the present one.
-        constants: what is the same in all sub-maps (k,), and what is known of it before.
+        most: maximum number of landmarks kept around the current sub-map's start; those of the last one are always kept.
+        unnamed: maintain `beside`, for unknown association.
+        constants: prior of the constants (k,) common to all sub-maps.
 
     Attributes:
-        frame: where there are finished ones, what they and the present one, as last looked at, say of its end.
-        beside: the old landmarks there, where they are kept.
-        maps: the finished ones.
-        starts: the world's origin, and world_from_end (E,) of each; the last one is where the present one starts.
-        about: what they say of the last start, of landmarks about it, and of the constants: as one that begins at the
+        frame: pose of the current one's end at the last `look_from`; None without finished ones.
+        beside: the old landmarks there, if `unnamed`.
+        maps: the finished sub-maps.
+        starts: the world's origin, and world_from_end (E,) of each; the last one is the start of the current one.
+        about: joint estimate of the last start, of landmarks around it, and of the constants, as a sub-map that starts at the
             world's origin and ends there.
     """
 
@@ -95,22 +96,22 @@ class SubMaps:
         cov = block_diag(np.zeros((space.dim, space.dim)), constants.cov)
         self.about = SubMap(self.start, np.zeros(0, dtype=np.int64), np.zeros((0, dim)), cov, constants=constants.mean)
         self._places: tuple[np.ndarray, np.ndarray] | None = None
-        self._factor_of_given: tuple[np.ndarray, ...] | None = None  # behind what it is of
-        self._last: dict[int, tuple[int, int]] = {}  # of each landmark the last map that holds it, and the row there
+        self._factor_of_given: tuple[np.ndarray, ...] | None = None  # preceded by its inputs
+        self._last: dict[int, tuple[int, int]] = {}  # last sub-map and row of each landmark
 
     @property
     def start(self) -> np.ndarray:
-        """World_from_start (E,) of the present sub-map."""
+        """World_from_start (E,) of the current sub-map."""
         return self.starts[-1]
 
     @property
     def known(self) -> Constants:
-        """The constants, by all that is finished."""
+        """The constants, estimated by all finished sub-maps."""
         own = slice(len(self.about.cov) - self.about.constants.size, None)
         return Constants(self.about.constants, self.about.cov[own, own])
 
     def presume(self, prior: Constants) -> None:
-        """All that is finished, had the constants had this prior before the first one."""
+        """Replaces the constants' initial prior in all finished sub-maps."""
         (before, self.prior), d, k = (self.prior, prior), self.space.dim, prior.mean.size
 
         def anew(given: Given, first: int = 0) -> tuple[np.ndarray, Given]:
@@ -130,34 +131,34 @@ class SubMaps:
         self.starts[-1], self._places = self.about.end, None
 
     def returned(self, ids: np.ndarray) -> np.ndarray:
-        """Which landmarks (K,) are of old sub-maps, and not among those about the start."""
+        """Mask of landmarks (K,) that are in old sub-maps, but not among those around the start."""
         old = np.array([landmark in self._last for landmark in ids.tolist()], dtype=bool)
         return old & ~np.isin(ids, self.about.ids)
 
     def take(self, present: SubMap, is_large: bool) -> bool:
-        """Joins the present sub-map if it is time: it is large, or the robot is back among old landmarks."""
+        """Joins the current sub-map if it is large, or if the robot has returned to old landmarks."""
         recall = False
         if self.unnamed and self.maps and present.ids.size:
             reach = float(np.linalg.norm(present.points, axis=1).max())
             recall = self.comes_near(self.end(present), reach)
-        # As many as tell a pose in space; with fewer the sub-map waits for more.
+        # Three landmarks determine a pose in space; with fewer the sub-map waits for more.
         if is_due := recall or is_large or bool(self.returned(present.ids).sum() >= 3):
             self.join(present, recall)
         return is_due
 
     def look_from(self, present: SubMap) -> None:
-        """What is known of the end of the present sub-map is so until it is looked from anew."""
+        """Updates `frame` and `beside` for the end of the current sub-map; both are constant between calls."""
         if not self.maps:
             return
         self.frame = self.end(present)
         if not self.unnamed:
             return
-        # The old landmarks about the end of the present sub-map, by all that is known.
+        # The old landmarks around the end of the current sub-map, by the joint estimate.
         about, x, cov, half, mine = tied = self._tied(present)
         own = slice(self.space.dim * 2 + self.dim * about.ids.size, len(x))
         others = np.setdiff1d(np.arange(about.ids.size), mine)
         seen, of_others = self._seen_from_end(tied, present, others)
-        # Rows of the joint covariance, then what of it goes with the present landmarks.
+        # Rows of the joint covariance, then regression on the current landmarks.
         rows, halves = of_others(cov), of_others(half.T)
         within = of_others(rows.T) - halves @ halves.T
         cross = rows[:, own] - halves @ half[:, own]
@@ -167,7 +168,7 @@ class SubMaps:
         self.beside = Beside(about.ids[others], seen, present.ids, present.points, slope, rest)
 
     def forget(self, ids: np.ndarray) -> None:
-        """Landmarks (K,) that are held no more: what was said of them ties the rest, and no one is told or asked for it."""
+        """Removes landmarks (K,): they still tie the sub-maps, under internal names, but are no longer reported."""
         gone = np.array([name for name in ids.tolist() if name in self._last], dtype=np.int64)
         if not gone.size:
             return
@@ -188,7 +189,7 @@ class SubMaps:
             self.beside = self.beside._replace(ids=renamed(self.beside.ids))
 
     def given(self, ids: np.ndarray, walked: Mapping[int, Array] = MappingProxyType({})) -> Given | None:
-        """What is known of landmarks (K,) about the start, which may have `walked`, and of constants, by what is finished."""
+        """The prior by finished sub-maps of landmarks (K,) around the start, which may have `walked`, and of constants."""
         own, d = self.about.of(self.about.rows(ids)), self.space.dim
         if not (ids.size or own.constants.size):
             return None
@@ -197,9 +198,9 @@ class SubMaps:
         return Given(ids, own.points, own.cov[d:, d:], own.constants, by)
 
     def join(self, finished: SubMap, recall: bool = False, wanted: np.ndarray | None = None) -> None:
-        """Takes a sub-map that begins at the last start; the next one begins at its end.
+        """Adds a finished sub-map that starts at the last start; the next one starts at its end.
 
-        All are solved for if landmarks have returned, or, to `recall` those about the end and those `wanted` there.
+        All are solved jointly if landmarks have returned, or to `recall` those around the end and those `wanted`.
         """
         loop = recall or bool(self.returned(finished.ids).any())
         before = [self._last[name][0] for name in finished.ids.tolist() if name in self._last]
@@ -210,7 +211,7 @@ class SubMaps:
             self._fuse()
 
     def end(self, present: SubMap) -> Estimate:
-        """World_from_end of the present sub-map, by it and what is known about its start."""
+        """World_from_end of the current sub-map, by it and the estimate around its start."""
         mean, cov = self.end_and_constants(present)
         return Estimate(mean, cov[: self.space.dim, : self.space.dim])
 
@@ -218,7 +219,7 @@ class SubMaps:
         """Its mean (E,), and the covariance (d + k, d + k) of it and the constants."""
         space, d, k = self.space, self.space.dim, self.about.constants.size
         if present.given is not None and np.isin(present.ids, self.about.ids).sum() == present.inherited.size:
-            # All that both know was passed on: no more than the start has to follow.
+            # All shared landmarks are in its prior: only the start has to be updated.
             moved, by_new, rest = self._followed(present, np.arange(d))
             x, cross = np.append(moved, np.zeros(d)), by_new @ present.cov
             spread = rest + cross @ by_new.T
@@ -226,7 +227,7 @@ class SubMaps:
             cross = cross[:, theirs]
             own = np.block([[spread, cross], [cross.T, principal(present.cov, theirs)]])
         else:
-            # Landmarks that one of the two alone has do not move ends.
+            # Landmarks that only one of the two has do not affect the ends.
             both = copy(self)
             both.about = self.about.of(np.flatnonzero(np.isin(self.about.ids, present.ids)))
             about, x, cov, half, _ = both._tied(present.of(np.flatnonzero(np.isin(present.ids, self.about.ids))))
@@ -239,7 +240,7 @@ class SubMaps:
         return mean, gaussian.symmetrise(turn @ own @ turn.T)
 
     def relative(self, number: int, present: SubMap) -> Estimate:
-        """Where the end of the present sub-map is as seen from that of an older one, by all that is known."""
+        """Pose of the current sub-map's end relative to that of an older one, by the joint estimate."""
         space, d, every = self.space, self.space.dim, self.copied()
         every._take(present)
         solution = every._solve(every._shared())
@@ -249,11 +250,11 @@ class SubMaps:
         return Estimate(mean, gaussian.symmetrise(turn @ cov @ turn.T))
 
     def _followed(self, new: SubMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What a new sub-map says of landmarks it was given, and of constants, moves these rows (R,) of `cov`.
+        """Propagates a new sub-map's estimate of its prior landmarks and constants to these rows (R,) of `about.cov`.
 
-        They are known by it now, with all that was known before: the rest is what it was given them, Mathematics
-        (passed-on). Returns how far the rows move (R,), by what slope with the new sub-map (R, d + MD), and what is left
-        of their covariance given it.
+        The new sub-map's estimate includes all previous information on them; the other rows follow by regression on the
+        prior, Mathematics (passed-on). Returns the rows' shift (R,), their Jacobian by the new sub-map (R, d + MD + k), and
+        their remaining covariance given it.
         """
         space, d, dim = self.space, self.space.dim, self.dim
         by_new = np.zeros((rows.size, len(new.cov)))
@@ -277,9 +278,9 @@ class SubMaps:
         return moved, by_new, self.about.cov[np.ix_(rows, rows)] - gain @ cross
 
     def brought_back(self, ids: np.ndarray, present: SubMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Landmarks (K,) about the start, as seen from the end of the present sub-map (K, D).
+        """Landmarks (K,) around the start, relative to the end of the current sub-map (K, D).
 
-        And by what slope (KD, d + MD) they move with its end and points, and the covariance that is left given these.
+        Also their Jacobian (KD, d + MD + k) by its end, points and constants, and their remaining covariance given these.
         """
         space, d, dim = self.space, self.space.dim, self.dim
         at = self.about.rows(ids)
@@ -293,9 +294,9 @@ class SubMaps:
     def _seen_from_end(
         self, tied: _Tied, new: SubMap, others: np.ndarray
     ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Landmarks about the start, by number (K,), as seen from the end of a new sub-map (K, D).
+        """Landmarks around the start, by row (K,), relative to the end of a new sub-map (K, D).
 
-        And what turns rows of the Gaussian that is tied, (n, …), into theirs (KD, …).
+        Also a function that maps rows (n, …) of the tied Gaussian to theirs (KD, …).
         """
         space, d, dim = self.space, self.space.dim, self.dim
         turned = slice(len(tied.about.cov), len(tied.about.cov) + d)
@@ -310,7 +311,7 @@ class SubMaps:
         return seen, of_others
 
     def comes_near(self, end: Estimate, reach: float) -> bool:
-        """Whether an old landmark that is not among those about the start may be within reach of a pose."""
+        """Whether an old landmark other than those around the start may be within reach of a pose."""
         origin = np.zeros((1, self.dim))
         off = self.space.transform(end.mean, origin) - self.space.transform(self.start, origin)
         ids = np.setdiff1d(self.ids, self.about.ids)
@@ -326,19 +327,19 @@ class SubMaps:
 
     @property
     def ids(self) -> np.ndarray:
-        """Of all landmarks (M,)."""
+        """Names of all landmarks (M,)."""
         return np.array([name for name in self._last if name >= 0], dtype=np.int64)
 
     def copied(self) -> "SubMaps":
-        """What is told of all of them is solved for in a copy: to be asked changes nothing."""
+        """A copy, so that queries of the joint solution do not change this object."""
         other = copy(self)
         other.maps, other.starts, other._last = list(self.maps), list(self.starts), dict(self._last)
         return other
 
     def landmarks(self, present: SubMap | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Names (M,), places in the world (M, D) and their covariances (M, D, D), by all sub-maps and the present one.
+        """Names (M,), world positions (M, D) and covariances (M, D, D), by all sub-maps and the current one.
 
-        Starts and what several sub-maps hold are solved for; the others follow from their own sub-map, given these.
+        Starts and shared landmarks are solved jointly; the others follow from their own sub-map, given these.
         """
         if present is not None and present.ids.size:
             every = self.copied()
@@ -349,7 +350,7 @@ class SubMaps:
         joint, end_of = solution.eliminated.within(), solution.starts[1:]
         names, places, covs = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
         for number, (each, factor) in enumerate(zip(self.maps, solution.factors, strict=True)):
-            # Of the landmarks that this sub-map is the last to hold, given those solved for, with its start and end.
+            # Landmarks whose last sub-map this is, conditioned on those solved for and its start and end.
             mine = np.flatnonzero([name >= 0 and self._last[name][0] == number for name in each.ids.tolist()])
             if not mine.size:
                 continue
@@ -371,7 +372,7 @@ class SubMaps:
         return np.concatenate(names), np.concatenate(places), gaussian.symmetrise(np.concatenate(covs))
 
     def _tied(self, new: SubMap) -> _Tied:
-        """One Kalman update by what is shared, without noise, of the Gaussians about the last start and the new end."""
+        """Ties the Gaussians around the last start and the new end by an iterated noise-free update on shared landmarks."""
         space, d, dim = self.space, self.space.dim, self.dim
         left = np.flatnonzero(~np.isin(self.about.ids, new.inherited))
         about = self.about.of(left)
@@ -389,7 +390,7 @@ class SubMaps:
             cov[first:, :first], cov[:first, :first] = cross.T, gaussian.symmetrise(rest + cross @ by_new.T)
         x, half, turned = prior, np.zeros((0, size)), slice(first, first + d)
         for _ in range(ITERATIONS if of_mine.size else 0):
-            # 0 = l − E Exp(ε) l′ for each landmark l that is l′ in the new one, which ends at E Exp(ε).
+            # 0 = l − E Exp(ε) l′ for each shared landmark, l′ in the new sub-map, whose end is E Exp(ε).
             end, seen = space.retract(new.end, x[turned]), x[of_its]
             rotation = space.rotation(end)
             by_turned = rotation @ space.transform_jacobian(seen) @ space.right_jacobian(x[turned])
@@ -409,7 +410,7 @@ class SubMaps:
         return _Tied(about, x, cov, half, mine)
 
     def _take(self, new: SubMap) -> None:
-        """About its end: it, its landmarks, and the old ones that it has not, as far as there is room."""
+        """Moves `about` to its end: the end, its landmarks, and further old ones, up to `most`."""
         space, d, dim = self.space, self.space.dim, self.dim
         about, x, cov, half, mine = tied = self._tied(new)
         first, k = len(about.cov), about.constants.size
@@ -426,7 +427,7 @@ class SubMaps:
         def of_moved(rows: np.ndarray) -> np.ndarray:
             return np.concatenate([by_start @ rows[:d] + by_end @ rows[turned], of_others(rows)])
 
-        # The new map's landmarks and the constants stay what they are: the rest moves, beside them.
+        # The new map's landmarks and the constants keep their coordinates; the rest is transformed.
         theirs = d + dim * others[:, None] + np.arange(dim)
         columns = np.concatenate([np.arange(first, points.stop), theirs.ravel(), np.arange(points.stop, len(x))])
         own = np.append(np.arange(d), points.stop - first + np.arange(theirs.size))
@@ -451,10 +452,10 @@ class SubMaps:
         self.maps.append(new)
 
     def _fuse(self) -> None:
-        """Older sub-maps of the same place go into the last one: who goes round the same places has no more of them.
+        """Fuses older sub-maps of the same place into the last one, so that their number does not grow on repeated visits.
 
-        Given up is how an older one hangs on the one before it and the one behind on it, but for the landmarks that they
-        share: as much as one step of the odometry each. Nothing is where there are too few of these, and never the first one.
+        This drops an older one's ties to its neighbours in time, except by shared landmarks: about one odometry step of
+        information each. No fusion if too few landmarks are shared, and never of the first sub-map.
         """
         for number in range(len(self.maps) - 3, 0, -1):
             old, new = self.maps[number], self.maps[-1]
@@ -464,7 +465,7 @@ class SubMaps:
                 or old.ids.size + new.ids.size - common > self.most
             ):
                 continue
-            # The neighbours in time that are tied to the old one and will not be any more.
+            # The neighbours in time that would lose their tie to the old one.
             beside = [self.maps[number - 1]] if old.tied else []
             beside += [each for each in [self.maps[number + 1]] if each.tied]
             both = np.union1d(old.ids, new.ids)
@@ -478,44 +479,44 @@ class SubMaps:
                 self._hold(each)
 
     def _shared(self, asked: np.ndarray | None = None) -> np.ndarray:
-        """Landmarks that several sub-maps hold, and with some `asked` for (K,) those, and all that may be about its end."""
+        """Landmarks in several sub-maps; with `asked` (K,) also those, and all that may be kept around the end."""
         ids, times = np.unique(np.concatenate([each.ids for each in self.maps]), return_counts=True)
         wanted, last = times > 1, self.maps[-1].ids
         if asked is not None:
             wanted |= np.isin(ids, last) | np.isin(ids, asked)
             far = np.linalg.norm(self.space.inverse_transform(self.start, self.guess(ids)), axis=1)
-            order = np.lexsort((far, -self._beside(ids, asked)))
+            order = np.lexsort((far, -self._co_observed(ids, asked)))
             wanted[order[: max(self.most - last.size, 0)]] = True
         return ids[wanted]
 
-    def _beside(self, ids: np.ndarray, asked: np.ndarray) -> np.ndarray:
-        """With how many of those `asked` for a sub-map holds each landmark (K,): what was seen with them is seen next."""
+    def _co_observed(self, ids: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        """For each landmark (K,) the most `asked` ones in a sub-map with it: those seen together are likely seen next."""
         most = np.zeros(ids.size, dtype=np.int64)
         for each in self.maps:
             most = np.maximum(most, np.isin(ids, each.ids) * np.isin(asked, each.ids).sum())
         return most
 
     def guess(self, ids: np.ndarray) -> np.ndarray:
-        """Where landmarks (K,) are in the world (K, D), by the last sub-map that holds each."""
+        """World positions (K, D) of landmarks (K,), by the last sub-map of each."""
         held = np.array([self._last[landmark] for landmark in ids.tolist()], dtype=np.int64).reshape(-1, 2)
         ends = np.array([self.starts[number + 1] for number in held[:, 0]]).reshape(-1, self.space.size)
         points = np.array([self.maps[number].points[row] for number, row in held]).reshape(-1, self.dim)
         return self.space.transform(ends, points)
 
     def latest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Names (M,) of all landmarks, and numbers (M,) of the last sub-maps that hold them."""
+        """Names (M,) of all landmarks, and the number (M,) of each one's last sub-map."""
         held = [(name, number) for name, (number, _) in self._last.items() if name >= 0]
         names, numbers = np.array(held, dtype=np.int64).reshape(-1, 2).T
         return names, numbers
 
     def surely_near(self, ratio: float) -> np.ndarray:
-        """Names (K,) of landmarks about the start that are known, as seen from it, to this fraction of their distance."""
+        """Names (K,) of landmarks around the start whose standard deviation is below this fraction of their distance."""
         columns = self.space.dim + self.dim * np.arange(self.about.ids.size)[:, None] + np.arange(self.dim)
         variance = np.diagonal(self.about.cov)[columns].max(axis=1, initial=0.0)
         return self.about.ids[np.sqrt(variance) <= ratio * np.linalg.norm(self.about.points, axis=1)]
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Names (M,) of all landmarks, and where in the world (M, D) the last sub-map that holds each has it."""
+        """Names (M,) of all landmarks, and their world positions (M, D) by the last sub-map of each; cached."""
         if self._places is None:
             self._places = self.ids, self.guess(self.ids)
         return self._places
@@ -524,11 +525,11 @@ class SubMaps:
         return solve(self.space, self.maps, ids, np.array(self.starts), self.guess(ids), self.about.constants)
 
     def solve(self, wanted: np.ndarray | None = None) -> None:
-        """All of them together, linearised anew: the starts, and what is known about the last one and landmarks `wanted`."""
+        """Solves all jointly with new linearisation points; updates the starts and `about`, with landmarks `wanted`."""
         asked = np.zeros(0, dtype=np.int64) if wanted is None else wanted
         try:
             solution = self._solve(self._shared(asked))
-        except InputError:  # as of a filter that has diverged: they stay as they are
+        except InputError:  # the filter has diverged: no change
             return
         if not solution.is_whole:
             return
@@ -536,7 +537,7 @@ class SubMaps:
         seen = self.space.inverse_transform(self.start, solution.world)
         last = np.isin(ids, self.maps[-1].ids) | np.isin(ids, asked)
         far = np.where(last, -1.0, np.linalg.norm(seen, axis=1))
-        order = np.lexsort((far, -self._beside(ids, asked), ~last))
+        order = np.lexsort((far, -self._co_observed(ids, asked), ~last))
         kept = order[: max(self.most, int(last.sum()))]
         kept = kept[last[kept] | (ids[kept] >= 0)]
         points, cov = solution.seen_from(self.space, len(self.maps), kept)
@@ -545,7 +546,7 @@ class SubMaps:
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All of it, for a checkpoint."""
+        """The arrays for a checkpoint."""
         named, walked = {"submaps/starts": np.array(self.starts)}, np.zeros((0, self.dim, self.dim))
         nothing = Given(np.zeros(0, dtype=np.int64), walked[:, 0], np.zeros((0, 0)), walked=walked)
         for number, each in enumerate([self.about, *self.maps]):
@@ -560,7 +561,7 @@ class SubMaps:
         return named
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Takes up what `arrays` gave. Raises InputError: it is damaged."""
+        """The inverse of `arrays`. Raises InputError: they are damaged."""
         d, dim, k = self.space.dim, self.dim, self.known.mean.size
         self.starts = list(checkpoint.read_one(arrays, "submaps/starts", checkpoint.elements(self.space, "starts")))
         maps = list[SubMap]()
@@ -586,7 +587,7 @@ class SubMaps:
         for each in maps[1:]:
             self._hold(each)
         if not np.isin(self.about.ids, list(self._last)).all():
-            raise InputError("the array submaps/0/ids names a landmark that no sub-map holds")
+            raise InputError("the array submaps/0/ids has a landmark that is in no sub-map")
         if not self.maps:
             return
         schema = {"frame": checkpoint.elements(self.space), "frame_cov": checkpoint.numbers(d, d)}

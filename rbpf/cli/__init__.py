@@ -1,4 +1,4 @@
-"""The command line: thin, one class per command."""
+"""The command line: a thin layer, one class per command."""
 
 import os
 import sys
@@ -8,8 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
-# Before NumPy is imported, which nothing above does: a filter's matrices are small, and BLAS's threads, which wait for one
-# another, make a run take twice as long where other programs keep the cores busy. A large one's last digits depend on them.
+# Before NumPy is imported (nothing above does): a filter's matrices are small, and waiting BLAS threads double a run's time
+# if other programs use the cores. The last digits of large products depend on their number.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from rbpf import __version__
@@ -28,7 +28,7 @@ BAD_INPUT, STOPPED = 2, 130  #: Exit codes; 0 is success, 1 a fault of the progr
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Printed):
-    """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video."""
+    """Render a desk that a camera moves over, run monocular SLAM on the images, write plots and the annotated video."""
 
     out: Path = Path("demo")  #: folder for the images and the results.
     frames: Annotated[int, Range(ge=2, le=MOST)] = 240  #: number of images, 30 per second.
@@ -39,7 +39,7 @@ class Demo(Printed):
         if not known.is_file():
             SimulateDesk(out=images, frames=self.frames)()
         made = ImageResultOptions(out=self.out / "run", overwrite=True)
-        # Rendered images are found to hundredths of a pixel, and this says no more than it knows; a camera's are not.
+        # In rendered images features are matched to hundredths of a pixel, unlike in a camera's.
         noise = FilterOptions(set=("search.noise_px=0.1", "search.planes=learnt", "noise=learnt"))
         RunMono(sequence=images, world=WorldOptions(known_points=known), result=made, filter=noise, json=self.json)()
 
@@ -75,7 +75,7 @@ Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one senten
 
 
 def _require_streams(wanted: bool) -> None:
-    """Gives what was closed (`>&-`) back, leading nowhere: else the next file that is opened would take its place."""
+    """Reopens closed standard streams (`>&-`) on the null device: else the next opened file would take their place."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             with suppress(OSError):
@@ -93,13 +93,13 @@ def main(arguments: list[str] | None = None) -> int:
         if given == ["--version"]:
             print(f"{PROGRAM} {__version__}", flush=True)
             return 0
-        # A name that is empty would stand for the folder one is in.
+        # An empty name would mean the current folder.
         for before, word in pairwise(["", *given]):
             option, equals, value = word.partition("=")
             if not word or (option.startswith("--") and equals and not value):
                 named = before if not word else option
                 raise InputError(f"{named} is empty" if named.startswith("--") else "an argument is empty")
-        # With other numbers Numba cannot be imported, or would run what it likes.
+        # Numba fails or misbehaves with other values.
         threads = os.environ.get("NUMBA_NUM_THREADS", "1")
         if not (threads.isdecimal() and int(threads) >= 1):
             raise InputError(f"the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got {threads!r}")
@@ -109,7 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
         say(f"{PROGRAM}: {error}")
         return BAD_INPUT
     except BrokenPipeError:
-        # Whoever read has seen enough; what Python would still write at its end goes nowhere.
+        # The reader has closed the pipe; discard what Python would still write.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:

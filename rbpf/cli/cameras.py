@@ -10,7 +10,7 @@ from rbpf.cli.options import Printed
 from rbpf.cli.showing import answer, progress, say
 from rbpf.ranges import Positive
 
-#: Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends.
+#: Standard deviation of focal lengths and centre, as a fraction of the focal length, beyond which a run's path is deformed.
 LOOSE = 0.01
 
 

@@ -1,4 +1,4 @@
-"""A group of commands that knows their names and options: what the parser says of others is long, or beside the point."""
+"""A group of commands that checks names and options itself: the parser's error messages are long, or off the point."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass
@@ -15,15 +15,15 @@ from rbpf.ranges import SettingError, check_ranges
 class Commands:
     """A group of commands."""
 
-    help: str  #: its first line says in which it is itself one of a group.
-    #: by name, further groups, and dataclasses whose fields are options, and whose call is what the command does.
+    help: str  #: its first line is shown in the group above.
+    #: by name, further groups, and dataclasses whose fields are options, and which run the command when called.
     kinds: "Mapping[str, Commands | type[Any]]"
     first: Callable[[], object] = lambda: None  #: called before each command.
 
     def call(self, arguments: list[str], before: str) -> None:
-        """Calls the command that the arguments name; `before` are the words that led here.
+        """Calls the command named by the arguments; `before` are the preceding words.
 
-        Of a group, or where help on one is asked for, the parser says which commands there are.
+        For a group, or its help, the parser lists the commands.
 
         Raises InputError: there is no such command or option, or a value is out of its range.
         """
@@ -52,7 +52,7 @@ class Commands:
         command()
 
     def _parsed(self) -> Any:
-        """What the parser takes for the group: it is told a help text, for which it would read the source of `typing`."""
+        """The group's type for the parser, with a help text, for which it would otherwise read the source of `typing`."""
         parts = []
         for name, kind in self.kinds.items():
             if isinstance(kind, Commands):
@@ -65,7 +65,7 @@ class Commands:
 
 
 def _options(kind: Any) -> Iterator[str]:
-    """The options of a dataclass, and of its groups, as they are given."""
+    """The options of a dataclass, and of its groups, as given on the command line."""
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if is_dataclass(bare := get_args(hint)[0] if get_origin(hint) is Annotated else hint):
             yield from _options(bare)
@@ -75,6 +75,6 @@ def _options(kind: Any) -> Iterator[str]:
 
 
 def _nearest(name: str, names: Iterable[str]) -> str:
-    """What may have been meant, or else all names."""
+    """A suggestion, or else all names."""
     close = get_close_matches(name, names, 1)
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"

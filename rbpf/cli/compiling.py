@@ -1,4 +1,4 @@
-"""Compiled kernels: which there are, whether they are in the cache, and compiling them with a word of warning."""
+"""Compiled kernels: their modules, whether they are cached, and compilation with progress messages."""
 
 import gc
 import re
@@ -12,15 +12,15 @@ import rbpf
 from rbpf.cli.showing import progress, say
 
 _ROOT = Path(rbpf.__file__).parent
-#: Of a source: that it imports compiled functions that others import, too.
+#: Matches a source that imports compiled functions shared with others.
 _SHARED = re.compile(r"^from rbpf\.kernels(\.(?!signature)\w+)? import", re.MULTILINE)
 
 
 def kernel_modules() -> list[str]:
-    """Modules of `rbpf` with compiled functions of their own, without those only compiled into others, in a good order.
+    """Modules of `rbpf` with compiled functions of their own, without those only compiled into others, in compilation order.
 
-    The drivers of landmarks first, which take longest, and leave functions of `rbpf.kernels` in the cache; then what compiles
-    these into its own, which takes long as well; then by length.
+    The drivers of landmarks first, which take longest and leave functions of `rbpf.kernels` in the cache; then modules that
+    compile these into their own, which also take long; then by length.
     """
     paths = [*(_ROOT / "kernels").glob("*.py")]
     for folder in ("sensors", "motion", "maps", "systems", "validation"):
@@ -45,10 +45,10 @@ def cached(module: str) -> bool:
 
 
 def compile_kernels(every: bool = False) -> list[str]:
-    """Compiles what is not in the cache, with a word and a bar, and returns those modules; `every` also loads and tries all.
+    """Compiles modules that are not cached, with messages, and returns them; `every` also loads and tests all.
 
-    Some are compiled as they are loaded, others at their first call: nothing is left that would be announced again. As many
-    modules are compiled at once, each in a process of its own, as there are cores.
+    Some are compiled on import, others at their first call: none is left to be announced later. Modules are compiled in
+    parallel, each in its own process, one per core.
     """
     import rbpf.kernels  # noqa: F401  (discards copies that are older than their sources)
 
@@ -60,7 +60,7 @@ def compile_kernels(every: bool = False) -> list[str]:
 
         with progress() as bar, Parallel(n_jobs=-1, return_as="generator_unordered") as parallel:
             report = bar("compiling")
-            # What takes longest first, the calls that need others' kernels last.
+            # The slowest first, the calls that need others' kernels last.
             calls = [*(partial(import_module, name) for name in missing), *FIRST_CALLS]
             jobs = [delayed(_with_little_garbage)(call) for call in calls]
             jobs.insert(1, jobs.pop())
@@ -75,13 +75,13 @@ def compile_kernels(every: bool = False) -> list[str]:
 
 
 def _with_little_garbage(call: Callable[[], object]) -> None:
-    """To look for garbage, as often as Python does, among all that a compiler holds takes a tenth of its time."""
+    """Disables garbage collection, which takes a tenth of a compiler's time."""
     gc.set_threshold(50_000, 20, 20)
     call()
 
 
 def _move() -> None:
-    """The motion of a stereo pair, as the systems do it, on a few numbers; likewise below."""
+    """Calls stereo odometry as the systems do, on a few numbers; likewise below."""
     import numpy as np
 
     from rbpf.motion.stereo_geometry import Matches
@@ -106,5 +106,5 @@ def _drive() -> None:
         filter_recording(RobotRecording(Path(folder) / "log"), RangeBearingConfig(particles=10))
 
 
-#: What is compiled at its first call.
+#: Functions compiled at their first call.
 FIRST_CALLS = (_drive, _move)

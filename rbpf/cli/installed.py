@@ -27,7 +27,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Printed):
-    """Say what is installed, in which versions, which parts work here; compile the kernels."""
+    """Show what is installed, in which versions, and which parts work here; compile the kernels."""
 
     compile: bool = True  #: compile the kernels, once, so that the first run need not.
 
@@ -42,7 +42,7 @@ class Doctor(Printed):
             "machine": platform.machine(),
             "cores": os.cpu_count() or 1,
         }
-        # Of what the package requires; None for what is missing.
+        # Versions of the package's requirements; None for missing ones.
         required = [
             re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in requires("rbpf") or () if "extra ==" not in line
         ]
@@ -50,14 +50,14 @@ class Doctor(Printed):
         for name in required:
             with suppress(PackageNotFoundError):
                 libraries[name] = version(name)
-        # Whether each part works, and its version or path; where it does not, why, and what to do.
+        # Whether each part works, and its version or path; else the reason, and what to do.
         parts: list[dict[str, Any]] = []
         for name, extra, module, distribution, probe in _PROBES:
             part = {"name": name, "works": True, "needed": not extra}
             try:
                 said = probe(import_module(module))
                 part["says"] = said if isinstance(said, str) else f"{distribution} {version(distribution)}"
-            except Exception as error:  # whatever a broken library raises as it is loaded
+            except Exception as error:  # a broken library may raise anything on import
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
                 again = "install the package again: pip install --force-reinstall"
                 remedy = f"pip install 'rbpf[{extra}]'" if extra else again
@@ -83,7 +83,7 @@ class Doctor(Printed):
         lines = {p["name"]: f"{'works' if p['works'] else fails[p['needed']]}: {p['says']}" for p in parts}
         known = {name: number or "missing" for name, number in libraries.items()}
         kernels = f"{len(modules) - len(missing)} of {len(modules)} compiled"
-        # The result first, and what to do.
+        # The result first, and the next step.
         absent = ", ".join(part["name"] for part in failing)
         optional = f"; not installed, and only needed for what its name says: {absent}" if absent else ""
         result = f"{broken}: needed, and broken here" if broken else f"all that every run needs works{optional}"
@@ -122,7 +122,7 @@ def _ffmpeg(imageio_ffmpeg: Any) -> str:
     return path
 
 
-#: What it does, the extra that it comes with, module and distribution, and how it is tried once it is loaded.
+#: Purpose, extra, module and distribution, and test after import.
 _PROBES: tuple[tuple[str, str, str, str, Callable[[Any], Any]], ...] = (
     ("compiled kernels", "", "numba", "numba", _compiler),
     ("images and video", "", "cv2", "opencv-python-headless", _images),
@@ -136,7 +136,7 @@ _PROBES: tuple[tuple[str, str, str, str, Callable[[Any], Any]], ...] = (
 )
 
 
-#: The last line for zsh is one for a file in its `fpath`; evaluated, it would complete nothing.
+#: The last line for zsh is for a file in its `fpath`; evaluated, it would not register the completion.
 _ZSH = (
     '\n_tyro_rbpf "$@"\n',
     '\nif [ "$funcstack[1]" = "_rbpf" ]; then _tyro_rbpf "$@"; else compdef _tyro_rbpf rbpf; fi\n',
@@ -147,7 +147,7 @@ _ZSH = (
 class Completion:
     """Print what makes a shell complete the commands and options of rbpf: eval "$(rbpf completion bash)"."""
 
-    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]  #: for which it is.
+    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]  #: which shell.
 
     def __call__(self) -> None:
         from rbpf.cli import APP, PROGRAM

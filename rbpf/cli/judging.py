@@ -25,9 +25,9 @@ class Validate(Printed):
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
     #: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
     against: Literal["groundtruth", "gtsam", "colmap"] = "groundtruth"
-    #: in their place, a file of relations between poses (t1 t2 x y z roll pitch yaw) that are known; by default none.
+    #: instead, a file of known relations between poses (t1 t2 x y z roll pitch yaw); by default none.
     relations: Where = None
-    path: Where = None  #: in their place, another path of the same recording, in TUM format; by default none.
+    path: Where = None  #: instead, another path of the same recording, in TUM format; by default none.
     truth_std_m: NotNegative = 0.0  #: standard deviation per axis of the ground truth's own positions, m.
     truth_std_deg: NotNegative = 0.0  #: of its rotations, degrees.
     out: Where = None  #: a further folder for the JSON, which is always written into the run's own; by default none.
@@ -46,7 +46,7 @@ class Validate(Printed):
             raise InputError(f"--truth-std-m and --truth-std-deg are of the ground truth, not of {file or against}")
         with CONSOLE.status(f"comparing with {file or against} …"):
             verdict = compare(self.run, against, self.out, file, truth)
-        # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
+        # The page's first sentence is about the truth if there is one; here that of the requested comparison is shown.
         asked = [c.accuracy for c in read_comparisons(self.run) if c.against == against]
         _answer(verdict, self.run, self.json, *(found for found in asked if found not in verdict.path.sentence))
 

@@ -1,4 +1,4 @@
-"""Options that several commands share; what stands at a field is its help text."""
+"""Options shared by several commands; the comment of a field is its help text."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
-# What is None unless it is given: the help says in words what that means. Of `int | None` the parser would ask typeguard,
+# Optional values, whose default is described in the help text. For `int | None` the parser would use typeguard,
 # whose import takes longer than NumPy's.
 Whole = Annotated[Optional[int], tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 Real = Annotated[Optional[float], tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
@@ -22,12 +22,12 @@ WholeCount = Annotated[Whole, Range(ge=1, le=MOST)]
 RealPositive = Annotated[Real, Range(gt=0.0)]
 Text = Annotated[Optional[str], tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Where = Annotated[Optional[Path], tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-MOST_PX = 1 << 15  #: Of a side of an image.
+MOST_PX = 1 << 15  #: Largest side of an image.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Printed:
-    """Of every command that has a result."""
+    """Option of every command with a result."""
 
     json: Flag = False  #: print the result as one JSON object on standard output, for programs.
 

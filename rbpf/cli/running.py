@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
-    """Where the results go, and what is made of them."""
+    """Folder and kinds of results."""
 
     #: folder for the results; by default run, or run-2, run-3, … where there are runs already; the last of them to
     #: resume or to overwrite.
@@ -45,18 +45,18 @@ class ResultOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageResultOptions(ResultOptions):
-    """Where the results go, and what is made of them."""
+    """Folder and kinds of results."""
 
     batch: bool = True  #: also adjust the same measurements in batch with GTSAM.
-    #: iterations after which the batch adjustment is given up, the run's results stay; by default so many that thirty
-    #: million sightings are linearised.
+    #: iterations after which the batch adjustment is given up (the run's results remain); by default as many that thirty
+    #: million observations are linearised.
     batch_limit: WholeCount = None
     video: bool = True  #: write the annotated video.
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilterOptions:
-    """What the filter is, and computes with."""
+    """Settings of the filter and its computation."""
 
     #: of the random generators; by default 0, or as in --config.
     seed: Annotated[Whole, Range(ge=0, le=2**63 - 1)] = None
@@ -68,14 +68,14 @@ class FilterOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
-    """What of the recording is used."""
+    """The used part of the recording."""
 
     start: NotNegative = 0.0  #: use the frames from so many seconds after the first on; of a log without times, steps.
     end: RealPositive = None  #: use the frames until so many seconds after the first; by default all.
-    every: Count = 1  #: of these use each so many-th.
+    every: Count = 1  #: of these use every n-th.
 
     def part(self, resize: int | None = None) -> "Part":
-        """What is used of the recording."""
+        """The used part of the recording."""
         from rbpf.sensors.readers.part import Part
 
         return Part(self.start, self.end, self.every, resize)
@@ -83,9 +83,9 @@ class RecordingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageOptions(RecordingOptions):
-    """What of the recording is used, and which camera took it."""
+    """The used part of the recording, and its camera."""
 
-    #: camera.yaml in place of the sequence's own, of the images before they are resized; by default that one is read.
+    #: camera.yaml instead of the sequence's own, for the images before they are resized; by default the latter.
     calibration: Where = None
     #: make the images smaller, to this width in px, and the calibration with them; by default they stay as they are.
     resize: Annotated[Whole, Range(ge=1, le=MOST_PX)] = None
@@ -96,29 +96,29 @@ class ImageOptions(RecordingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
-    """What is known of the world beforehand: points, a board, or a map of an earlier run."""
+    """Prior knowledge of the world: points, a board, or a map of an earlier run."""
 
-    #: table of points of known position that are seen in the first image; by default none: the world is the first
+    #: table of points of known position in the first image; by default none: the world is the first
     #: camera's and its scale is arbitrary.
     known_points: Where = None
-    #: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6; the
+    #: instead of known points, inner corners of a chessboard fully visible in the first image, as 9x6; the
     #: world is then the board's; by default none.
     board: Text = None
     square: RealPositive = None  #: side of its squares, m; by default none.
-    #: in place of known points, a board of so many ArUco markers, as 5x7, of which some are seen in the first image;
+    #: instead of known points, a board of ArUco markers, as 5x7, some of them visible in the first image;
     #: the world is then the board's; by default none.
     aruco: Text = None
     marker: RealPositive = None  #: side of a marker, its black border included, m; by default none.
     gap: NotNegative = 0.01  #: between two markers, m.
     dictionary: str = "4x4_50"  #: of the markers' patterns, as 4x4_50 or 6x6_250.
-    #: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
+    #: folder of a run, or its known_map.npz, in which the camera is localised; by default a map is made.
     map: Where = None
-    localize: Flag = False  #: the map is known: the start is found by recognition, and the map is not changed.
+    localize: Flag = False  #: localise in the known map of --map, which is not changed.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(Printed):
-    """Of every `rbpf run`, in the groups of its help."""
+    """Options of every `rbpf run`, in the groups of its help."""
 
     particles: WholeCount = None  #: number of particles.
     result: Group[ResultOptions] = ResultOptions()
@@ -126,7 +126,7 @@ class RunOptions(Printed):
     recording: Group[RecordingOptions] = RecordingOptions()
 
     def settings(self, kind: "type[Config]", system: str, **own: Any) -> "Config":
-        """The system's settings by --config, --set and options that are settings, of which the system has some of its own."""
+        """The system's settings from --config, --set and options that are settings, common and system-specific."""
         from rbpf.systems.settings import load_settings
 
         named = {"particles": self.particles, "seed": self.filter.seed, **own}
@@ -136,7 +136,7 @@ class RunOptions(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRunOptions(RunOptions):
-    """Of every run over images."""
+    """Options of every run over images."""
 
     result: Group[ImageResultOptions] = ImageResultOptions()
     recording: Group[ImageOptions] = ImageOptions()
@@ -149,7 +149,7 @@ class RunRangeBearing(RunOptions):
     #: recording: a folder of an MRCLAM or MRPT log, or a Victoria Park graph.
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
     particles: WholeCount = None  #: number of particles; by default 100, or as in --config.
-    #: landmarks named by the log, or by maximum likelihood; by default known, or as in --config.
+    #: known association by the log's names, or maximum likelihood; by default known, or as in --config.
     association: Annotated[
         Optional[Literal["known", "ml"]], tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
     ] = None
@@ -177,7 +177,7 @@ class RunLaser(RunOptions):
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
     particles: WholeCount = None  #: number of particles; by default 30, or as in --config.
     scanner: Text = None  #: message (CARMEN) or topic (ROS) of the scans; by default the first that the log has.
-    max_range: RealPositive = None  #: what is farther gives no return, m; by default what the log says.
+    max_range: RealPositive = None  #: maximum range, beyond which there is no return, m; by default the log's.
     upside_down: Flag = False  #: the scanner is mounted upside down, or its readings run clockwise.
 
     def __call__(self) -> None:
@@ -284,13 +284,13 @@ def repeated(arguments: list[str]) -> list[str]:
     return ["run", *words, *out, *arguments[3:]]
 
 
-#: Columns of a system that say how much was found, and of how much.
+#: Columns of a system with the numbers of matches and of searched features.
 _FOUND = ("found", "searched"), ("observed", "features")
-_RECENT = 50  #: Frames over which their number per second is taken.
+_RECENT = 50  #: Frames over which the frame rate is averaged.
 
 
 def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
-    """A listener that reports each frame: whether it was tracked or lost, found of searched, frames per second of late."""
+    """A listener that reports each frame: tracking state, matched of searched features, recent frame rate."""
     times: deque[float] = deque(maxlen=_RECENT)
 
     def tell(run: "Run", tracked: "Tracked") -> None:
@@ -306,7 +306,7 @@ def _telling(report: OnProgress) -> "Callable[[Run, Tracked], None]":
 
 @contextmanager
 def patient(report: OnProgress) -> Iterator[OnProgress]:
-    """What a run reports its progress to, in place of `report`: after Ctrl-C it stops the run at the next frame.
+    """Wraps the progress callback `report`: after Ctrl-C it stops the run at the next frame.
 
     A second Ctrl-C stops it at once, without a checkpoint of its own.
     """
@@ -341,7 +341,7 @@ def _run(
     filtered: "Callable[[Run], None]" = lambda run: None,
     **made: Any,
 ) -> None:
-    """Filters, then writes everything that is to be `made`, with a bar for each stage of the work; see `finish_run`.
+    """Filters, then writes all results in `made`, with a progress bar for each stage; see `finish_run`.
 
     `filtered` is called in between.
     """
@@ -353,7 +353,7 @@ def _run(
         from rbpf.validation.report.live import require_rerun, viewer
 
         require_rerun()
-    # Threads as asked for, and the folder for the results, which nobody else writes to.
+    # Set the requested threads, and lock the folder for the results.
     if result.resume and result.overwrite:
         raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
     kept = result.resume or result.overwrite
@@ -377,7 +377,7 @@ def _run(
             if view is not None:
                 view.finish(run)
         filtered(run)
-        # Not before the first frame: it takes as long to import as everything above.
+        # After the first frame, as it takes as long to import as everything above.
         from rbpf.validation.finish import finish_run
 
         drawing, solving = bar("drawing"), bar("batch")

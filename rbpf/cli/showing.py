@@ -1,4 +1,4 @@
-"""What all commands show progress and results with: sentences and bars on standard error, JSON on standard output."""
+"""Output of all commands: messages and progress bars on standard error, JSON on standard output."""
 
 import json
 import sys
@@ -15,14 +15,14 @@ CONSOLE = Console(stderr=True)
 
 
 class OnProgress(Protocol):
-    """Called with how many are done, of how many, None where that is not known, and what is to be said of it."""
+    """Called with the number done, the total or None if unknown, and a message."""
 
     def __call__(self, done: int, total: int | None, words: str = "") -> None: ...
 
 
 @contextmanager
 def progress() -> Iterator[Callable[[str], OnProgress]]:
-    """Makes bars by name: each a callback for what is done, shown from its first call."""
+    """Makes progress bars by name: each is a callback, shown from its first call."""
     done, left = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()), (TextColumn("left:"), TimeRemainingColumn())
     said = TextColumn("{task.fields[words]}", markup=False)
     bars = Progress(TextColumn("{task.description}"), *done, *left, said, console=CONSOLE)
@@ -45,7 +45,7 @@ def progress() -> Iterator[Callable[[str], OnProgress]]:
 
 
 def say(sentence: str) -> None:
-    """A sentence, on standard error, whatever names are in it; it is broken between words, and on a terminal alone."""
+    """Prints a message on standard error, without markup; wrapped between words only on a terminal."""
     CONSOLE.print(printable(sentence), highlight=False, markup=False, emoji=False, soft_wrap=not CONSOLE.is_terminal)
 
 
@@ -59,7 +59,7 @@ def answer(entries: Mapping[str, Any], as_json: bool, *sentences: str) -> None:
 
 
 def table(entries: Mapping[str, Any], width: int) -> list[str]:
-    """Names and values, one a line."""
+    """Names and values, one per line."""
     return [f"{name:>{width}}  {_shown(value)}" for name, value in entries.items()]
 
 

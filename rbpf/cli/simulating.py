@@ -1,4 +1,4 @@
-"""`rbpf simulate`: logs and images of worlds whose truth is known."""
+"""`rbpf simulate`: logs and images of simulated worlds, with ground truth."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ class SimulateRangeBearing(Printed):
     spatial: Flag = False  #: six degrees of freedom instead of three.
     steps: Annotated[int, Range(ge=2, le=MOST)] = 200  #: number of steps, one a second.
     landmarks: Count = 60  #: number of landmarks.
-    unnamed: Flag = False  #: the log does not say which landmark was observed.
+    unnamed: Flag = False  #: the log has no landmark names (unknown association).
 
     def __call__(self) -> None:
         from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -54,7 +54,7 @@ class SimulateLaser(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions(Printed):
-    """Of every `rbpf simulate` that renders images."""
+    """Options of every `rbpf simulate` that renders images."""
 
     focal_fraction: ClassVar[float]  #: focal length by default, as a fraction of the width.
     #: folder for the sequence (EuRoC ASL, with camera.yaml and known_points.csv); must not exist, or be empty.
@@ -64,7 +64,7 @@ class RenderOptions(Printed):
     height: Annotated[int, Range(ge=2, le=MOST_PX)] = 480  #: of the images, px.
     focal_px: RealPositive = None  #: focal length, px; by default a fraction of the width.
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 of the lens.
-    #: k1, k2, k3, k4 of an equidistant lens in its place; by default none. The ideal one has 0 0 0 0; it sees 140
+    #: k1, k2, k3, k4 of an equidistant lens instead; by default none. The ideal one has 0 0 0 0; it sees 140
     #: degrees where the focal length is 0.41 of the width.
     fisheye: tuple[float, float, float, float] | None = None
     baseline_m: Real = None  #: of a second camera to the right, m; None or nothing for none.
@@ -72,18 +72,18 @@ class RenderOptions(Printed):
     noise_std: NotNegative = 3.0  #: of the sensor, grey levels.
     blur_s: NotNegative = 0.01  #: the shutter is open this long, s.
     exposure_drift: Fraction = 0.15  #: greatest change of the exposure, as a fraction.
-    vignetting: Fraction = 0.2  #: fraction of the light that is missing in the corners.
+    vignetting: Fraction = 0.2  #: loss of light in the corners, as a fraction.
     contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
     #: first frame in the dark and number of frames; by default none.
     blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = None
     depth: Flag = False  #: also write depth images.
-    #: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
+    #: quality of JPEG files, 1 to 100; 0 writes lossless PNG.
     jpeg: Annotated[int, Range(ge=0, le=100)] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImagesOptions(RenderOptions):
-    """Of `rbpf simulate desk` and `rbpf simulate room`."""
+    """Options of `rbpf simulate desk` and `rbpf simulate room`."""
 
     focal_fraction = 0.8
     frames: Annotated[int, Range(ge=2, le=MOST)] = 300  #: number of images, 30 per second.
@@ -126,7 +126,7 @@ SIMULATE = Commands(
 
 
 def render(world: "ImageWorld", options: RenderOptions) -> None:
-    """Takes the pictures of a world that a command asks for, and says so."""
+    """Renders the images of a world for a command, and reports it."""
     from rbpf.sensors.camera import Pinhole
     from rbpf.validation.simulation.images import Imaging, simulate_images
 

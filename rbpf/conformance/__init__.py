@@ -1,4 +1,4 @@
-"""Says in words what is wrong with a user's model, before a filter is built on it.
+"""Checks a user's model, and describes what is wrong with it, before a filter is built on it.
 
 Every check calls the model as the filter does, on random arguments or on those of an `Example`, and compares
 the answer with what `rbpf.core.models` promises: shapes, numeric derivatives, the compiled twin, round trips.
@@ -20,16 +20,16 @@ __all__ = ["Example", "check_model"]
 def check_model(
     model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
 ) -> list[str]:
-    """What is wrong with a MotionModel, ObservationModel, Landmark, Likelihood, Sensor or Conditional.
+    """Checks a MotionModel, ObservationModel, Landmark, Likelihood, Sensor or Conditional.
 
     Args:
-        model: an object of a class derived from one of these. A Conditional begins anew.
+        model: an object of a class derived from one of these. A Conditional is re-initialised.
         space: group of the state; by default `model.space`.
-        rng: draws the arguments; by default always the same ones.
+        rng: draws the arguments; by default with a fixed seed.
         example: arguments that replace random ones; a Sensor needs its frame and belief, a Conditional its groups.
 
     Returns one sentence per finding, none for a sound model: class, method, what was expected and found. Raises InputError:
-    the object is of none of these classes, or cannot be tried without more than was given.
+    the object is of none of these classes, or cannot be checked without further arguments.
     """
     rng, example = rng or np.random.default_rng(0), example or Example()
     space = space or getattr(model, "space", None)
@@ -55,7 +55,7 @@ def check_model(
 
 
 def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) -> list[str]:
-    """Of a sensor; of a sound one, of the models, landmarks and likelihoods of what it observes and starts."""
+    """Findings of a sensor; if it is sound, of the models, landmarks and likelihoods that it uses."""
     belief = example.belief
     if belief is not None and belief.landmarks != sensor.part:
         example = replace(example, belief=replace(belief, landmarks=sensor.part))
@@ -68,7 +68,7 @@ def sensor_findings(sensor: Sensor, rng: np.random.Generator, example: Example) 
         if group.data is not None:
             continue
         if group.ids is not None and (group.ids >= 0).any():
-            # The landmark that the model belongs to: it is tried on what the map holds.
+            # The model's landmark is tested on the map's landmarks.
             known = np.unique(group.ids[group.ids >= 0])
             landmark = example.belief.map.landmark_of(int(known[0]))
             records = example.belief.read(known[example.belief.map.are(known, landmark)])

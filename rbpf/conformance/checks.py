@@ -1,6 +1,6 @@
-"""What is tried of motion and observation models, landmarks, likelihoods, sensors and what is marginalised.
+"""Checks of motion and observation models, landmarks, likelihoods, sensors and conditionals.
 
-Below it stands how methods are called, and how their answers are judged.
+Below are the helpers that call methods and validate their results.
 """
 
 from collections.abc import Callable, Sequence
@@ -119,7 +119,7 @@ def check_residual(model: models.ObservationModel, scene: Scene) -> None:
 
 
 def check_cut(model: models.ObservationModel, scene: Scene) -> None:
-    """While the state turns around an axis of its chart, no residual may jump by 2π between two small steps."""
+    """While the state rotates about an axis of its chart, no residual may jump by 2π between two small steps."""
     if models.Part.STATE not in model.reads:
         return
     angles = np.linspace(0.0, 2 * np.pi, TURN_STEPS)[:, None, None, None]
@@ -343,7 +343,7 @@ def likelihood_checks(likelihood: models.Likelihood, rng: Generator) -> list[Che
 
 
 def sensor_checks(sensor: models.Sensor, example: Example) -> list[Check]:
-    """What it observes, then what it starts."""
+    """Its observations, then its new landmarks."""
     belief = example.belief
     if belief is None:
         name = type(sensor).__name__
@@ -392,7 +392,7 @@ def sensor_checks(sensor: models.Sensor, example: Example) -> list[Check]:
 
 
 def conditional_checks(part: models.Conditional, space: LieGroup, rng: Generator, example: Example) -> list[Check]:
-    """A few steps of what is marginalised: shapes, what a prediction may change, copies, and the checkpoint."""
+    """A few steps of a conditional: shapes, side effects of predictions, copies, and the checkpoint."""
     states, groups = example.states(space, rng), example.groups
     n, d = states.shape[0], space.dim
     alike = np.repeat(states[:1], n, axis=0)
@@ -444,7 +444,7 @@ def conditional_checks(part: models.Conditional, space: LieGroup, rng: Generator
             require(same, f"{name}: information says nothing, so that after_sampling must be all of the density")
 
     def copies() -> None:
-        """Descendants of one particle are alike, and what one of them sees is nothing to the others."""
+        """Descendants of one particle are equal, and an update of one does not affect the others."""
         name, seen = named(part.resample), []
         for between in (alike, np.concatenate([states[:1], states[1:][::-1]])):
             begin()
@@ -497,7 +497,7 @@ def run(checks: Sequence[Check]) -> list[str]:
 
 
 def called(method: Callable[..., Any], *args: Any, repeat: bool = True, gives: Sequence[type] = ()) -> Any:
-    """What a method returns, after it was seen to return the same twice and to leave its arguments alone.
+    """A method's result, after checking that it is deterministic and does not change its arguments.
 
     If types are given, it must be of one of these.
     """

@@ -1,4 +1,4 @@
-"""What a user's model is tried on."""
+"""Test arguments for a user's model."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,23 +12,23 @@ from rbpf.errors import InputError
 from rbpf.lie import LieGroup, Product, SE2Group, SE3Group
 
 PARTICLES, LANDMARKS = 5, 4
-CANDIDATES = 400  #: Random landmarks per particle, of which the first visible ones are taken.
+CANDIDATES = 400  #: Random landmarks per particle, of which the first visible ones are used.
 SPREAD = 5.0  #: Standard deviation of random landmarks, in their own units.
 
 
 @dataclass(frozen=True)
 class Example:
-    """What to try a model on, where random draws make no sense; all of it is optional."""
+    """Arguments for checking a model, where random draws make no sense; all are optional."""
 
     state: np.ndarray | None = None  #: (N, E) states.
     landmark: Landmark | None = None  #: the parametrisation that an observation model reads; by default a point.
     records: Records | None = None  #: (N, K, …) estimates of landmarks.
     substate: int = 0  #: m, size of the linear substate that an observation model reads.
-    control: object = None  #: what a motion model moves by.
+    control: object = None  #: control input of a motion model.
     dt: float = 0.1  #: seconds.
-    frame: object = None  #: what a sensor observes.
-    belief: Belief | None = None  #: what it knows before; its map may be changed by the check.
-    groups: Sequence[Observations] = ()  #: what a conditional is updated by.
+    frame: object = None  #: input of a sensor.
+    belief: Belief | None = None  #: its prior belief; the check may change its map.
+    groups: Sequence[Observations] = ()  #: observations for a conditional.
     transition: Transition | None = None  #: of the states, for a conditional that drives the motion.
 
     def states(self, space: LieGroup, rng: Generator) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""Files of named plain arrays; checkpoints, arrays with a header and a digest; and what the arrays of a file must be.
+"""Files of named plain arrays; checkpoints, which add a header and a digest; and schemas for the arrays of a file.
 
-A file is a NumPy `.npz` archive, never pickled, and read without trusting a header. What a header claims is compared with
-the file's own size before anything is allocated: members are stored as they are, uncompressed, so that no file unfolds into
-more than itself. A checkpoint's entry `header` is JSON text: format version, the filter's fingerprint (model classes, sizes),
-the state of the random generator and a SHA-256 digest of all other entries.
+A file is a NumPy `.npz` archive without pickled objects, and no header is trusted: the size that it claims is checked
+against the file's own size before anything is allocated. Members are stored uncompressed, so that no file can expand beyond
+its size. A checkpoint's entry `header` is JSON text: format version, the filter's fingerprint (model classes, sizes), the
+state of the random generator and a SHA-256 digest of all other entries.
 """
 
 import hashlib
@@ -27,19 +27,19 @@ from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3, LieGroup
 
-VERSION = 1  #: Of the format of checkpoints.
+VERSION = 1  #: Version of the checkpoint format.
 
-#: What a file that is cut off, damaged or made up can raise, read by zipfile and NumPy.
+#: Exceptions of zipfile and NumPy on a truncated, damaged or malicious file.
 UNREADABLE = (
     OSError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError, RuntimeError, EOFError, MemoryError,
     SyntaxError, TokenError, zipfile.BadZipFile,
 )  # fmt: skip
 NOT_PLAIN = "it must hold truth values, numbers or text"
-_PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")  #: Types of arrays that are read: truth values, numbers, text.
+_PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")  #: Accepted array types: booleans, numbers, text.
 
 
 def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes an `.npz`, whole or not at all. Raises InputError: the place is full or forbidden, or an array is not plain."""
+    """Writes an `.npz` atomically. Raises InputError: the path is not writable, the disk is full, or an array is not plain."""
     for name, array in arrays.items():
         try:
             _require_plain(np.asarray(array))
@@ -47,21 +47,21 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
             raise InputError(f"{path} cannot be written: the array {name}: {error}") from error
         if "\0" in name:
             raise InputError(f"{path} cannot be written: the name {name!r} of an array holds a zero")
-    # All are plain by now; before NumPy 2.2 `allow_pickle` would be one more array. Its types take no dict of arrays.
+    # All are plain by now; NumPy below 2.2 would store `allow_pickle` as an array. Its types take no dict of arrays.
     plain: dict[str, Any] = dict(arrays)
     with whole(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **plain)
         file.flush()
-        # Else a power cut after the renaming could leave neither the old file nor the new one.
+        # Without fsync a power cut after the renaming could lose both the old and the new file.
         os.fsync(file.fileno())
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A temporary place beside a file, which gets the file's name when everything is written.
+    """A temporary path beside a file, renamed to the file once everything is written.
 
-    Nothing stays of what fails half way, and a file that was there before stays as it was. What bears the temporary name, a
-    link to another file too, is removed. Raises InputError: the place cannot be written to, or the disk is full.
+    On failure the temporary file is removed and an existing file is unchanged. Whatever has the temporary name before, even
+    a link, is removed. Raises InputError: the path is not writable, or the disk is full.
     """
     temporary = path.with_name(f"{path.stem}.partial{path.suffix}")
     try:
@@ -78,9 +78,9 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
-    """Reads all arrays of an `.npz` that `save_arrays` wrote, or the one called `only` if there is one; all writable.
+    """Reads all arrays of an `.npz` that `save_arrays` wrote, or just the one named `only`, if present; all writable.
 
-    Raises InputError: the file is missing, cut off or not an archive of plain arrays.
+    Raises InputError: the file is missing, truncated or not an archive of plain arrays.
     """
     try:
         if not os.path.isfile(path) and os.path.exists(path):
@@ -100,7 +100,7 @@ def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
 
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """Around the reading of a checkpoint's arrays: one InputError says in a sentence that they do not fit together."""
+    """Wraps the reading of a checkpoint's arrays: any error becomes one InputError that they do not fit together."""
     try:
         yield
     except InputError as error:
@@ -115,13 +115,13 @@ def fitting(path: Path) -> Iterator[None]:
 def write_checkpoint(
     path: Path, arrays: dict[str, np.ndarray], fingerprint: Mapping[str, object], rng_state: Mapping[str, object]
 ) -> None:
-    """Saves arrays with what they belong to: plain values by name that must agree between who saves and who loads."""
+    """Saves arrays with a fingerprint: plain named values that must agree between saving and loading."""
     header = {"version": VERSION, "fingerprint": fingerprint, "rng": rng_state, "digest": _digest(arrays)}
     save_arrays(path, {"header": np.array(json.dumps(header, default=lambda value: value.tolist())), **arrays})
 
 
 def read_checkpoint(path: Path, fingerprint: Mapping[str, object]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """The arrays, and the state of the random generator. Raises InputError: missing, damaged, of another version or filter."""
+    """Arrays and random generator state. Raises InputError: the file is missing, damaged, of another version or filter."""
     arrays = load_arrays(path)
     try:
         header = json.loads(str(arrays.pop("header")))
@@ -143,11 +143,11 @@ def read_checkpoint(path: Path, fingerprint: Mapping[str, object]) -> tuple[dict
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One member; whatever is wrong with it raises an error that `load_arrays` knows."""
+    """One member; all errors are of the types that `load_arrays` handles."""
     if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
         raise ValueError("a member is compressed or encrypted")
     member = BytesIO(archive.read(info))
-    # The header: what the numbers are. NumPy writes plain arrays in version 1 of its format.
+    # The header: type and shape. NumPy writes plain arrays in version 1 of its format.
     if np.lib.format.read_magic(member) != (1, 0):
         raise ValueError("a member is no plain array")
     shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(member)
@@ -156,14 +156,14 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     data = member.read()
     if math.prod(shape) * max(dtype.itemsize, 1) != len(data) or min(shape, default=0) < 0:
         raise ValueError("a member has another size than its header claims")
-    # The numbers: no bit pattern that is no truth value or no text.
+    # The data: bit patterns that are not a boolean or a character are refused.
     flat = np.frombuffer(data, dtype)
     _require_plain(flat)
     return flat.reshape(shape, order="F" if is_fortran else "C").copy(order="K")
 
 
 def _require_plain(array: np.ndarray) -> None:
-    """Raises a ValueError unless it is an array that files of this module hold."""
+    """Raises ValueError: the array is not of a type that these files hold."""
     dtype = array.dtype
     if not _PLAIN.fullmatch(dtype.str) or dtype.kind not in "biufU":
         raise ValueError(f"{NOT_PLAIN}, it is of {dtype}")
@@ -185,34 +185,34 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-# What the arrays of a file must be: declared once for each state, checked before anything follows an index or a size.
+# Schemas of the arrays of a file: declared once per state, checked before any index or size is used.
 #
 #     FEATURES = {"px": numbers("features", 2), "member": integers("features", least=-1, below="members")}
 #     found = read(arrays, FEATURES, "features/", members=5)
 #
-# A size that has a name is the same wherever the name comes: the first array that has it says what it is, or the caller.
+# A named size is equal wherever the name occurs: it is set by the caller, or by the first array that has it.
 
-LARGEST = 1e30  #: No number is larger, so that squares stay finite.
+LARGEST = 1e30  #: Largest accepted number, so that squares stay finite.
 
 _WORDS = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "b": "truth values", "U": "text"}
-_CLOSE = 1e-6  #: Quaternions of poses are of unit length up to this.
+_CLOSE = 1e-6  #: Tolerance of the unit length of quaternions.
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What one array must be."""
+    """Requirements of one array."""
 
-    dtype: type  #: that it is read as.
-    shape: tuple[int | str, ...]  #: sizes, or names of sizes; "" for any.
+    dtype: type  #: type it is converted to.
+    shape: tuple[int | str, ...]  #: sizes or names of sizes; "" for any size.
     least: float | None = None  #: its lowest value.
-    below: int | str | None = None  #: above its highest value; a number, or the name of a size.
+    below: int | str | None = None  #: exclusive upper bound; a number, or the name of a size.
     values: Literal["finite", "log", "any"] = "finite"  #: "finite"; "log" also takes −∞; "any" also +∞ and NaN.
     space: LieGroup | None = None  #: group whose elements the last axis holds; None for plain numbers.
-    ascending: bool = False  #: each value is above the one before.
-    ordered: bool = False  #: no value is below the one before, as of times.
-    distinct: bool = False  #: no value comes twice, as of names.
-    covariance: bool = False  #: the last two axes are those of covariances, which may be singular.
-    refers: str | None = None  #: name of an array of the same file that holds all of its values.
+    ascending: bool = False  #: strictly ascending values.
+    ordered: bool = False  #: non-decreasing values, such as times.
+    distinct: bool = False  #: distinct values, such as names.
+    covariance: bool = False  #: the last two axes hold covariances, which may be singular.
+    refers: str | None = None  #: name of an array in the same file that must contain all its values.
 
     def empty(self, **sizes: int) -> np.ndarray:
         shape = [sizes[size] if isinstance(size, str) else size for size in self.shape[1:]]
@@ -223,16 +223,16 @@ Schema = Mapping[str, Entry]
 
 
 def entry(*shape: int | str, **options: Any) -> Entry:
-    """An array of a shape, see `Entry`."""
+    """An `Entry` of this shape."""
     return Entry(shape=shape, **options)
 
 
-#: Arrays of an `Entry`'s shape and options: numbers, whole numbers, truth values, text, grey levels of images.
+#: Entries by type: numbers, integers, booleans, text, grey levels of images.
 numbers, integers = partial(entry, dtype=np.float64), partial(entry, dtype=np.int64)
 truths, text, grey = (partial(entry, dtype=kind) for kind in (np.bool_, np.str_, np.uint8))
 
 
-#: Times, and covariances whose shape has the size of both axes.
+#: Times, and covariances, whose shape includes both axes.
 stamps, covariances = partial(integers, ordered=True), partial(numbers, covariance=True)
 
 
@@ -247,44 +247,44 @@ def poses(*shape: int | str) -> Entry:
 
 
 def read(arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **sizes: int) -> dict[str, np.ndarray]:
-    """The arrays of a schema, without the prefix of their names; copies, of the schema's types.
+    """Validated copies of a schema's arrays, of the schema's types, by their names without the prefix.
 
     Args:
-        arrays: of a file.
-        schema: what they must be; in this order sizes get their names.
+        arrays: named arrays of a file.
+        schema: their requirements; named sizes are set in this order.
         prefix: of their names in the file.
-        sizes: that are known beforehand.
+        sizes: named sizes that are known.
 
-    Raises InputError: one is missing, or is not what it should be.
+    Raises InputError: one is missing, or does not meet its requirements.
     """
     sizes = dict(sizes)
     return {name: _read(arrays, prefix + name, entry, sizes) for name, entry in schema.items()}
 
 
 def read_one(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, **sizes: int) -> np.ndarray:
-    """One array; errors as `read`."""
+    """One array; errors as of `read`."""
     return _read(arrays, name, entry, sizes)
 
 
 class Kept:
-    """An object of which a checkpoint holds the attributes that `kept` names: after `prefix`, without their underscore."""
+    """Base class that saves the attributes in `kept` to a checkpoint, named by `prefix` and without leading underscore."""
 
     kept: ClassVar[Schema]
     prefix: ClassVar[str]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         return {self.prefix + name.lstrip("_"): np.asarray(getattr(self, name)) for name in self.kept}
 
     def restore(self, arrays: Mapping[str, np.ndarray], **sizes: int) -> None:
-        """The inverse of `arrays`, where sizes are known beforehand; errors as `read`."""
+        """The inverse of `arrays`, given known sizes; errors as of `read`."""
         found = read(arrays, {name.lstrip("_"): entry for name, entry in self.kept.items()}, self.prefix, **sizes)
         for name, array in zip(self.kept, found.values(), strict=True):
             setattr(self, name, array if array.ndim else array.item())
 
 
 def require(what: str, values: Mapping[str, Any], schema: Schema, **sizes: int) -> None:
-    """Refuses arrays in memory, of `what` in words, that are not what the schema says; errors as `read`."""
+    """Validates arrays in memory against a schema; `what` names them in messages; errors as of `read`."""
     for name in schema:
         if not isinstance(values[name], np.ndarray):
             raise InputError(f"{what}: {name} must be an array, got a {type(values[name]).__name__}")
@@ -295,7 +295,7 @@ def require(what: str, values: Mapping[str, Any], schema: Schema, **sizes: int) 
 
 
 def split(rows: np.ndarray, counts: Sequence[int], name: str) -> list[np.ndarray]:
-    """The rows of an array as so many each. Raises InputError: there are not as many rows."""
+    """Splits the rows of an array by `counts`. Raises InputError: the number of rows differs."""
     if sum(counts) != len(rows):
         raise InputError(f"the array {name} has {len(rows)} rows, expected {sum(counts)}")
     return np.split(rows, np.cumsum(counts)[:-1]) if len(counts) else []
@@ -305,7 +305,7 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
     array = arrays.get(name)
     if array is None:
         raise InputError(f"the array {name} is missing")
-    # Type and shape; a size that is named for the first time is what it is here.
+    # Type and shape; the first occurrence of a named size sets it.
     wanted = np.dtype(entry.dtype)
     kinds = {"i": "iu", "f": "fiub" if entry.values == "any" else "f"}.get(wanted.kind, wanted.kind)
     fits = array.dtype.kind in kinds and array.ndim == len(entry.shape)
@@ -324,7 +324,7 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
         if entry.values == "log":
             is_right |= np.isneginf(array)
         _require(is_right, array, name, "finite numbers")
-    # What is followed: indices, counts, ranges.
+    # Indices, counts, ranges.
     below = sizes[entry.below] if isinstance(entry.below, str) else entry.below
     if wanted.kind == "i":
         least = -(2**62) if entry.least is None else entry.least
@@ -338,7 +338,7 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
         _require(np.diff(array, prepend=array[:1]) >= 0, array, name, "numbers in order (sort what they are of)")
     if entry.distinct:
         is_first = np.isin(np.arange(array.size), np.unique(array, return_index=True)[1])
-        _require(is_first, array, name, "numbers that come once (keep one of each)")
+        _require(is_first, array, name, "distinct numbers (keep one of each)")
     if entry.covariance:
         try:
             gaussian.psd_factor(array)
@@ -356,7 +356,7 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
 
 
 def _require(is_right: np.ndarray, array: np.ndarray, name: str, words: str) -> None:
-    """Refuses an array whose rows are not all right, with the first that is not."""
+    """Raises InputError with the first row for which `is_right` is False."""
     if not np.all(is_right):
         row = tuple(int(i) for i in np.argwhere(~np.asarray(is_right))[0])
         where = f" at {', '.join(map(str, row))}" if row else ""

@@ -1,9 +1,9 @@
-"""Whether a filter is healthy: NEES and its band, ancestors, corrections of the motion; and a watch for signs of failure.
+"""Consistency checks of a filter: NEES and its band, ancestors, motion corrections; and a monitor for divergence.
 
-A filter that fails says nothing by itself, so `Health` looks for signs in every step, and tells each once: innovations that
-stay several times as large as stated, evidence that falls and stays below all that was before, weight on a particle or two,
-descendants of a parent or two, a number of the state that all particles share. Each is judged by a median over the last steps,
-so that an outlier, or a first fix that decides between guesses, is none.
+A filter gives no error when it fails, so `Health` monitors every step for these signs, and reports each once: normalised
+innovations that stay large, evidence that drops and stays low, weight on one or two particles, descent from one or two
+parents, a state component that all particles share. Each is a median over the last steps, so that a single outlier, or the
+first fix that resolves an ambiguity, does not trigger it.
 """
 
 import math
@@ -19,14 +19,14 @@ from rbpf.core.genealogy import History
 from rbpf.core.particles import Estimate, Prior, Proposed
 from rbpf.lie import Finite, LieGroup, Product
 
-WINDOW = 20  #: Steps with observations that a sign must last for, in most of them.
+WINDOW = 20  #: Steps with observations over which the median of a sign is taken.
 LARGE = 4.0  #: Normalised innovation squared per degree of freedom; the median of a consistent filter is 0.45 to 1.
-#: The same over all that was measured, where the noise is stated twice as large as it is; and of how many numbers at
-#: least.
+#: Mean of the same over all measurements, at a noise stated twice as large as it is; and the least number of measured
+#: components for it.
 SMALL, ENOUGH = 0.25, 200.0
-FEW = 0.02  #: Fraction of the particles that is next to none of them, but two at least.
+FEW = 0.02  #: Fraction of the particles that counts as few; at least two particles.
 EVIDENCE_SIGMA = 6.0
-EVERY = 10  #: Steps from one count of distinct states to the next.
+EVERY = 10  #: Steps between counts of distinct states.
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ def nees(space: LieGroup, estimate: Estimate, truth: np.ndarray) -> float:
 
 
 def chi_square_quantile(probability: Any, dof: float) -> Any:
-    """What a χ² variable stays below with this probability, a number or an array."""
-    # As `scipy.stats` has it, which takes half a second to import.
+    """Quantile of the χ² distribution, for a number or an array of probabilities."""
+    # As in `scipy.stats`, which takes half a second to import.
     return 2.0 * gammaincinv(0.5 * dof, probability)
 
 
@@ -61,24 +61,24 @@ def chi_square_band(dof: float, runs: int = 1, probability: float = 0.95) -> Ban
 
 
 def ancestors_by_step(history: History) -> np.ndarray:
-    """How many particles of each step kept still have descendants among the present ones, (T,) int."""
+    """Number of particles of each stored step that have descendants among the current ones, (T,) int."""
     counts = [np.full(len(b.states), history.lineage.distinct(b.generation)) for b in history.blocks]
     return np.concatenate([np.zeros(0, dtype=np.int64), *counts])
 
 
 def coalescence_steps(history: History) -> int | None:
-    """Steps back from the last one to the latest ancestor that all particles share; None where no step kept has one."""
+    """Steps back from the last one to the latest common ancestor of all particles; None if no stored step has one."""
     single = np.flatnonzero(ancestors_by_step(history) == 1)
     return int(history.stamps_ns.size - 1 - single[-1]) if single.size else None
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What the observations of one step say about the motion into it, beside what a consistent filter expects of them.
+    """The correction of one step's motion by its observations, and its covariance expected of a consistent filter.
 
-    The increment is μ + L u with u ~ N(0, I) before the observations. Given them, u has mean û and covariance C, within
-    + between particles. By the law of total variance û has covariance I − C, and it is independent from step to step:
-    an odometer with a bias of b standard deviations moves it to (I − C) b, and wrong noise makes it too large or small.
+    The increment is μ + L u with u ~ N(0, I) before the observations. Given them, u has mean û and covariance C, within +
+    between particles. By the law of total variance û has covariance I − C, and it is independent between steps: an odometer
+    with a bias of b standard deviations shifts û by (I − C) b, and wrong noise makes it too large or small.
     """
 
     mean: np.ndarray  #: (r,) û.
@@ -101,13 +101,13 @@ def motion_correction(mixture: tuple[Prior, Proposed | None, np.ndarray]) -> Cor
 
 
 class HealthWarning(UserWarning):
-    """A filter that is probably wrong, or surer than it should be."""
+    """The filter has probably diverged, or is overconfident."""
 
 
 class Health:
-    """What the last steps show. `findings` holds the sentences; each kind is told once, as a `HealthWarning` unless `silent`.
+    """Monitor of the last steps. Each kind of finding is added to `findings` once, with a `HealthWarning` unless `silent`.
 
-    Too much caution is no finding but one of the `remarks`: nothing that the filter says is wrong.
+    An underconfident filter is not a finding but one of the `remarks`: its estimates remain valid.
 
     Args:
         n: number of particles.
@@ -122,29 +122,29 @@ class Health:
         self._few = max(2.0, FEW * n)
         self._ratios, self._ess, self._parents = (deque[float](maxlen=WINDOW) for _ in range(3))
         self._recent = deque[float](maxlen=WINDOW)
-        self._steady = 0.0, 0.0, 0.0  # number, mean and summed squares of the evidence before the recent one.
+        self._steady = 0.0, 0.0, 0.0  # count, mean and sum of squares of the earlier evidence.
         self._most: np.ndarray | None = None
         groups = space.groups if isinstance(space, Product) else (space,)
         self._continuous = np.repeat([not isinstance(group, Finite) for group in groups], [g.size for g in groups])
 
     def innovations(self, step: int, nis: float, rows: float, ess: float) -> None:
-        """After a step with observations: what `StepReport` says of them."""
+        """To be called after a step with observations, with the values of its `StepReport`."""
         if rows > 0.0 and math.isfinite(nis):
             self._ratios.append(nis / rows)
             ratio = _lasting(self._ratios, step)
             if ratio > LARGE:
-                self._tell(
+                self._warn_once(
                     "innovations",
-                    f"step {step}: what is measured is {ratio:.0f} times as far off (squared) as the noise explains, and has "
+                    f"step {step}: squared innovations are {ratio:.0f} times as large as the noise explains, and have "
                     f"been for {WINDOW} steps. The filter has probably diverged: check the noise of motion and measurements, "
                     "use more particles, or marginalise what is sampled",
                 )
-            # A mean, for a filter that is too cautious is no failure, and there is time; large ones only hide it.
+            # A mean over the whole run: underconfidence is not urgent, and large innovations can only mask it.
             self._squared, self._rows = self._squared + nis, self._rows + rows
             if self._rows >= ENOUGH and self._squared < SMALL * self._rows:
                 ratio = self._squared / self._rows
                 self.remarks["caution"] = (
-                    f"what was measured is {ratio:.2f} times as far off (squared) as the noise explains, 1 is right: the "
+                    f"squared innovations are {ratio:.2f} times as large as the noise explains, 1 is right: the "
                     "noise of motion or measurements is stated too large"
                 )
             else:
@@ -152,19 +152,19 @@ class Health:
         self._ess.append(-ess)
         few = -_lasting(self._ess, step)
         if few < self._few:
-            self._tell(
+            self._warn_once(
                 "weights",
-                f"step {step}: {few:.1f} of {self.n} particles have had all the weight for {WINDOW} steps, no cloud of them "
-                "is left that could say how uncertain the state is: use more particles or a proposal that looks at the "
+                f"step {step}: {few:.1f} of {self.n} particles have had all the weight for {WINDOW} steps, too few "
+                "to represent the uncertainty of the state: use more particles or a proposal that uses the "
                 "measurements, or check their noise",
             )
 
     def evidence(self, step: int, log_evidence: float) -> None:
-        """After a step with observations: the log-evidence of one number measured."""
+        """To be called after a step with observations, with the log-evidence per measured component."""
         if not math.isfinite(log_evidence):
             return
         if len(self._recent) == WINDOW:
-            # Those that leave the recent ones are the past (B. Welford 1962).
+            # Values that leave the window are added to the running statistics (B. Welford 1962).
             number, mean, squares = self._steady
             oldest = self._recent[0]
             moved = mean + (oldest - mean) / (number + 1.0)
@@ -175,26 +175,26 @@ class Health:
             sigma = max(math.sqrt(squares / number), 0.1)
             best = sorted(self._recent)[3 * WINDOW // 4]
             if best < mean - EVIDENCE_SIGMA * sigma:
-                self._tell(
+                self._warn_once(
                     "evidence",
-                    f"step {step}: what is measured has become improbable, the log-evidence of one number fell from "
+                    f"step {step}: the measurements have become improbable, the log-evidence per component fell from "
                     f"{mean:.1f} ± {sigma:.1f} to {best:.1f} and stayed there. The filter has probably diverged: check its "
                     "models, or use more particles",
                 )
 
     def descendants(self, step: int, ancestors: np.ndarray) -> None:
-        """After particles were resampled."""
+        """To be called after resampling."""
         self._parents.append(-float(np.count_nonzero(np.bincount(ancestors, minlength=self.n))))
         few = -_lasting(self._parents, step)
         if few < self._few:
-            self._tell(
+            self._warn_once(
                 "ancestors",
-                f"step {step}: all {self.n} particles descend from {few:.0f} of those before, again and again: they share "
-                "one past, which the covariance does not know; use more particles, or marginalise what is sampled",
+                f"step {step}: all {self.n} particles descend from {few:.0f} of those before, step after step: they share "
+                "one past, which makes the covariance too small; use more particles, or marginalise what is sampled",
             )
 
     def states(self, step: int, state: np.ndarray) -> None:
-        """After a step, whose states (N, E) are looked at now and then."""
+        """To be called after a step; its states (N, E) are checked every few steps."""
         if step % EVERY:
             return
         ordered = np.sort(state, axis=0)
@@ -202,14 +202,14 @@ class Health:
         self._most = distinct if self._most is None else np.maximum(self._most, distinct)
         lost = np.flatnonzero(self._continuous & (self._most >= self.n / 2) & (distinct <= self._few) & (self.n > 4))
         if lost.size:
-            self._tell(
+            self._warn_once(
                 "copies",
-                f"step {step}: number {lost[0]} of the state has {distinct[lost[0]]} values left among {self.n} particles. "
-                "Nothing makes copies of a particle differ in it, so that it can no longer be corrected: marginalise it "
+                f"step {step}: component {lost[0]} of the state has {distinct[lost[0]]} values left among {self.n} particles. "
+                "It has no noise that separates copies of a particle, so it can no longer be corrected: marginalise it "
                 "(KalmanSubstate), or give it some noise",
             )
 
-    def _tell(self, kind: str, sentence: str) -> None:
+    def _warn_once(self, kind: str, sentence: str) -> None:
         if kind not in self.findings:
             self.findings[kind] = sentence
             if not self.silent:
@@ -217,5 +217,5 @@ class Health:
 
 
 def _lasting(values: deque[float], step: int) -> float:
-    """The median of a full window, looked at in every fourth step; −∞ says nothing."""
+    """The median of a full window, computed every fourth step; else −∞."""
     return sorted(values)[WINDOW // 2] if len(values) == WINDOW and step % 4 == 0 else -math.inf

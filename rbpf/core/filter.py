@@ -53,28 +53,28 @@ from rbpf.ranges import require_memory
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """What one step did."""
+    """The results of one step."""
 
     stamp_ns: int  #: time of the step.
-    #: the refined mixture before sampling, with its log-weights; after a proposal that did not look at the
-    #: observations, the weighted samples.
+    #: the refined mixture before sampling, with its log-weights; after a proposal that does not use the observations, the
+    #: weighted samples.
     mixture: tuple[Prior, Proposed | None, np.ndarray]
-    #: the samples, with their weights before and after the second weight; None where the mixture is made of them.
+    #: the samples, with their weights before and after the second weight; None if the mixture consists of them.
     second: SecondWeight | None
     ess: float  #: effective sample size before resampling.
-    resampled: bool  #: whether the particles were resampled or consolidated before they moved.
-    #: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density, or where
-    #: observations of landmarks updated only the state or only the landmarks, and no other group of the same ones
-    #: the rest: that is no density of what was measured.
+    resampled: bool  #: whether the particles were resampled or consolidated in this step.
+    #: log p(z_t | z_1:t−1), Mathematics (evidence-increment). NaN if a likelihood is not normalised, or if landmark
+    #: observations updated only the state or only the landmarks without another group of the same measurements for the
+    #: other: their product is then not a density of the measurements.
     log_evidence: float
-    #: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
-    #: innovation of the rows that took part, a weighted mean over the particles.
+    #: normalised innovation squared, NaN without linearisation: the squared Mahalanobis distance of the joint innovation of
+    #: the rows used, a weighted mean over the particles.
     nis: float
-    #: its degrees of freedom, the weighted mean of the number of those rows. A row takes no part in a particle that
-    #: does not associate it with a known landmark, or that the likelihood gates as an outlier.
+    #: its degrees of freedom, the weighted mean number of those rows. A particle does not use rows that it does not
+    #: associate with a known landmark, or that the likelihood gates as outliers.
     rows: float
     groups: Sequence[Observations]  #: the observations that were used.
-    new_landmarks: np.ndarray  #: ids of those that were started.
+    new_landmarks: np.ndarray  #: ids of the landmarks initialised in this step.
 
     @cached_property
     def estimate(self) -> Estimate:
@@ -87,20 +87,20 @@ class Filter:
 
     Args:
         motion: p(x_t | x_{t−1}, u_t).
-        sensors: what measures; a single Sensor or several.
+        sensors: a single Sensor or several.
         conditional: what is marginalised: a LandmarkMap, a KalmanSubstate, parts of your own, several in a list, or nothing.
-        proposal: where the particles are sampled; by default EKF-refined with the exact ratio.
+        proposal: the proposal distribution; by default EKF-refined with the exact importance ratio.
         resampler: by default systematic when the effective sample size falls below N/2.
         n: number of particles.
         rng: source of all randomness.
         start: (E,) or (N, E) initial state; by default the identity.
         lag: steps of trajectory kept, None keeps all.
         clouds: keep whole clouds, for backward simulation.
-        consolidation: when a conditional that can takes in what the particles differ by; they are then never resampled.
-            Paths are not kept across it: ask for a lag of one step. States are in a frame of the conditional's choice.
+        consolidation: when the spread of the particles is merged into a conditional that supports it; they are then never
+            resampled. Stored paths end there: use a lag of one step. States are in a frame chosen by the conditional.
 
     Attributes:
-        health: what in the last steps looks like failure; `health.findings` holds what it warned of.
+        health: monitor for signs of divergence; `health.findings` holds its warnings.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Filter:
             raise InputError(f"a filter needs at least one particle, got {n}")
         if lag is not None and lag < 1:
             raise InputError(f"a fixed lag keeps at least one step, got {lag}")
-        # Ancestry, states, and a few matrices of the state's size in each particle.
+        # Ancestry, states, and a few matrices of the state's size per particle.
         require_memory(8.0 * n * (40 + 4 * motion.space.dim**2), f"a filter of {n} particles")
         self.motion = motion
         self.space = motion.space
@@ -152,7 +152,7 @@ class Filter:
         return self.particles.n
 
     def expect(self, control: object = None, stamp_ns: int | None = None) -> Belief:
-        """The belief that `step` would give the sensors, for looking at a frame before it is filtered; no particle moves."""
+        """The predicted belief that `step` would pass to the sensors, without changing the filter."""
         _, dt = self._clock(stamp_ns)
         before = self.rng.bit_generator.state
         prior = self._predict(control, dt)
@@ -162,19 +162,19 @@ class Filter:
     def step(
         self, frame: object, control: object = None, stamp_ns: int | None = None, proposal: Proposal | None = None
     ) -> StepReport:
-        """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
+        """Predicts, observes, refines, weighs, resamples, samples, updates the map and the weights; then adds new landmarks.
 
-        Where there is a consolidation, it takes the place of resampling; it comes after the step, too, when it is due.
+        A consolidation replaces resampling; if it is due, it also follows the step.
 
         Args:
             frame: what the sensors observe.
-            control: what the motion model moves by.
+            control: control input of the motion model.
             stamp_ns: time of the frame; by default the previous one plus one second.
-            proposal: of this step, where the filter's own would not do.
+            proposal: for this step, instead of the filter's own.
 
-        Raises InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the
-        error is about what came in before the particles are weighed (time, control, measurements), the filter is as
-        it was; otherwise it stands between two steps: `load` a checkpoint.
+        Raises InputError: time runs backwards, shapes do not fit, or no particle explains the observations. After an error
+        about the inputs, before the particles are weighed (time, control, measurements), the filter is unchanged; after
+        others it is in an intermediate state: `load` a checkpoint.
         """
         proposal = proposal or self.proposal
         with _unchanged_by_failure(self):
@@ -183,14 +183,14 @@ class Filter:
             prior = self._predict(control, dt)
             groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng))
 
-            # Refine, and weigh by the look-ahead w₁.
+            # Refine the proposal, and weigh by the look-ahead w₁.
             proposed = proposal.propose(prior, self.marginals.linearised(prior, groups), self.rng)
             log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
         weights = np.exp(log_weights)
 
-        # Consolidate what was known before if the particles no longer stand for what they are about to see, and begin anew:
-        # what was observed holds in any frame.
+        # Consolidate before this step if the particles have degenerated with respect to its observations, and repeat the
+        # prediction: the observations are independent of the map's frame.
         ancestors, consolidated = None, False
         if self.consolidation is None:
             ancestors = self.resampler.ancestors(weights, self.rng)
@@ -202,7 +202,7 @@ class Filter:
             log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
             mixture, weights = (prior, proposed, log_weights), np.exp(log_weights)
 
-        # Resample if it is time: descendants inherit by ancestor, and so do associations of their own.
+        # Resample if it is due: descendants inherit from their ancestors, including per-particle associations.
         if ancestors is not None:
             fits = ancestors.dtype.kind in "iu" and ancestors.shape == (self.n,)
             if not fits or ancestors.min() < 0 or ancestors.max() >= self.n:
@@ -212,7 +212,7 @@ class Filter:
             self.lineage.advance(ancestors)
             self.marginals.resample(ancestors)
             if self._draws and proposed.nis is None:
-                # Nothing has looked at what was drawn: each descendant draws anew.
+                # `MotionModel.sample` did not depend on the observations: each descendant draws its own sample.
                 self.particles = Particles(take(self.particles.state, ancestors), log_weights)
                 prior = self._predict(control, dt)
             else:
@@ -222,7 +222,7 @@ class Filter:
                 for group in groups
             ]
 
-        # Sample one state for each descendant from its parent's Gaussian, and update what is marginalised.
+        # Sample one state for each descendant from its parent's Gaussian, and update the marginalised parts.
         inherited = proposed if ancestors is None else proposed.take(ancestors)
         balance = None
         if self.consolidation is not None:
@@ -235,7 +235,7 @@ class Filter:
         # Correct by log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁.
         log_w2 = densities.after_sampling
         if proposal.exact:
-            # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
+            # A parent of weight zero that was not resampled keeps it, whatever its second weight is.
             log_w2 = densities.all + log_ratio
             np.subtract(log_w2, inherited.log_w1, out=log_w2, where=inherited.log_w1 != -np.inf)
         log_before = log_weights
@@ -247,7 +247,7 @@ class Filter:
         else:
             second = SecondWeight(state, log_before, log_weights)
 
-        # Start landmarks, look for signs of failure, and report.
+        # Initialise landmarks, monitor for divergence, and report.
         new_landmarks = self._start_landmarks(frame, groups)
         evidence = look_ahead + correction if are_explained(groups) else float("nan")
         self.log_evidence += evidence
@@ -255,16 +255,16 @@ class Filter:
         nis = float("nan") if proposed.nis is None else float((weights * proposed.nis).sum())
         rows = 0.0
         if proposed.rows is not None:
-            # A weighted mean, exact where all are the same.
+            # A weighted mean, exact if all are equal.
             rows = float(proposed.rows[0] + (weights * (proposed.rows - proposed.rows[0])).sum())
         if groups:
             self.health.innovations(self.steps, nis, rows, ess)
             if not (rows > 0.0 and np.isfinite(nis)):
-                # Where innovations are known they tell: evidence also falls as the filter rightly knows less.
+                # Only without innovations: evidence also falls when the uncertainty rightly grows.
                 self.health.evidence(self.steps, evidence / max(sum(group.z.size for group in groups), 1))
         if ancestors is not None:
             self.health.descendants(self.steps, ancestors)
-        # Copies have not parted yet where none was drawn anew, nor where nothing drives them, as in no time.
+        # Copies still coincide if `sample` ran before resampling, or if the motion has no noise (a zero time step).
         if self.consolidation is None and (ancestors is None if self._draws else prior.factor.any()):
             self.health.states(self.steps, state)
         self._end(stamp_ns)
@@ -286,10 +286,10 @@ class Filter:
         )
 
     def follow(self, state: Array, frame: object, control: object = None, stamp_ns: int | None = None) -> Array:
-        """A step along given states (E,) or (N, E): what is marginalised is conditioned on them, p(m | x_0:t, z_1:t).
+        """A step along given states (E,) or (N, E): conditions the marginalised parts on them, p(m | x_0:t, z_1:t).
 
-        Mapping with known poses, or the maps of paths that were drawn elsewhere. The weights stay as they are. Arguments and
-        errors as `step`; returns the log-likelihood (N,) of the observations.
+        For mapping with known poses, or the maps of paths that were sampled elsewhere. The weights are unchanged. Arguments
+        and errors as of `step`; returns the log-likelihood (N,) of the observations.
         """
         if self._draws:
             raise InputError(f"follow needs Gaussian increments, but {type(self.motion).__name__} draws: see `sample`")
@@ -310,12 +310,12 @@ class Filter:
         return mixture_estimate(here, None, self.particles.log_weights)
 
     def belief(self) -> Belief:
-        """The particles as they are, for reading the map."""
+        """The current belief, for reading the map."""
         here = Prior.exactly(self.space, self.particles.state)
         return Belief(self.particles.log_weights, here, self.marginals.parts, self.rng)
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
-        """A checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
+        """Writes a checkpoint from which `load` continues identically, with additional arrays of the caller."""
         held = self.arrays() | {f"extra/{name}": array for name, array in (extra or {}).items()}
         checkpoint.write_checkpoint(Path(path), held, self._fingerprint(), self.rng.bit_generator.state)
 
@@ -331,7 +331,7 @@ class Filter:
         return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint must hold, but for the state of the random generator."""
+        """The arrays of a checkpoint; the state of the random generator is stored separately."""
         return {
             "particles/state": self.particles.state,
             "particles/log_weights": self.particles.log_weights,
@@ -345,7 +345,7 @@ class Filter:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`. Raises InputError: an array does not fit; the filter is then in between."""
+        """The inverse of `arrays`. Raises InputError: an array does not fit; the filter is then in an intermediate state."""
         schema = {
             "particles/state": checkpoint.elements(self.space, "n"),
             "particles/log_weights": checkpoint.numbers("n", values="log"),
@@ -417,7 +417,7 @@ class Filter:
         for sensor in self.sensors:
             groups = [checked_observations(group) for group in sensor.observe(frame, told(belief, sensor))]
             if sensor.part != Part.LANDMARK:
-                # The landmarks of its groups are those of its own map.
+                # The landmark ids of its groups refer to its own map.
                 its = [group.part is None and Part.LANDMARK in group.model.reads for group in groups]
                 groups = [replace(g, part=sensor.part) if own else g for g, own in zip(groups, its, strict=True)]
             observed.append(groups)
@@ -425,7 +425,7 @@ class Filter:
         return self.marginals.decided([group for groups in observed for group in groups], belief)
 
     def consolidate(self) -> None:
-        """Takes what the particles differ by into what is marginalised, now: a window ends, whether it is due or not."""
+        """Merges the spread of the particles into the marginalised part now, whether it is due or not."""
         self.particles = self.marginals.consolidate(self.particles)
         self._age = 0
 
@@ -449,7 +449,7 @@ class Filter:
 
 @contextmanager
 def _unchanged_by_failure(of: Filter) -> Iterator[None]:
-    """Puts a filter back as it was where it is refused; what it would be takes new objects, never the old ones."""
+    """Restores a filter's attributes after an InputError; the step must not have modified them in place."""
     held = [(item, dict(vars(item))) for item in (of, *of.marginals.parts.values())]
     generator, state = of.rng.bit_generator, of.rng.bit_generator.state
     try:
@@ -463,9 +463,9 @@ def _unchanged_by_failure(of: Filter) -> Iterator[None]:
 
 
 def are_explained(groups: Sequence[Observations]) -> bool:
-    """Whether the weights take in the density of a step's measurements given all before: each counts, and once.
+    """Whether the weights include the predictive density of all of a step's measurements, each exactly once.
 
-    Measurements that one group gives to the state and another one to the landmarks are whole.
+    Measurements with one group for the state and another one for the landmarks are complete.
     """
     if not all(group.normalised and (group.likelihood is None or group.likelihood.normalised) for group in groups):
         return False
@@ -477,19 +477,19 @@ def are_explained(groups: Sequence[Observations]) -> bool:
 
 
 def are_same(one: Observations, other: Observations) -> bool:
-    """Whether two groups are of the same measurements, whatever they update."""
+    """Whether two groups have the same measurements, whatever they update."""
     rows = {name: getattr(one, name) for name in ("z", "cov", "ids", "log_odds")}
     alike = vars(replace(other, **rows, updates=one.updates)) == vars(one)
     return alike and all(np.array_equal(array, getattr(other, name)) for name, array in rows.items())
 
 
 def told(belief: Belief, sensor: Sensor) -> Belief:
-    """The belief for a sensor, whose landmarks may be in a map of their own."""
+    """The belief for a sensor, with the map that holds its landmarks."""
     return belief if sensor.part == Part.LANDMARK else replace(belief, landmarks=sensor.part)
 
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
-    """A transition as the kernels take it. Raises InputError: mean or noise factor has the wrong shape, or is not finite."""
+    """A validated transition for the kernels. Raises InputError: mean or noise factor has a wrong shape or is not finite."""
     changed = {}
     for name, array in vars(transition).items():
         if array is not None and (checked := numbers(array, f"{what}: {name}")) is not array:
@@ -510,7 +510,7 @@ def checked_transition(transition: Transition, state: np.ndarray, space: LieGrou
 
 
 def checked_observations(group: Observations) -> Observations:
-    """A group as the kernels take it. Raises InputError: z or cov has the wrong shape, is not finite, or is no covariance."""
+    """A validated group for the kernels. Raises InputError: z or cov has a wrong shape, is not finite, or not a covariance."""
     if group.data is not None:
         return group
     name, ids = type(group.model).__name__, group.ids
@@ -535,7 +535,7 @@ def checked_observations(group: Observations) -> Observations:
     try:
         gaussian.psd_factor(group.cov)
     except InputError as error:
-        raise InputError(f"the noise of {name} has no covariance: {error}") from error
+        raise InputError(f"the noise covariance of {name} is not valid: {error}") from error
     return group
 
 

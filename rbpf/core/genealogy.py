@@ -1,7 +1,7 @@
-"""Who descends from whom: the lineage of the particles, and their paths along it.
+"""The genealogy of the particles, and their paths along it.
 
-Each resampling starts a generation; whatever is stored per particle (poses, landmarks) is stored per generation, by the
-row of the particle that wrote it, and read back through `Lineage.rows`. Resampling copies nothing but ancestor indices.
+Each resampling starts a generation; everything stored per particle (poses, landmarks) is stored per generation, by the row
+of the particle that wrote it, and read back through `Lineage.rows`. Resampling copies only ancestor indices.
 """
 
 from collections import Counter
@@ -16,10 +16,10 @@ from rbpf.kernels import forest
 from rbpf.kernels.forest import CHILDREN, GENERATION, ROW
 from rbpf.ranges import require_memory
 
-#: Age in generations at which what is stored is first looked through for dead rows, and least time until the next look.
+#: Age in generations at which stored rows are first checked for extinct lineages, and least time to the next check.
 _FIRST_CHECK = 4
-_MEMORY_CHECK = 64  #: Steps between two looks at whether the paths still fit.
-_PENDING = 8  #: Generations at most whose ancestors wait to be taken into the forest.
+_MEMORY_CHECK = 64  #: Steps between checks of the paths' memory.
+_PENDING = 8  #: Maximum number of generations not yet inserted into the forest.
 
 _COLUMNS = "parent", "children", "generation", "row"
 _NO_NODE = np.array([-1, 0, -1, 0])
@@ -39,7 +39,7 @@ _BLOCK = {
 
 
 class Lineage:
-    """The forest of ancestors of n particles; a generation that somebody stores rows of is kept by `retain` to `release`."""
+    """The ancestor forest of n particles; generations with stored rows are kept from `retain` to `release`."""
 
     def __init__(self, n: int) -> None:
         self.n = n
@@ -48,14 +48,14 @@ class Lineage:
         self._mark = 0
         self._allocate(4 * n)
         self._identity = np.arange(n)
-        #: Ancestors of the newest generations, which the forest does not hold before somebody asks for it.
+        #: Ancestors of the newest generations, inserted into the forest lazily.
         self._pending: list[np.ndarray] = []
-        #: Of the generations that were asked for since the last resampling, what `rows` and `survivors` are.
+        #: Cached `rows` and `survivors` by generation, since the last resampling.
         self._cache: dict[int, np.ndarray] = {}
         self._alive: dict[int, np.ndarray] = {}
-        #: Of each retained generation, its nodes as they were last looked through, by row.
+        #: Nodes of each retained generation at the last check, by row.
         self._members: dict[int, np.ndarray] = {}
-        #: Generations of which one row has all descendants: it always will, and the trunk need not be climbed again.
+        #: Generations with a single surviving row, which stays the only one: no need to climb the forest again.
         self._settled: dict[int, int] = {}
         self._oldest = 0
         self._plant()
@@ -96,8 +96,8 @@ class Lineage:
     def survivors(self, generation: int) -> Int[np.ndarray, " n"]:
         """Particles of a retained generation that still have descendants, ascending.
 
-        Costs as much as had descendants when this was last asked, so that what is asked at ages that grow by a quarter
-        costs a few passes over the particles in all.
+        The cost is proportional to the survivors at the previous call, so that calls at ages growing by a quarter cost a
+        few passes over the particles in total.
         """
         if generation == self.generation:
             return self._identity.copy()
@@ -108,13 +108,13 @@ class Lineage:
         if nodes is None:
             nodes = np.flatnonzero(self._nodes[:, GENERATION] == generation)
             nodes = nodes[np.argsort(self._nodes[nodes, ROW])]
-        # A node that died is free, or serves a later generation.
+        # The node of an extinct lineage is free, or reused by a later generation.
         self._members[generation], alive = forest.survivors(self._nodes, nodes, generation)
         self._alive[generation] = alive
         return alive
 
     def due(self, oldest: int = 0) -> list[int]:
-        """Past generations from `oldest` on, ascending, whose rows are worth compacting now: at ages growing by a quarter.
+        """Past generations from `oldest` on, ascending, whose rows are due for compaction: at ages growing by a quarter.
 
         Lineages coalesce ever more slowly.
         """
@@ -131,7 +131,7 @@ class Lineage:
         return self.survivors(generation).size
 
     def retain(self, generation: int) -> None:
-        """Keeps the nodes of a generation. Raises InputError: the ancestry does not hold it, as a checkpoint may say."""
+        """Keeps the nodes of a generation. Raises InputError: it is not in the ancestry (of a damaged checkpoint)."""
         if not self._oldest <= generation <= self.generation:
             raise InputError(f"the ancestry does not hold generation {generation}")
         self._retained[generation] += 1
@@ -153,9 +153,9 @@ class Lineage:
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`, into a new lineage; what is stored per generation must be taken up again.
+        """The inverse of `arrays`, into a new lineage; data per generation must be registered again.
 
-        Raises InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
+        Raises InputError: an array is missing, or they do not form a forest, which compiled code does not check.
         """
         now, n_free = read_one(arrays, "lineage/now", integers(2, least=0)).tolist()
         found = read(arrays, _FOREST, "lineage/", n=self.n, generations=now + 1)
@@ -163,7 +163,7 @@ class Lineage:
         self._nodes[:] = np.column_stack([found[name] for name in _COLUMNS])
         self._leaves, self._free = found["leaves"], found["free"]
         self.generation, self._n_free = now, n_free
-        # Refused is what is no forest: what is not free has children or is a leaf, and a parent that is older and not free.
+        # In a forest every used node has children or is a leaf, and its parent is older and in use.
         size, free = len(self._nodes), self._free[:n_free]
         alive = np.ones(size, dtype=bool)
         alive[free] = False
@@ -201,12 +201,12 @@ class Lineage:
         self._remember(self._oldest)
 
     def _remember(self, generation: int) -> None:
-        """Whose nodes are the leaves now."""
+        """Records the current leaves as the nodes of a retained generation."""
         if generation in self._retained:
             self._members[generation] = self._leaves.copy()
 
     def _forget(self) -> None:
-        """Drops the forest where no retained generation is in it; `_grow` plants another at the oldest retained one."""
+        """Drops the forest if no retained generation is in it; `_grow` plants another at the oldest retained one."""
         newest = self.generation - len(self._pending)
         if self._pending and not any(generation <= newest for generation in self._retained):
             self._oldest = min(self._retained, default=self.generation)
@@ -214,7 +214,7 @@ class Lineage:
             self._is_planted = False
 
     def _grow(self) -> None:
-        """Takes the ancestors that are pending into the forest."""
+        """Inserts the pending ancestors into the forest."""
         if self._is_planted and not self._pending:
             return
         self._forget()
@@ -229,7 +229,7 @@ class Lineage:
         self._pending.clear()
 
     def _make_room(self) -> None:
-        """Splices chains that nobody needs out of the forest, and doubles it where that is not enough."""
+        """Removes unneeded chain nodes from the forest, and doubles it if that is not enough."""
         needed = np.isin(self._nodes[:, GENERATION], list(self._retained))
         self._mark += 1
         scratch = self._leaves, needed, self._stamp, self._mark
@@ -273,7 +273,7 @@ class History:
         self._steps = 0
 
     def record(self, stamp_ns: int, state: np.ndarray, log_weights: np.ndarray) -> None:
-        """Stores the states (N, E) after a step. Raises InputError: the paths no longer fit into the machine's memory."""
+        """Stores the states (N, E) after a step. Raises InputError: the paths no longer fit into memory."""
         if self._steps % _MEMORY_CHECK == 0:
             paths = (
                 f"the paths of {self.lineage.n} particles over {self._steps + _MEMORY_CHECK} steps (a lag keeps fewer)"
@@ -284,7 +284,7 @@ class History:
         if block is None:
             block = self._blocks[now] = PathBlock(now, self.lineage.rows(now), [], [], [])
             self.lineage.retain(now)
-            # Blocks whose lineages have coalesced shrink to the rows that still have descendants.
+            # Blocks shrink to the rows that still have descendants.
             for generation in [] if self.clouds else self.lineage.due(next(iter(self._blocks))):
                 past = self._blocks.get(generation)
                 if past is None or past.kept.size == 1:
@@ -322,7 +322,7 @@ class History:
         return sum(len(block.states) * block.kept.size for block in self.blocks)
 
     def distinct_first(self) -> int:
-        """How many particles of the first generation kept still have descendants."""
+        """Number of particles of the first stored generation that have descendants."""
         return self.lineage.distinct(self.blocks[0].generation) if self.blocks else self.lineage.n
 
     def paths(self) -> np.ndarray:
@@ -343,7 +343,7 @@ class History:
         return out
 
     def restore(self, arrays: dict[str, np.ndarray], size: int | None = None) -> None:
-        """The inverse of `arrays`, of states of so many numbers, into a new one; errors as `rbpf.core.checkpoint.read`."""
+        """The inverse of `arrays`, into a new one, for states of `size` numbers; errors as of `rbpf.core.checkpoint.read`."""
         generations = read_one(arrays, "history/generations", integers("blocks", ascending=True)).tolist()
         shape = ("steps", "n") if self.clouds else (0,)
         block = {**_BLOCK, "log_weights": numbers(*shape, values="log")}

@@ -1,10 +1,9 @@
 """Likelihoods of an innovation, and the associations that maximise them.
 
-Each measurement is explained by a landmark within the gate, by a new landmark (only where nothing known is near), or by
-clutter; no landmark explains two. `associate` does so in every particle by itself, whose landmarks are independent;
-`associations` finds the most probable explanations of a whole frame by landmarks that are one Gaussian. Costs, Mathematics
-(association-cost), are negative log-densities in the measurement's units, so that the choice and the weight speak of the
-same thing.
+Each measurement is explained by a landmark within the gate, by a new landmark (only if no known one is near), or by
+clutter; no landmark explains two. `associate` solves this in every particle separately, where landmarks are independent;
+`associations` finds the most probable explanations of a whole frame by landmarks with one joint Gaussian. Costs,
+Mathematics (association-cost), are negative log-densities in the measurement's units, consistent with the weights.
 """
 
 from copy import copy
@@ -32,14 +31,14 @@ class Gaussian(Likelihood):
 
 @final
 class TruncatedMahalanobis(Likelihood):
-    """−½ min(T_l, νᵀS⁻¹ν), S05 (6); a null match costs T_l/2. It is no density: evidence is not defined.
+    """−½ min(T_l, νᵀS⁻¹ν), S05 (6); a null match costs T_l/2. It is not a density: evidence is not defined.
 
-    What T_l bounds is the weight. That a landmark is not updated by what is clipped does not follow, and S05 does not
-    say so: at 4.0 a quarter of the true measurements would be lost, those that contradict the particle's map.
+    T_l bounds the weight only. S05 does not say that clipped observations do not update the landmark: at 4.0 a quarter of
+    the true measurements would be lost, those that contradict the particle's map.
 
     Args:
         limit: T_l, dimensionless; the paper's is 4.0.
-        update_limit: νᵀS⁻¹ν beyond which an observation does not move the state or the landmark either; None is T_l.
+        update_limit: νᵀS⁻¹ν beyond which an observation updates neither the state nor the landmark; None is T_l.
     """
 
     normalised = False
@@ -67,14 +66,14 @@ class TruncatedMahalanobis(Likelihood):
         return 0.5 * (self.params[1] - squared_mahalanobis(nu, cov))
 
     def predicted_inlier(self, nu: np.ndarray, cov: np.ndarray, predictive: np.ndarray) -> np.ndarray:
-        """Within the limit for updates; for the look-ahead, as probable as an outlier."""
+        """Within the limit for updates; for the look-ahead, at least as probable as an outlier."""
         if self.kernel_id == 1:
             return self.inlier(nu, predictive)
         log_ratio = gaussian.log_det(gaussian.cholesky(predictive)) - gaussian.log_det(gaussian.cholesky(cov))
         return squared_mahalanobis(nu, predictive) + log_ratio <= self.params[0]
 
     def of_look_ahead(self) -> Likelihood:
-        """Whose inliers at the prediction are those that T_l does not bound, Mathematics (truncated-look-ahead)."""
+        """The likelihood with the inliers that T_l does not clip at the prediction, Mathematics (truncated-look-ahead)."""
         weighing = copy(self)
         weighing.kernel_id = 3
         return weighing
@@ -104,7 +103,7 @@ class GaussianWithOutliers(Likelihood):
         return np.logaddexp(gaussian.log_density(nu, cov) + self.params[0], self.params[1])
 
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """More probable as an inlier than as an outlier."""
+        """An observation that is more probable as an inlier than as an outlier."""
         return gaussian.log_density(nu, cov) + self.params[0] >= self.params[1]
 
     def log_odds(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -119,10 +118,10 @@ class GaussianWithOutliers(Likelihood):
 
 @final
 class StudentT(Likelihood):
-    """Multivariate t with the scale matrix S: a Gaussian whose covariance is uncertain, so that what is far off says less.
+    """Multivariate t with the scale matrix S: a Gaussian of uncertain covariance, so that large innovations have less effect.
 
-    In a joint map it is the measurement's noise that is so, and each observation updates by what is learnt of its own,
-    Mathematics (joint-tails). In maps of the particles' own it weighs, and the update is Kalman's with S.
+    In a joint map it models the measurement noise, and each observation's update uses its own learnt noise, Mathematics
+    (joint-tails). In per-particle maps it only weighs, and the update is Kalman's with S.
 
     Args:
         dof: degrees of freedom; infinitely many are a Gaussian.
@@ -146,27 +145,27 @@ def squared_mahalanobis(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
     return np.square(white).sum(axis=-1)
 
 
-#: Cost of an impossible pair: far above any log-density, and finite because the assignment solver wants numbers.
+#: Cost of an impossible pair: far above any log-density, yet finite as the assignment solver requires.
 _FORBIDDEN = 1e12
 
 
 @dataclass(frozen=True)
 class Gates:
-    """When a landmark may explain a measurement, and what the alternatives cost."""
+    """Gates of the association, and the costs of its alternatives."""
 
     accept: float  #: squared Mahalanobis distance up to which a landmark is a candidate.
-    isolate: float  #: distance beyond which a measurement may start a landmark; between the two it can only be clutter.
+    isolate: float  #: squared distance beyond which a measurement may start a landmark; between the two it is clutter.
     log_new: float  #: log-density of a new landmark's first measurement, in inverse measurement units.
     log_clutter: float  #: log-density of clutter.
 
 
 def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates) -> np.ndarray:
-    """Most probable explanation of K measurements among M landmarks, in each of N particles.
+    """Most probable association of K measurements with M landmarks, in each of N particles.
 
-    Innovations (N, K, M, p), their predicted covariances (N, K, M, p, p), the pose's included, and whether the particle holds
-    the landmark (N, M), give (N, K): index of a landmark, NEW or NULL.
+    Takes innovations (N, K, M, p), their predicted covariances (N, K, M, p, p) including the pose's, and whether a particle
+    holds a landmark (N, M); returns (N, K): index of a landmark, NEW or NULL.
     """
-    from scipy.optimize import linear_sum_assignment  # a third of the time that all imports take; seldom needed
+    from scipy.optimize import linear_sum_assignment  # slow to import, rarely needed
 
     chol = gaussian.cholesky(cov)
     squared = np.square(gaussian.solve_lower(chol, nu)).sum(axis=-1)
@@ -179,7 +178,7 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
     alternative = np.minimum(-alternative, 0.1 * _FORBIDDEN)
     if not cost.shape[2]:
         return fallback
-    # Independent minima where they do not collide, the Hungarian method where two measurements chose one landmark.
+    # Independent minima if they do not collide, else the Hungarian method.
     _, k, m = cost.shape
     best = cost.argmin(axis=2)
     chosen = np.where(np.take_along_axis(cost, best[..., None], axis=2)[..., 0] < alternative, best, fallback)
@@ -195,7 +194,7 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
 
 
 class Association(NamedTuple):
-    """An explanation of K measurements, and what is then expected of M landmarks."""
+    """An association of K measurements, and the predictions of M landmarks conditioned on it."""
 
     chosen: np.ndarray  #: (K,) index of a landmark, NEW or NULL.
     log_density: float  #: of all measurements.
@@ -203,26 +202,27 @@ class Association(NamedTuple):
     cov: np.ndarray  #: (M, p, p).
 
 
-WIDTH = 50  #: Explanations of the first measurements of a frame that are followed, at most.
+WIDTH = 50  #: Beam width: maximum number of partial associations that are kept.
 
 
 def associations(
     z: Array, noise: Array, mean: Array, cov: Array, gates: Gates, log_unit: Array, bound: float
 ) -> list[Association]:
-    """The most probable explanations of a frame, best first, Mathematics (association-search).
+    """The most probable associations of a frame, best first, Mathematics (association-search).
 
-    Searches the measurements one by one, those with the fewest candidates first. An explanation of some is a Kalman filter of
-    what is expected of the landmarks, by which the next one is judged: what fits together is found together (as the joint
-    compatibility of J. Neira and J. Tardós 2001), and exclusion and all densities are those of the joint Gaussian.
+    Beam search over the measurements, those with the fewest candidates first. Each partial association conditions the
+    landmarks' joint prediction by Kalman updates, which then scores the next measurement: jointly compatible matches are
+    found together (as in the joint compatibility of J. Neira and J. Tardós 2001), and exclusion and all densities are those
+    of the joint Gaussian.
 
     Args:
-        z: (K, p) measurements, linear in what is expected.
+        z: (K, p) measurements.
         noise: (K, p, p) their covariance.
-        mean: (M, p) what is expected of landmarks.
-        cov: (M p, M p) its covariance.
-        gates: as `associate` has them.
-        log_unit: (K,) log-size of the unit that the gates' densities are in, in units of z.
-        bound: log-ratio up to which an explanation is worth keeping beside the best one.
+        mean: (M, p) predicted measurements of the landmarks.
+        cov: (M p, M p) their joint covariance.
+        gates: as of `associate`.
+        log_unit: (K,) log-size of the gates' density unit, in units of z.
+        bound: log-ratio to the best association up to which others are kept.
     """
     (k, p), m = z.shape, len(mean)
     best_else = max(gates.log_new, gates.log_clutter)
@@ -234,7 +234,7 @@ def associations(
 
     alone = squared_mahalanobis(z[:, None] - mean.reshape(m, p), blocks()[0] + noise[:, None])
     for reading in np.argsort((alone <= gates.accept).sum(axis=1), kind="stable").tolist():
-        # A landmark within the gate that explains nothing yet, or none.
+        # Options: an unused landmark within the gate, or none.
         nu, own = z[reading] - mean.reshape(len(mean), m, p), blocks() + noise[reading]
         free = (squared_mahalanobis(nu, own) <= gates.accept) & ~(chosen[:, :, None] == each).any(axis=1)
         by_landmark = np.where(free, gaussian.log_density(nu, own), -np.inf)
@@ -253,8 +253,8 @@ def associations(
             gain = cross @ gaussian.inverse(own[parent, which])
             mean[took] += (gain @ nu[parent, which][..., None])[..., 0]
             cov[took] -= gain @ np.swapaxes(cross, 1, 2)
-    # What is explained by no landmark is new, but clutter where a landmark is as near as the measurement's own noise: that
-    # one is uncertain of its place is no reason to take another one for it.
+    # Unmatched measurements are new, or clutter if a landmark is as near as the measurement's own noise: a landmark's
+    # position uncertainty is no reason to add a second one beside it.
     for reading in np.flatnonzero((chosen == NULL).any(axis=0)).tolist():
         apart = squared_mahalanobis(z[reading] - mean.reshape(len(mean), m, p), noise[reading])
         near = apart.min(axis=1, initial=np.inf) <= gates.isolate
@@ -273,11 +273,11 @@ class ExistenceModel:
 
     hit: float = 1.0  #: added for each observation.
     miss: float = 0.5  #: subtracted where it should have been observed and was not.
-    limit: float = 5.0  #: log-odds are held within ± limit, so that no landmark becomes immortal.
-    drop: float = -1.5  #: a landmark below this leaves the particle.
+    limit: float = 5.0  #: log-odds are clipped to ± limit, so that any landmark can still be dropped.
+    drop: float = -1.5  #: a landmark below this is dropped from the particle.
 
     def updated(self, log_odds: np.ndarray, seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
-        """(N, M) log-odds after a frame; −inf where the landmark leaves the particle."""
+        """(N, M) log-odds after a frame; −inf where the landmark is dropped."""
         change = np.where(seen, self.hit, np.where(expected, -self.miss, 0.0))
         moved = np.clip(log_odds + change, -self.limit, self.limit)
         return np.where(np.isneginf(log_odds) | (moved < self.drop), -np.inf, moved)

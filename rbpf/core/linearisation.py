@@ -1,6 +1,6 @@
 """Observations linearised: Jacobians on the manifold, and the plain NumPy twins of the compiled drivers.
 
-Shapes: N particles, K observations, p rows, d increment, D landmark. `mask` (N, K): who took an observation; None is all.
+Shapes: N particles, K observations, p rows, d increment, D landmark. `mask` (N, K): who uses an observation; None is all.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array, LieGroup
 
 EVERYTHING = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
-#: Variance at which log|2πS| is zero: a row of it, with zero residual and Jacobian, says nothing.
+#: Variance at which log|2πS| is zero: a row with it and zero residual and Jacobian has no effect.
 _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 
 
@@ -26,9 +26,9 @@ def numeric_jacobians(
     substate: np.ndarray | None = None,
     by: frozenset[Part] = EVERYTHING,
 ) -> Jacobians:
-    """Central differences of −ν for z = h, in the right chart at the state; `model.residual` wraps.
+    """Central differences of −ν at z = h, in the right chart at the state; `model.residual` wraps angles.
 
-    Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
+    Only by the parts in `by`: each coordinate costs two predictions.
     """
     steps = np.array([STEP, -STEP])
     constrains = type(model).innovation is not ObservationModel.innovation
@@ -47,7 +47,7 @@ def numeric_jacobians(
         if z is not None:
             nu = model.innovation(z, moved_state, moved_landmark, const, moved_substate)
             difference = nu[1] - nu[0]
-        else:  # half as many residuals
+        else:  # saves half of the residuals
             difference = model.residual(*model.predict(moved_state, moved_landmark, const, moved_substate))
         blocks.append(np.moveaxis(difference, 0, -1) / (2 * STEP))
     return Jacobians(*blocks)
@@ -65,7 +65,7 @@ def linearise(
 ) -> tuple[np.ndarray, Jacobians]:
     """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), constants (N, K, A), substates (N, 1, m).
 
-    Numeric Jacobians by a part that `by` does not name are left out. Raises InputError: a result has the wrong shape.
+    Numeric Jacobians are computed only for the parts in `by`. Raises InputError: a result has the wrong shape.
     """
     nu = model.innovation(z, state, landmark, const, substate)
     name = type(model).__name__
@@ -81,7 +81,7 @@ def linearise(
     sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
     blocks: list[np.ndarray | None] = []
     for block, size in zip(jacobians, sizes, strict=True):
-        # A constant block may come without its leading axes.
+        # A constant block may lack the leading axes.
         try:
             if block is not None and block.dtype != np.float64:
                 block = numbers(block, f"{name}.jacobians")
@@ -104,8 +104,8 @@ def information(
 ) -> Information:
     """Information of independent observations with innovations ν (N, K, p), H (N, K, p, d), S (N, K, p, p).
 
-    An observation that the likelihood calls an outlier at the prediction, S + H Q Hᵀ, takes no part in the
-    refinement and enters by its outlier density.
+    Observations that the likelihood classifies as outliers at the prediction, S + H Q Hᵀ, are not used in the refinement
+    and contribute their outlier density.
     """
     n, k, p = nu.shape
     use, log_factor = mask, np.zeros(n)
@@ -128,7 +128,7 @@ def information(
 def gated(
     nu: Array, jac_state: Array, cov: Array, likelihood: Likelihood, prior: Prior, mask: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which particles take an observation as an inlier (N, K), and the log-density (N,) that this adds.
+    """Mask (N, K) of observations used as inliers, and the log-density (N,) of this choice.
 
     The gate is at the prediction: its covariance is S + H Q Hᵀ.
     """
@@ -165,8 +165,8 @@ def stacked(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of several observations that share a landmark or a substate as one observation per particle.
 
-    ν (N, p_j), J (N, p_j, c), R_j (p_j, p_j) → ν (N, Σp), J (N, Σp, c), R (N, Σp, Σp). A row that a particle did not take
-    says nothing there.
+    ν (N, p_j), J (N, p_j, c), R_j (p_j, p_j) → ν (N, Σp), J (N, Σp, c), R (N, Σp, Σp). A row that a particle does not use
+    has no effect there.
     """
     n = nus[0].shape[0]
     sizes = [nu.shape[1] for nu in nus]

@@ -1,4 +1,4 @@
-"""What is marginalised, besides a map: a Kalman-filtered substate, nothing (`StateOnly`), and several parts side by side."""
+"""Conditionals besides maps: a Kalman-filtered substate, nothing (`StateOnly`), and several parts side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ Moves = Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 @final
 class StateOnly(Conditional):
-    """Observations that read the sampled state and nothing else, as a position fix: S = R, and nothing is stored.
+    """Observations of the sampled state alone, such as a position fix: S = R, and nothing is stored.
 
     Raw data are functions of the states (N, E) that give log-likelihoods (N,), see `LikelihoodSensor`.
     """
@@ -45,7 +45,7 @@ class StateOnly(Conditional):
         self._ahead = not prior.factor.shape[2]
         for group in groups:
             if group.data is not None:
-                # Where nothing is left to sample the states are final, and the look-ahead knows the weight.
+                # Without noise to sample the states are final, and the look-ahead weight is exact.
                 if self._ahead:
                     total.log_factor += log_likelihoods(group, state)
                 continue
@@ -62,7 +62,7 @@ class StateOnly(Conditional):
                 raw += log_likelihoods(group, state)
                 continue
             name = type(group.model).__name__
-            nu = numbers(group.model.innovation(group.z, state[:, None, :]), f"what {name} predicts")
+            nu = numbers(group.model.innovation(group.z, state[:, None, :]), f"the prediction of {name}")
             if len(nu) == 1:  # the same for all states
                 nu = np.repeat(nu, state.shape[0], axis=0)
             if nu.shape != (state.shape[0], *group.z.shape):
@@ -90,14 +90,14 @@ class StateOnly(Conditional):
 
 
 def log_likelihoods(group: Observations, state: np.ndarray) -> np.ndarray:
-    """(N,) of raw data about the states (N, E). Raises InputError: not one number each, or NaN."""
+    """(N,) of raw data given states (N, E). Raises InputError: there is not one number each, or one is NaN."""
     found = numbers(np.asarray(group.data(state)), "a log-likelihood of the states")  # type: ignore[operator]
     if found.shape != state.shape[:1]:
         raise InputError(f"a log-likelihood of states must be {state.shape[:1]}, got {found.shape}")
     return found
 
 
-#: Of a sum of few terms, as a standard deviation: a few times the root of the last digit.
+#: Rounding error of a sum of few terms, as a standard deviation: a few times the root of the last digit.
 ROUNDING = 8.0 * np.sqrt(np.finfo(float).eps)
 
 
@@ -105,16 +105,16 @@ ROUNDING = 8.0 * np.sqrt(np.finfo(float).eps)
 class KalmanSubstate(checkpoint.Kept, Conditional):
     """A linear substate s ~ N(ŝ, P) in every particle, given the sampled states.
 
-    The motion model says how it drives the increment and how it moves (`Transition`): the increment is then itself a
-    measurement of it, and is conditioned on exactly. Observations may read it, with the state but not with a landmark.
+    The motion model defines how it drives the increment and how it evolves (`Transition`): the increment is then a
+    measurement of it, used exactly. Observations may read it together with the state, but not with a landmark.
 
     Args:
         space: the group of the sampled state.
         mean: (m,) initial mean.
         cov: (m, m) initial covariance, may be singular.
-        part: its name; another one than Part.SUBSTATE where it stands beside a second substate.
-        moves: how it moves where the motion model does not drive it, as a sensor's bias: seconds → A (m, m), b (m,) and
-            the noise's factor (m, r).
+        part: its name, for a second substate another one than Part.SUBSTATE.
+        moves: its own dynamics if the motion model does not drive it, such as a sensor's bias: seconds → A (m, m), b (m,)
+            and the noise factor (m, r).
 
     Attributes:
         mean: (N, m) of each particle.
@@ -142,7 +142,7 @@ class KalmanSubstate(checkpoint.Kept, Conditional):
         self.cov = self._cov[None]
 
     def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior | None:
-        """Joint distribution of (ε, s_t), Mathematics (joint-substate), kept as s_t | ε; what moves by itself knows no ε."""
+        """Joint distribution of (ε, s_t), Mathematics (joint-substate), stored as s_t | ε; own dynamics know no ε."""
         if self.moves is not None:
             dynamics, drift, factor = self.moves(dt)
             self._increment_mean = np.zeros((1, space.dim))
@@ -245,15 +245,15 @@ class KalmanSubstate(checkpoint.Kept, Conditional):
 
 
 def _split(joint: Array, d: int) -> tuple[Array, Array, Array]:
-    """Of the joint covariance (…, d + m, d + m) of (ε, s): a factor of that of ε, and s | ε by its gain and covariance."""
+    """From the joint covariance (…, d + m, d + m) of (ε, s): a factor of cov ε, and gain and covariance of s | ε."""
     of_increment, m = joint[:, :d, :d], joint.shape[-1] - d
     factor = gaussian.psd_factor(gaussian.symmetrise(of_increment))
     gain = joint[:, d:, :d] @ np.linalg.pinv(of_increment, hermitian=True)
-    # In a form that rounding cannot make indefinite.
+    # The closed form stays positive semi-definite under rounding.
     closed = np.concatenate([-gain, np.broadcast_to(np.eye(m), (len(joint), m, m))], axis=2)
     rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
-    # What an increment tells exactly leaves the rounding of what cancels, which the next inverse would take for knowledge.
-    # It is small beside the terms that cancel, of each number in its own unit.
+    # If the increment determines a component exactly, cancellation leaves rounding errors, which the next inverse would
+    # treat as information. They are small relative to the cancelling terms, in each component's unit.
     terms = np.abs(closed) @ np.sqrt(np.diagonal(joint, axis1=1, axis2=2))[..., None]
     scale = np.where(terms > 0.0, ROUNDING * terms, 1.0)
     values, vectors = np.linalg.eigh(rest / scale / np.swapaxes(scale, -1, -2))
@@ -265,7 +265,7 @@ def _split(joint: Array, d: int) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=64)
 def _kept_parts(joint: bytes, d: int, m: int) -> tuple[Array, Array, Array]:
-    # Where time steps are alike the recursion comes to rest, in every bit.
+    # With equal time steps the recursion becomes stationary, bit by bit.
     return _split(np.frombuffer(joint).reshape(1, d + m, d + m), d)
 
 
@@ -297,7 +297,7 @@ class Marginals(Conditional):
             part.begin(n, lineage)
 
     def predict(self, transition: Transition, space: LieGroup, dt: float) -> Prior:
-        """Tells every part that time goes on; the increment is distributed as the transition or one of the parts says."""
+        """Predicts every part; the increment is distributed by the transition, or by the part that drives the motion."""
         found: Prior | None = None
         for name, part in self.parts.items():
             prior = part.predict(transition, space, dt)
@@ -311,7 +311,7 @@ class Marginals(Conditional):
         return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
 
     def decided(self, groups: Sequence[Observations], belief: Belief) -> list[Observations]:
-        """By the part that each group goes to, in the groups' order."""
+        """Each group by the part that it belongs to, in the groups' order."""
         found = dict[int, Observations]()
         for supplies, routed in self._routed(groups).items():
             found |= zip(map(id, routed), self.parts[supplies].decided(routed, belief), strict=True)
@@ -326,8 +326,8 @@ class Marginals(Conditional):
         return total
 
     def linearised(self, prior: Prior, groups: Sequence[Observations]) -> LineariseAt:
-        """What the observations say about the state, to be linearised wherever a proposal asks."""
-        # What may move the state weighs it, too, unless a likelihood says otherwise.
+        """The observations' information about the state, as a function of the linearisation point."""
+        # Inliers for the update are also those of the look-ahead weight, unless a likelihood overrides `of_look_ahead`.
         ahead = [group.likelihood and group.likelihood.of_look_ahead() for group in groups]
         is_other = any(likelihood is not group.likelihood for likelihood, group in zip(ahead, groups, strict=True))
 
@@ -359,14 +359,14 @@ class Marginals(Conditional):
         return next((mean for part in self.parts.values() if (mean := part.driving()) is not None), None)
 
     def consolidate(self, particles: Particles) -> Particles:
-        """By the one part that there is: Gaussians apart from one another lack the correlation that the particles show."""
+        """Of the only part: separate Gaussians could not hold the correlation between parts that the particles represent."""
         parts = [part for part in self.parts.values() if not isinstance(part, StateOnly)]
         if len(parts) != 1:
-            raise InputError(f"consolidation makes one Gaussian: give the filter one conditional, not {len(parts)}")
+            raise InputError(f"consolidation needs one Gaussian: give the filter one conditional, not {len(parts)}")
         return parts[0].consolidate(particles)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """By their names; those of a part with a name of its own come under that name."""
+        """By name; arrays of a part with a name of its own have that name as prefix."""
         parts = self.parts.items()
         return {prefix(of) + name: array for of, part in parts for name, array in part.arrays().items()}
 
@@ -384,7 +384,7 @@ class Marginals(Conditional):
         for group in groups:
             holder = self._holder_of(group)
             if group.data is not None and not holder.takes_raw:
-                raise InputError(f"{type(holder).__name__} takes no raw data, but rows with an observation model")
+                raise InputError(f"{type(holder).__name__} takes no raw data, only rows with an observation model")
             routed[holder.supplies].append(group)
         return routed
 
@@ -404,12 +404,12 @@ class Marginals(Conditional):
 
 
 def prefix(part: Part) -> str:
-    """What stands before the names of a part's arrays in a checkpoint: nothing for those that every filter may have."""
+    """Prefix of a part's arrays in a checkpoint: empty for the three standard parts."""
     return "" if part in EVERYTHING else f"{part}/"
 
 
 def _all_outliers(groups: Sequence[Observations], like: Information) -> Information | None:
-    """All measurements as outliers, where the likelihoods allow it."""
+    """The information if all measurements are outliers, or None if a likelihood has no outliers."""
     weigh = [group for group in groups if Part.STATE in group.updates]
     if any(group.likelihood is None or group.likelihood.kernel_id != 3 for group in weigh):
         return None

@@ -1,7 +1,7 @@
-"""The weighted particles, and the Gaussian that the increment of each is drawn from.
+"""The weighted particles, and the Gaussian from which each particle's increment is drawn.
 
 A particle's state moves by an increment ε in the right chart at the motion model's mean. `Prior` is its distribution before
-the observations, `Information` what they say about it, `Proposed` the Gaussian that it is sampled from. The arithmetic of
+the observations, `Information` that of the observations, `Proposed` the Gaussian it is sampled from. The arithmetic of
 log-weights is that of S05 (8)–(12).
 """
 
@@ -19,7 +19,7 @@ from rbpf.lie import LieGroup
 
 #: Fields of `Information` that add up over independent observations.
 SUMMED = "info", "vector", "quad", "log_det", "log_factor", "rows"
-ROUNDING = 1e-15  #: Fraction of the largest variance of a sum that others must exceed.
+ROUNDING = 1e-15  #: Variances below this fraction of the largest are rounding errors.
 NOTHING_MOVED = 1e-12  #: χ² below which weights differ by rounding alone.
 
 
@@ -45,10 +45,10 @@ def uniform_log_weights(n: int) -> np.ndarray:
 
 
 def reweight(log_weights: np.ndarray, log_factors: np.ndarray, what: str) -> tuple[np.ndarray, float]:
-    """Normalised log-weights times factors (N or 1,), and log Σ W·factor; InputError: one is NaN or +∞, or all are zero."""
+    """Normalised log-weights times factors (N or 1,), and log Σ W·factor. Raises InputError: NaN, +∞ or all zero."""
     if log_factors.size == 1 and math.isfinite(log_factors[0]):
         return log_weights, float(log_factors[0])
-    with np.errstate(invalid="ignore"):  # from a weight of zero times an infinite factor, which is refused
+    with np.errstate(invalid="ignore"):  # a weight of zero times an infinite factor, refused below
         joint = log_weights + log_factors
     high = joint.max()
     if not math.isfinite(high):
@@ -67,12 +67,12 @@ def effective_sample_size(weights: np.ndarray) -> float:
 
 
 def weighted_mean(values: Float[np.ndarray, "N k"], weights: Float[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
-    """Σ W values (k,), row by row: BLAS would add up in another order on another number of threads."""
+    """Σ W values (k,), summed row by row: the summation order of BLAS depends on the number of threads."""
     return np.asarray((weights[:, None] * values).sum(axis=0))
 
 
 def take(array: np.ndarray, ancestors: np.ndarray | slice) -> np.ndarray:
-    """Rows of the ancestors; an array shared by all particles (first axis 1) stays as it is."""
+    """Rows of the ancestors; an array shared by all particles (first axis 1) is returned unchanged."""
     if array.shape[0] == 1:
         return array
     return array[ancestors] if isinstance(ancestors, slice) else array.take(ancestors, axis=0)
@@ -109,14 +109,14 @@ class Prior:
         return out
 
     def spread(self, increment: Float[np.ndarray, "#N d"]) -> Float[np.ndarray, "#N d r"]:
-        """The factor (N, d, r) in the charts at the states at increments (N or 1, d), to first order."""
+        """The noise factor (N, d, r), to first order, in the charts at the states with increments (N or 1, d)."""
         if self.centred:
             return self.factor
         return self._spread if increment is self.mean else self.space.right_jacobian(increment) @ self.factor
 
     @cached_property
     def _predicted(self) -> np.ndarray:
-        """Needed several times in a step, as is `_spread`."""
+        """Cached, as is `_spread`: used several times in a step."""
         return self.base if self.centred else self.at(self.mean)
 
     @cached_property
@@ -130,7 +130,7 @@ class Prior:
 
 @dataclass
 class Information:
-    """What the observations say about ε − μ, in information form; sums over independent observations add."""
+    """Information of the observations about ε − μ; independent observations add up."""
 
     info: Float[np.ndarray, "N d d"]  #: (N, d, d) Σ HᵀS⁻¹H.
     vector: Float[np.ndarray, "N d"]  #: (N, d) Σ HᵀS⁻¹ν.
@@ -138,9 +138,9 @@ class Information:
     log_det: Float[np.ndarray, " N"]  #: (N,) Σ log|2πS|.
     #: (N,) log-densities that do not depend on the increment: clutter, new landmarks.
     log_factor: Float[np.ndarray, " N"]
-    #: (N,) number of scalar measurements that took part in the sums, gated and unassociated ones left out.
+    #: (N,) number of scalar measurements in the sums, without gated and unassociated ones.
     rows: Float[np.ndarray, " N"]
-    #: the same with other choices of outliers, which bound the look-ahead weight from below.
+    #: the same for other choices of outliers; their weights are lower bounds of the look-ahead weight.
     otherwise: "tuple[Information, ...]" = ()
 
     @classmethod
@@ -156,7 +156,7 @@ class Information:
     def charted(self, jacobian: Float[np.ndarray, "#N d d"], offset: Float[np.ndarray, "#N d"]) -> "Information":
         """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d).
 
-        It is then relative to a point `offset` (N, d) before the one linearised at: ν + H·offset.
+        It is relative to the linearisation point minus `offset` (N, d): ν + H·offset.
         """
         info, vector, quad = (np.array(each, order="C") for each in (self.info, self.vector, self.quad))
         chart(np.ascontiguousarray(jacobian), np.ascontiguousarray(offset), info, vector, quad)
@@ -171,9 +171,9 @@ class Proposed:
     mean: Float[np.ndarray, "#N r"]  #: (N, r) of u.
     root: Float[np.ndarray, "#N r r"]  #: (N or 1, r, r) upper triangular; the covariance of u is root rootᵀ.
     log_w1: Float[np.ndarray, " #N"]  #: (N or 1,) look-ahead weight.
-    #: (N,) squared Mahalanobis distance of the joint innovation, None where nothing was linearised.
+    #: (N,) squared Mahalanobis distance of the joint innovation, None without linearisation.
     nis: Float[np.ndarray, " N"] | None = None
-    #: (N,) number of scalar measurements behind it, those that took part in each particle.
+    #: (N,) number of scalar measurements used in each particle.
     rows: Float[np.ndarray, " N"] | None = None
 
     @cached_property
@@ -181,7 +181,7 @@ class Proposed:
         return len(self.root) == 1 and not self.mean.any() and np.array_equal(self.root[0], np.eye(self.root.shape[2]))
 
     def take(self, ancestors: Int[np.ndarray, " N"]) -> "Proposed":
-        """What descendants are sampled from, that of their parents, with the weight of these."""
+        """The Gaussians and weights of the descendants' parents."""
         if len(self.root) == len(self.mean) == len(self.log_w1) == 1:
             return self
         return Proposed(take(self.mean, ancestors), take(self.root, ancestors), take(self.log_w1, ancestors))
@@ -194,7 +194,7 @@ class Proposed:
     ) -> tuple[Float[np.ndarray, "M r"], Float[np.ndarray, " #M"]]:
         """One u for each of n particles (n, r), and log p(u) − log q(u) (n or 1,).
 
-        `balanced` by their weights and by what they differ by already, where that is given.
+        `balance` has the arguments weights and apart of `balanced`; None for independent draws.
         """
         noise = rng.standard_normal((n, self.mean.shape[1]))
         if balance is not None:
@@ -202,7 +202,7 @@ class Proposed:
         if self._is_prior:
             return noise, np.zeros(1)
         u = self.mean + np.einsum("nab,nb->na", self.root, noise)
-        # Field by field: NumPy takes twice as long to add up many short rows.
+        # Summed by columns: NumPy takes twice as long to sum many short rows.
         roots = np.ascontiguousarray(np.diagonal(self.root, axis1=1, axis2=2).T)
         squares = np.ascontiguousarray((noise * noise - u * u).T)
         return u, 0.5 * squares.sum(axis=0) + np.log(roots).sum(axis=0)
@@ -211,19 +211,19 @@ class Proposed:
 def balanced(
     noise: Float[np.ndarray, "N r"], weights: Float[np.ndarray, " N"], apart: Float[np.ndarray, "N d"]
 ) -> Float[np.ndarray, "N r"]:
-    """Standard normal draws (N, r) with exactly the moments that independent draws `noise` have on average.
+    """Transforms draws `noise` to have exactly the moments that independent draws have on average.
 
-    Their weighted mean is 0, their weighted covariance (1 − ΣW²) I, and they are uncorrelated with what the particles
-    differ by already, `apart` (N, d). So the moments of a sample are those of its Gaussian, and who goes on from the moments
-    does not take over the chance of the draws (second-order exact sampling, D. Pham 2001). Where there are too few particles
-    the draws stay as they are.
+    Their weighted mean is 0, their weighted covariance (1 − ΣW²) I, and they are uncorrelated with the particles' existing
+    differences `apart` (N, d). So the sample has the moments of its Gaussian, and a filter that continues from the moments
+    has no Monte Carlo error in them (second-order exact sampling, D. Pham 2001). With too few particles the draws are
+    returned unchanged.
     """
     left = 1.0 - float(np.square(weights).sum())
     if left * effective_sample_size(weights) <= 2.0 * noise.shape[1] + apart.shape[1] + 1.0:
         return noise if left > 0.0 else np.zeros_like(noise)
     column = weights[:, None]
     noise, apart = noise - weighted_mean(noise, weights), apart - weighted_mean(apart, weights)
-    # What is apart by rounding alone, against its largest spread, is not taken out.
+    # Directions whose spread is only rounding errors are ignored.
     values, vectors = np.linalg.eigh((column * apart).T @ apart)
     spread = values > ROUNDING * values[-1:]
     root = vectors[:, spread] / np.sqrt(values[spread])
@@ -242,9 +242,9 @@ class SecondWeight:
 
     @cached_property
     def trust(self) -> float:
-        """Fraction χ² / (χ² + Σ W²), of which χ² = Σ W²/V − 1 is how far w₂ moved the weights from V to W.
+        """Fraction χ² / (χ² + Σ W²), where χ² = Σ W²/V − 1 measures the change of the weights by w₂ from V to W.
 
-        No mean moves by more than √χ² standard deviations by w₂, and that of the samples errs by √(Σ W²) of them.
+        w₂ shifts a mean by at most √χ² standard deviations; the sampling error of a mean is √(Σ W²) of them.
         """
         held = np.isfinite(self.log_after)
         after, before = self.log_after[held], self.log_before[held]
@@ -265,10 +265,10 @@ class Estimate:
 def mixture_estimate(
     prior: Prior, proposed: Proposed | None, log_weights: Float[np.ndarray, " N"], second: SecondWeight | None = None
 ) -> Estimate:
-    """Summary of the refined mixture before sampling, or of the prior's states where nothing was proposed.
+    """Summary of the refined mixture before sampling, or of the prior's states without a proposal.
 
-    The covariance within a particle at δ in the chart of the mean is carried there by J_r⁻¹(δ), to first order.
-    With a second weight, the fraction `SecondWeight.trust` of the mixture is what was sampled, with its final weights.
+    The covariance within a particle at δ in the chart of the mean is transformed by J_r⁻¹(δ), to first order.
+    With a second weight, the samples with final weights enter with the fraction `SecondWeight.trust`.
     """
     weights, factor, centres = np.exp(log_weights), prior.factor, prior.predicted()
     if proposed is not None:

@@ -26,13 +26,13 @@ class PriorProposal(Proposal):
     """The bootstrap filter's: q is the motion model, w₁ = 1, w₂ = p(z | x) (S05 §II-A)."""
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
-        return _as_before(prior.factor.shape[2])
+        return _unrefined(prior.factor.shape[2])
 
 
 @lru_cache
-def _as_before(rank: int) -> Proposed:
+def _unrefined(rank: int) -> Proposed:
     held = np.zeros((1, rank)), np.eye(rank)[None], np.zeros(1)
-    for array in held:  # one for all filters
+    for array in held:  # shared by all filters
         array.flags.writeable = False
     return Proposed(*held)
 
@@ -45,14 +45,14 @@ class EkfProposal(Ranged, Proposal):
     Raises InputError: there is not at least one iteration, or `settled` is negative.
     """
 
-    #: Whether a particle is corrected by the importance ratio at its sample; False is E06's weight, the linearised marginal.
+    #: Whether weights include the exact importance ratio at the sample; False is E06's weight, the linearised marginal.
     exact: bool = True
-    #: Linearisations at most; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
+    #: Maximum linearisations; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
     iterations: Count = 1
-    #: (d,) increment in each particle's chart at which the first linearisation is, where more is known than the prior says;
-    #: None is the prior's mean.
+    #: (d,) increment in each particle's chart at which to linearise first, if better known than by the prior; None is the
+    #: prior's mean.
     start: np.ndarray | None = None
-    #: No further linearisation is made when the last one moved no particle's mean by so many of its standard deviations.
+    #: Iteration ends once no particle's mean moves by more than this, in its standard deviations.
     settled: NotNegative = 0.0
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
@@ -70,10 +70,10 @@ class EkfProposal(Ranged, Proposal):
 
 
 def refined(prior: Prior, information: Information) -> Proposed:
-    """The refined Gaussian and the joint marginal weight of each particle, the largest for any choice of outliers."""
+    """The refined Gaussian and the joint marginal weight of each particle, maximised over the choices of outliers."""
     n, rank = len(information.quad), prior.factor.shape[2]
     mean, root, squared, log_det = np.empty((n, rank)), np.empty((n, rank, rank)), np.empty(n), np.empty(n)
-    # With M = C Cᵀ the covariance of u is C⁻ᵀC⁻¹, and its mean C⁻ᵀ of C⁻¹Lᵀη. What a model spoils makes the weight NaN.
+    # With M = C Cᵀ the covariance of u is C⁻ᵀC⁻¹, and its mean C⁻ᵀ of C⁻¹Lᵀη. Invalid values of a model make the weight NaN.
     given = (numbers(each, "information") for each in (information.info, information.vector, prior.factor))
     run_driver(refine, n * rank, -(-n // BLOCK), *given, mean, root, squared, log_det)
     nis = information.quad - squared

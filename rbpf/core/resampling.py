@@ -1,6 +1,6 @@
 """Resampling: four unbiased schemes, and a wrapper that resamples only when the weights have degenerated.
 
-R. Douc, O. Cappé, E. Moulines 2005. Ancestors come in ascending order, so that what is gathered by them is read forwards.
+R. Douc, O. Cappé, E. Moulines 2005. Ancestors are ascending, so that gathering by them reads memory forwards.
 """
 
 from dataclasses import dataclass, field
@@ -14,11 +14,11 @@ from rbpf.core.particles import effective_sample_size
 from rbpf.kernels.dense import comb
 from rbpf.ranges import Count, Fraction, Ranged
 
-_ROUNDING = 1e-12  #: Relative error within which weights count as equal, and N W as whole.
+_ROUNDING = 1e-12  #: Relative tolerance for equal weights and for integer N W.
 
 
 def _inverse_cdf(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Index of the weight that each point of [0, 1), ascending, falls on; never one of weight zero."""
+    """Index of the weight in whose interval each of the ascending points in [0, 1) falls; never one of weight zero."""
     cdf = np.cumsum(weights)
     last = int(np.flatnonzero(weights)[-1])
     return np.minimum(np.searchsorted(cdf / cdf[-1], points, side="right"), last)
@@ -26,7 +26,7 @@ def _inverse_cdf(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @final
 class Systematic(Resampler):
-    """One uniform number, a comb of N teeth."""
+    """One uniform number for N equidistant points."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         ancestors = np.empty(weights.size, dtype=np.int64)
@@ -69,14 +69,14 @@ class Residual(Resampler):
 @final
 @dataclass(frozen=True, eq=False)
 class EssTriggered(Ranged, Resampler):
-    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step.
+    """Resamples when the effective sample size falls below a fraction of N; else the weights carry over to the next step.
 
     Raises InputError: the threshold does not lie in [0, 1].
     """
 
-    #: How to resample.
+    #: The resampling scheme.
     scheme: Resampler
-    #: Fraction of N in [0, 1]; 0 never resamples, 1 does whenever the weights differ.
+    #: Fraction of N in [0, 1]; 0 never resamples, 1 whenever the weights differ.
     threshold: Fraction = 0.5
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -88,19 +88,19 @@ class EssTriggered(Ranged, Resampler):
 @final
 @dataclass(frozen=True)
 class Consolidation(Ranged):
-    """When what the particles differ by is taken into what is marginalised, in place of resampling.
+    """When the spread of the particles is merged into the marginalised Gaussian, instead of resampling.
 
     Raises InputError: the window is shorter than a step, or the threshold does not lie in [0, 1].
     """
 
-    #: Steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
+    #: Maximum steps between consolidations; weights degenerate within a sampled window of dozens of steps.
     window: Count = 5
-    #: Fraction of N below which the effective sample size calls for it earlier.
+    #: Fraction of N below which the effective sample size triggers it earlier.
     threshold: Fraction = 0.5
-    #: Whether it waits: while it is not known where the robot is, its frame must not move there.
+    #: Whether it is suspended: the map's frame must not move to the robot while its pose is unknown.
     held: bool = field(default=False, repr=False)
 
     def is_due(self, age: int, weights: np.ndarray) -> bool:
-        """After `age` steps, with weights (N,)."""
+        """Whether to consolidate, `age` steps after the last time, with weights (N,)."""
         enough = self.threshold * weights.size * (1.0 - _ROUNDING)
         return not self.held and (age >= self.window or effective_sample_size(weights) < enough)

@@ -1,4 +1,4 @@
-"""Smoothed trajectories: along ancestors, with a fixed lag, and by backward simulation where there is no map."""
+"""Smoothed trajectories: along ancestors, with a fixed lag, and by backward simulation for models without a map."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ class Smoothed:
 
 
 def ancestral_smoothing(space: LieGroup, history: History, weights: np.ndarray) -> Smoothed:
-    """p(x_t | z_1:T) from the ancestors of the present particles, of weights (N,); a lag of the history makes it fixed-lag."""
+    """p(x_t | z_1:T) from the ancestors of the current particles with weights (N,); fixed-lag if the history has a lag."""
     return _summary(space, history.stamps_ns, history.paths(), weights)
 
 
@@ -31,19 +31,19 @@ def backward_simulation(
     """p(x_t | z_1:T) from `count` trajectories drawn backwards through stored clouds.
 
     S. Godsill, A. Doucet, M. West, "Monte Carlo smoothing for nonlinear time series" (2004). For models without a
-    marginalised part: with a map the backward weight would need every landmark's future information.
+    marginalised part: with a map the backward weight would depend on all future observations of every landmark.
 
     Args:
-        motion: the filter's; its noise must be regular.
+        motion: the filter's motion model; its noise covariance must be regular.
         history: made with clouds=True and without a lag.
-        count: trajectories.
+        count: number of trajectories.
         rng: source of randomness.
-        controls: control of each step; entry t moved the state from t−1 to t.
+        controls: control of each step; entry t leads from t−1 to t.
 
     Raises InputError: the history holds no clouds, or the motion has a substate or singular noise.
     """
     if not history.clouds or history.lag is not None:
-        raise InputError("backward simulation needs whole clouds: build the filter with clouds=True and no lag")
+        raise InputError("backward simulation needs stored clouds: build the filter with clouds=True and no lag")
     clouds = [states for block in history.blocks for states in block.states]
     log_weights = [weights for block in history.blocks for weights in block.log_weights]
     stamps = history.stamps_ns
@@ -57,7 +57,7 @@ def backward_simulation(
 
 
 def _transition_log_density(motion: MotionModel, before: Array, after: Array, control: object, dt: float) -> Array:
-    """Log p(after_j | before_i) up to what does not depend on i, (J, N): Mathematics (backward)."""
+    """Log p(after_j | before_i) up to terms independent of i, (J, N): Mathematics (backward)."""
     density = motion.log_density(before, after, control, dt)
     if density is not None:
         return density

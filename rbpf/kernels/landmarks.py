@@ -235,9 +235,9 @@ def _add_between(weights, offset, mean, cov):
 def project(fused, records, mode, weights, factor, sizes, mean, cov):
     """Fills `mean` (K, p) and `cov` (K, p, p) = within + between particles.
 
-    What particle `mode` expects of a landmark is what all are compared with, so that angles need not be wrapped: a kernel's
-    residual of it, with the sign reversed, is how far off a particle expects the landmark. Within is J P Jᵀ + H L (H L)ᵀ,
-    with the `factor` L (N or 1, d, r) of the state. Other arguments as in `refine`.
+    Predictions are relative to that of particle `mode`, so that angles need not be wrapped: the negative residual of that
+    prediction is a particle's difference from it. Within is J P Jᵀ + H L (H L)ᵀ, with the `factor` L (N or 1, d, r) of the
+    state. Other arguments as in `refine`.
     """
     address, params, state = fused
     pool, slabs, which, maps = records

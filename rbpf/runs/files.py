@@ -1,4 +1,4 @@
-"""Files that a run leaves: whole or not there at all; tables, maps and summaries."""
+"""Writes a run's files atomically; tables, maps and summaries."""
 
 import csv
 import errno
@@ -16,13 +16,13 @@ from rbpf.errors import InputError
 
 CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajectory.npz", "map.npz"
 POSTERIOR, GRID = "posterior.npz", "grid.npz"
-LOCK = ".lock"  #: In a run's folder while somebody writes there; with the number of that process.
+LOCK = ".lock"  #: Lock file in a run's folder while a process writes there; holds its id.
 VERSION = 1  #: Of trajectory.npz.
-OnDone = Callable[[int, int], None]  #: Called with how many parts of some work are done, and of how many.
+OnDone = Callable[[int, int], None]  #: Called with the number of parts done, and their total.
 
 
 def prepare_folder(out: Path, what: str = "results") -> None:
-    """Makes a folder for `what`, the word of it in messages.
+    """Makes a folder; `what` names its purpose in messages.
 
     Raises InputError: there is a file of that name, or the folder cannot be made.
     """
@@ -40,7 +40,7 @@ def holds_run(out: Path) -> bool:
 
 
 def numbered(out: Path, last: bool = False) -> Path:
-    """The first of `run`, `run-2`, `run-3`, … that holds no run; with `last` the one before it, if there is one."""
+    """The first of `run`, `run-2`, `run-3`, … without a run; with `last` the last one with a run, if any."""
     before = out
     for number in count(2):
         place = out if number == 2 else out.with_name(f"{out.name}-{number - 1}")
@@ -52,11 +52,11 @@ def numbered(out: Path, last: bool = False) -> Path:
 
 @contextmanager
 def own_folder(out: Path) -> Iterator[None]:
-    """A run's folder, made where it does not exist, in which nobody else writes meanwhile.
+    """Creates and locks a run's folder, so that no other process writes there.
 
-    A folder that is made here and in which nothing stays is removed again. The lock is the system's, so that a process that
-    was killed holds none; where the file system knows no locks there is none. Raises InputError: it cannot be made or written
-    to, or another process writes there.
+    A folder created here and left empty is removed again. It is a lock of the operating system, so that a killed process
+    holds none; file systems without locks are not locked. Raises InputError: the folder cannot be made or written to, or
+    another process writes there.
     """
     missing = [place for place in (out, *out.parents) if not place.exists()]
     prepare_folder(out)
@@ -75,7 +75,7 @@ def own_folder(out: Path) -> Iterator[None]:
 
 
 def _locked(path: Path) -> int:
-    """The descriptor of a file that this process holds the lock of."""
+    """Descriptor of a file locked by this process."""
     while True:
         try:
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
@@ -93,7 +93,7 @@ def _locked(path: Path) -> int:
             if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
                 os.close(file)
                 raise InputError(f"{path.parent} cannot be locked: {error.strerror}") from error
-        # Whoever held it before may have removed it meanwhile: then another one can make a new file of this name.
+        # The previous owner may have removed it meanwhile, so that another process can create a new file of this name.
         with suppress(OSError):
             if os.path.samestat(os.fstat(file), os.stat(path, follow_symlinks=False)):
                 os.ftruncate(file, 0)
@@ -103,7 +103,7 @@ def _locked(path: Path) -> int:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a whole file or none."""
+    """Writes a text file atomically."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""Everything that a run leaves in its folder; which files there are, and what stands in them, docs/run_folder.md says."""
+"""Writes a run's folder; its files and their contents are described in docs/run_folder.md."""
 
 import json
 import math
@@ -26,17 +26,17 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 
-#: Bytes of grid.pgm: where something is, where beams have passed, where nothing is known.
+#: Bytes of grid.pgm: occupied, free, unknown.
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-#: A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth.
+#: Extent of a path, relative to the landmarks' distance, below which depth is hardly observable.
 STILL = 0.01
-#: Features are in the image, not in the world, that stay within so many px in so many frames, over which others move so far
-#: and the camera, by its own account, stands still or turns as far; fewer of them do no harm.
+#: Test for dirt on the lens: features that stay within this many px over this many frames, in which others move this far,
+#: while the estimated camera stands still or rotates as far; and the least number of them.
 STAY_PX, FRAMES, MOVE_PX, FEATURES = 1.5, 30, 5.0, 5
 
 
 def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:
-    """Writes all data files of a run, and returns the entries of summary.json; for config.yaml `sources` says what was read.
+    """Writes all data files of a run, and returns the entries of summary.json; `sources` are the inputs for config.yaml.
 
     Raises InputError: the folder cannot be written to, or the disk is full.
     """
@@ -74,7 +74,7 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
 
 
 def summarise(run: Run) -> dict[str, Any]:
-    """The entries of summary.json that need no comparison."""
+    """The entries of summary.json that need no reference."""
     log, config = run.log, run.system.config
     evidence, (median, p95) = log["log_evidence"], np.percentile(1e3 * log["seconds"], [50, 95]).round(3).tolist()
     linearised = np.isfinite(log["nis"]) & (log["nis_dof"] > 0)
@@ -99,7 +99,7 @@ def summarise(run: Run) -> dict[str, Any]:
 
 
 def remarks(run: Run) -> list[str]:
-    """Sentences that come before all figures of a run: nothing was measured, nothing moved, or what was seen is no world."""
+    """Warnings before all figures of a run: nothing measured, no motion, or features fixed in the image."""
     log, landmarks = run.log, run.system.map()
     seen = [state in (TrackingState.TRACKED, TrackingState.INITIALISING) for state in log.states]
     if not any(seen):
@@ -122,7 +122,7 @@ def remarks(run: Run) -> list[str]:
 
 
 def _in_the_image(features: FeatureLog, poses: np.ndarray, is_still: bool) -> list[str]:
-    """In one sentence, that features stay at their pixels while others move, as dirt on a lens does, where they do."""
+    """A warning if features stay at their pixels while others move, as with dirt on the lens; else empty."""
     names = np.concatenate([frame.landmarks for frame in features.frames])
     steps = np.repeat(np.arange(len(features.frames)), [frame.landmarks.size for frame in features.frames])
     order = np.argsort(names, kind="stable")
@@ -148,7 +148,7 @@ def _in_the_image(features: FeatureLog, poses: np.ndarray, is_still: bool) -> li
 
 
 def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
-    """summary.json; numbers that are not finite become null, which JSON has."""
+    """summary.json; non-finite numbers become null."""
     plain = {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in entries.items()}
     files.write_text(out / files.SUMMARY, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
@@ -168,7 +168,7 @@ def write_map(out: Path, found: MapEstimate) -> None:
 
 
 def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
-    """grid.pgm and grid.yaml of what grid.npz holds: one byte per cell, the highest y in the first row."""
+    """grid.pgm and grid.yaml of grid.npz: one byte per cell, the highest y in the first row."""
     log_odds, (x, y) = grid["log_odds"], grid["corner"].tolist()
     cells = np.select([log_odds > 0.0, log_odds < 0.0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
     height, width = cells.shape
@@ -187,13 +187,13 @@ def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
 
 
 def peak_memory_mb() -> float:
-    """Largest resident size of this process so far."""
+    """Peak resident memory of this process."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
 def write_trajectory(out: Path, stamps_ns: np.ndarray, mean: np.ndarray, cov: np.ndarray, **more: np.ndarray) -> None:
-    """trajectory.npz: poses (T, E), covariances (T, d, d), and what more `rbpf.runs.reading` says of them; none by default."""
+    """trajectory.npz: poses (T, E), covariances (T, d, d), and further arrays, see `rbpf.runs.reading`; none by default."""
     steps, size = mean.shape
     path = {"version": np.array(files.VERSION), "stamps_ns": stamps_ns, "mean": mean, "cov": cov}
     corrections = {"correction": np.zeros((steps, 0)), "cov_correction": np.zeros((steps, 0, 0))}

@@ -1,6 +1,6 @@
-"""Measurements in files: what every run leaves behind for the comparison with a batch optimiser.
+"""Files of a run's measurements, for comparison with a batch optimiser.
 
-Their format stands in docs/run_folder.md.
+Their format is described in docs/run_folder.md.
 """
 
 import re
@@ -26,7 +26,7 @@ OBSERVATIONS = "observations.csv"
 ODOMETRY = "observations_odometry.csv"
 FRAMES = "observations_frames.csv"
 KNOWN = "observations_known_points.csv"
-PLAIN = "radial-tangential"  #: The lens that is meant where none is named.
+PLAIN = "radial-tangential"  #: The lens of files that name none.
 
 _FILES = {OBSERVATIONS: "observations", ODOMETRY: "odometry", FRAMES: "frames", KNOWN: "known points"}
 _TITLES = {name: f"rbpf {what} 1" for name, what in _FILES.items()}
@@ -40,7 +40,7 @@ _INT64 = np.iinfo(np.int64)
 
 
 def write_measurements(folder: Path, m: Measurements | FeatureLog | None) -> None:
-    """Writes the files; they appear under their names when all are complete, and those of a former run are replaced or go."""
+    """Writes the files atomically; those of an earlier run are replaced or removed."""
     texts = {} if m is None else _camera_texts(m) if isinstance(m, FeatureLog) else _robot_texts(m)
     with ExitStack() as together:
         for name, text in texts.items():
@@ -57,7 +57,7 @@ def read_measurements(folder: Path) -> Measurements | FeatureLog:
 
 
 def read_feature_log(folder: Path) -> FeatureLog:
-    """`read_measurements` of a camera's run; a robot's is refused."""
+    """`read_measurements` of a camera's run; raises InputError for a robot's."""
     table = _Table.read(folder / OBSERVATIONS)
     return _read_camera_log(folder, table, table.choice("measurement", tuple(_PIXELS)))
 
@@ -103,7 +103,7 @@ def _camera_texts(log: FeatureLog) -> dict[str, str]:
 def _text(
     name: str, recording: str, header: dict[str, str], columns: list[str], integers: list[np.ndarray], *numbers: Array
 ) -> str:
-    """A file: whole numbers (n,) each; then, where there are any, numbers (n, k) and their covariances (n, d, d)."""
+    """Writes a file: integer columns (n,); then optionally numbers (n, k) and their covariances (n, d, d)."""
     lines = [f"# {_TITLES[name]}", f"# recording: {recording}"]
     lines += [f"# {key}: {value}" for key, value in header.items()]
     lines += [f"# rows: {len(integers[0])}", ",".join(columns)]
@@ -183,7 +183,7 @@ def _read_camera(table: "_Table", kind: str) -> Pinhole | RectifiedStereo:
     try:
         camera = Pinhole(int(width), int(height), fx, fy, cx, cy, tuple(distortion), lens)
         return camera if baseline is None else RectifiedStereo(camera, float(baseline[0]))
-    except InputError as error:  # which does not know where the numbers are from
+    except InputError as error:  # whose message does not name the file
         raise InputError(f"{table.path}: {error}") from None
 
 
@@ -213,7 +213,7 @@ def _triangle(count: int) -> list[str]:
 @final
 @dataclass(frozen=True)
 class _Table:
-    """Lines of one of the files, checked as they are asked for; every method raises InputError at a malformed one."""
+    """Lines of one of the files, validated lazily; every method raises InputError for a malformed line."""
 
     path: Path  #: the file.
     header: dict[str, tuple[int, str]]  #: line number and text of each named value.
@@ -278,12 +278,12 @@ class _Table:
         return wholes, numbers
 
     def require(self, valid: NDArray[np.bool_], expected: str) -> None:
-        """Refuses the first row where `valid` (n,) is False."""
+        """Raises InputError for the first row at which `valid` (n,) is False."""
         if not valid.all():
             raise self.row_error(int(np.argmin(valid)), f"expected {expected}")
 
     def require_same(self, key: str, other: "_Table") -> None:
-        """Refuses a named value that another of the run's files has otherwise."""
+        """Raises InputError: a named value differs from that in another of the run's files."""
         if self.text(key) != other.text(key):
             found = f"expected {key} {other.text(key)} as in {other.path.name}, found {quoted(self.text(key))}"
             raise self.header_error(key, f"{found}; take both files from one run")

@@ -1,6 +1,6 @@
-"""Pictures of a run of any system, from its folder, drawn without a screen: one set for all.
+"""Plots of a run of any system, from its folder, without a display; the same set for all systems.
 
-All are drawn in one world, the truth's where the recording has one (`World`), each as vectors, too (.pdf), for print.
+All are in one world, the truth's if there is one (`World`); each is also saved as vector graphics (.pdf) for print.
 A further figure of every run is one function from `RunFolder` to a matplotlib figure, entered into `FIGURES`.
 """
 
@@ -23,8 +23,8 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 
 SIGMAS = 3.0
-VECTORS = "pdf"  #: Ending of a figure's second file: the same without pixels, but where thousands of curves are in it.
-_MANY = 2000  #: So many curves are pixels in a vector format, too: else its file is larger than all others.
+VECTORS = "pdf"  #: Suffix of a figure's second file in vector graphics, except for thousands of curves.
+_MANY = 2000  #: From this number curves are rasterised in vector formats, too, to limit the file's size.
 COLOURS = {
     "filter": "tab:blue",
     "truth": "black",
@@ -34,13 +34,13 @@ COLOURS = {
     "known": "tab:green",
 }
 
-#: The map's picture holds the path and this fraction of the points; single points far off do not make it small.
+#: The map's plot covers the path and this fraction of the points, so that single distant points do not shrink it.
 MAP_FRACTION = 0.9
-CAMERA_HZ = 30.0  #: What a camera's frames are to keep up with.
-#: Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera.
+CAMERA_HZ = 30.0  #: Frame rate of a typical camera, for the timing plot.
+#: Weight of the images' up direction relative to that of their rows, which do not tilt with the camera.
 _UPRIGHT = 0.05
 
-#: Columns of diagnostics.csv that are no curve of the picture's first row: all others are.
+#: Columns of diagnostics.csv that are not plotted in the first row.
 _NOT_COUNTS = {
     "step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof", "lost", "updated", "assumed",
 }  # fmt: skip
@@ -57,7 +57,7 @@ def draw_run(found: RunFolder, out: Path | None = None, formats: Sequence[str] =
 
 
 def plot_trajectory(*runs: RunFolder, ax: Any = None) -> Any:
-    """The path, beside what there is of truth, odometry and batch optimum.
+    """The path, together with truth, odometry and batch optimum, if available.
 
     Of several runs it is their paths, in one world. Returns the figure: seen from above and, in space, from the side. Into
     the axes `ax`, if they are given, only the view from above is drawn.
@@ -83,7 +83,7 @@ def plot_trajectory(*runs: RunFolder, ax: Any = None) -> Any:
 
 
 def other_paths(found: RunFolder, world: "World") -> list[tuple[str, str, np.ndarray]]:
-    """What the path of a run is drawn beside: name in `COLOURS`, label and positions (T, 3) of truth, odometry and batch."""
+    """Reference paths of a run: name in `COLOURS`, label and positions (T, 3) of truth, odometry and batch."""
     others = []
     if world.truth is not None and (found.folder / TRUTH).is_file():
         others.append(("truth", "truth", world.truth.positions))
@@ -110,7 +110,7 @@ def plot_map(found: RunFolder, ax: Any = None) -> Any:
 
 
 def near_box(mean: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which of the points (M, 3) are near, and lowest and highest corner of a box that holds these and the path (T, 3)."""
+    """Mask of the nearby points (M, 3), and the lowest and highest corner of their box with the path (T, 3)."""
     far = np.linalg.norm(mean - np.median(np.concatenate([mean, at]), axis=0), axis=1)
     near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
     held = np.concatenate([mean[near], at])
@@ -123,7 +123,7 @@ def draw_map(
     """A path (T, 3) and a map of its world: points with 3σ ellipses, rays; others' points (K, 3), with a name in `COLOURS`."""
     figure, shown = views.axes(title, ax)
     mean, cov = landmarks.points().in_space()
-    # Limits that hold what is near with a margin; what is far away (rays) runs out of the picture.
+    # Limits include nearby points with a margin; distant ones (rays) are cut off.
     near, low, high = near_box(mean, at)
     middle, half = 0.5 * (low + high), 0.55 * max(float((high - low).max()), 1e-3)
     for axes, plane in shown:
@@ -147,12 +147,12 @@ def draw_map(
 
 
 def _grid_figure(found: RunFolder, world: "World", path: Trajectory, motion: Similarity, ax: Any) -> Any:
-    """Path and occupancy grid: black where something is, white where beams have passed, grey where none has."""
+    """Path and occupancy grid: black occupied, white free, grey unknown."""
     from matplotlib.transforms import Affine2D
 
     grid, (figure, shown) = found.grid, Views((0, 1), None).axes(f"{found.name}: map in {world.name}", ax)
     axes = shown[0][0]
-    # An image, moved as the path is: a mesh of as many cells takes minutes and gigabytes in a large place.
+    # Drawn as a transformed image: a mesh of as many cells would take minutes and gigabytes.
     extent = grid.cell_m * np.array(grid.log_odds.shape[::-1])
     corners = grid.corner + extent * [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
     at = motion.transform(np.pad(corners, ((0, 0), (0, 1))))[:, :2]
@@ -193,7 +193,7 @@ def particles_figure(found: RunFolder) -> Any:
 
 
 def error_figure(found: RunFolder) -> Any | None:
-    """Error of the position along the truth's axes, beside what the filter believes (3σ).
+    """Position error along the truth's axes, with the filter's 3σ bounds.
 
     None without truth.
     """
@@ -218,7 +218,7 @@ def error_figure(found: RunFolder) -> Any | None:
         batch_error = fit(how, batch.positions, true.positions).transform(batch.positions) - true.positions
     lost = lost_frames(found)
     for axes, axis in zip(panels, used, strict=True):
-        # A band that leaps for some frames runs out of the picture, errors do not.
+        # The limits follow the errors; wide bounds in some frames are cut off.
         reach = 1.1 * unit * max(np.abs(error[:, axis]).max(), 1.2 * np.quantile(band[:, axis], 0.95))
         low, high = -unit * band[:, axis], unit * band[:, axis]
         label_ = f"{SIGMAS:g}σ of the filter"
@@ -255,11 +255,11 @@ def plot_error(*runs: RunFolder, ax: Any = None) -> Any:
 
 
 def tracking_figure(found: RunFolder) -> Any:
-    """What was measured, effective sample size and innovations, frame by frame."""
+    """Counts of observations, effective sample size and innovations, frame by frame."""
     table = found.table("diagnostics.csv")
     counts = {name: values for name, values in table.items() if name not in _NOT_COUNTS}
     shares = {name: counts.pop(name) for name, values in list(counts.items()) if (np.mod(values, 1.0) > 0.0).any()}
-    # What stands behind the column `updated` is of the update, where there was one.
+    # Columns after `updated` are valid only for frames with an update.
     updated, names = np.flatnonzero(table.get("updated", np.ones(table["step"].size))), list(table)
     of_update = names[names.index("updated") :] if "updated" in names else names
     rows = (["number"] if counts else []) + (["share"] if shares else []) + ["ess"]
@@ -290,7 +290,7 @@ def tracking_figure(found: RunFolder) -> Any:
 
 
 def timings_figure(found: RunFolder) -> Any:
-    """Milliseconds per frame by stage, one over the other; frames that compile run out of the picture."""
+    """Milliseconds per frame by stage, one over the other; frames that include compilation are cut off."""
     table = found.table("timings.csv")
     stages = {n.removesuffix("_ms").replace("_", " "): v for n, v in table.items() if n.endswith("_ms")}
     waiting = stages.pop("waiting for image", None)
@@ -319,9 +319,9 @@ FIGURES: Mapping[str, Callable[[RunFolder], Any | None]] = {
 
 @dataclass(frozen=True)
 class World:
-    """The world in which all pictures of a run are drawn: the truth's where the recording has one, else the run's own.
+    """The world of all plots of a run: the truth's if the recording has one, else the run's own.
 
-    `alignment` brings filter, odometry and batch there, each by its own; `truth` is at the frames that have one.
+    `alignment` is applied to filter, odometry and batch separately; `truth` is at the frames that have one.
     """
 
     name: str = "the run's own world"
@@ -330,7 +330,7 @@ class World:
 
     @classmethod
     def of(cls, found: RunFolder, *others: RunFolder) -> "World":
-        """The world of a run, into which further runs are brought as freely as one of them needs."""
+        """The world of a run, with the most general alignment that any of the further runs needs."""
         if not (found.folder / TRUTH).is_file():
             if not others:
                 return cls()
@@ -343,7 +343,7 @@ class World:
         return cls(f"the truth's world{how}", free, in_space(found.path.stamps_ns[truth.rows], truth.poses))
 
     def motion(self, estimate: Trajectory) -> Similarity:
-        """What brings an estimate here; nothing moves one that has too few frames with a true pose."""
+        """The alignment of an estimate; the identity with too few true poses."""
         if self.truth is not None and self.alignment != "none":
             ours, true = associate(estimate, self.truth, 0)
             if len(ours) >= LEAST:
@@ -355,7 +355,7 @@ class World:
 
 
 def moved_map(found: MapEstimate, motion: Similarity) -> MapEstimate:
-    """A map by a similarity; one of the plane by what that does there."""
+    """A map transformed by a similarity, reduced to the plane for a planar map."""
     motion = motion.in_dimension(found.mean.shape[1])
     turn = motion.scale * motion.rotation
     ends = None if found.ray_ends is None else motion.transform(found.ray_ends)
@@ -372,7 +372,7 @@ def position_covariances(path: PathAndMap) -> np.ndarray:
 
 
 def lost_frames(found: RunFolder) -> np.ndarray:
-    """(T,) bool: where the run's own diagnostics say that it was lost, or that its motion was only assumed."""
+    """(T,) bool: whether the run was lost, or its motion only assumed, by its diagnostics."""
     try:
         table = found.table("diagnostics.csv")
     except InputError:
@@ -382,7 +382,7 @@ def lost_frames(found: RunFolder) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Views:
-    """From where a world is drawn: from above and, in space, from the side; each the axes to the right and up the page.
+    """Views of a world: from above and, in space, from the side; each has the axes to the right and up.
 
     `down` says whether the vertical axis points down, as a camera's y axis does.
     """
@@ -393,7 +393,7 @@ class Views:
 
     @classmethod
     def of(cls, system: str, path: Trajectory) -> "Views":
-        """For a path of a system: of a robot z is up, of a camera what its images' rows are square to."""
+        """For a path of a system: up is z for a robot, for a camera perpendicular to its images' rows."""
         if system in ("range-bearing", "laser"):
             flat = not np.ptp(path.positions[:, 2]) > 0.0
             return cls((0, 1), None if flat else (0, 2))
@@ -401,7 +401,7 @@ class Views:
 
     @classmethod
     def of_camera(cls, world_from_camera: np.ndarray) -> "Views":
-        """For a path (T, 7): a camera is seldom rolled, so that the vertical is square to its images' rows."""
+        """For a path (T, 7): a camera is rarely rolled, so the vertical is perpendicular to its images' rows."""
         turn = SE3.rotation(world_from_camera)
         upper = -turn[:, :, 1].mean(axis=0)
         score = np.square(turn[:, :, 0]).mean(axis=0) - _UPRIGHT * np.abs(upper)
@@ -412,7 +412,7 @@ class Views:
         return cls(top, (top[0], vertical), down)
 
     def axes(self, title: str, ax: Any = None) -> tuple[Any, list[tuple[Any, list[int]]]]:
-        """A figure, and its pairs of axes with the world's axes that they show; of axes that are given the view from above."""
+        """A figure, and its axes with the world axes they show; given axes show the view from above."""
         planes = [plane for plane in (self.top, self.side) if plane is not None]
         if ax is not None:
             label(ax, title, f"{'xyz'[self.top[0]]} [m]", f"{'xyz'[self.top[1]]} [m]", equal=True)
@@ -438,12 +438,12 @@ def shade(axes: Any, lost: np.ndarray) -> None:
 
 
 def save_figures(figures: Mapping[str, Any], out: Path, *also: str) -> list[str]:
-    """Saves figures by file name, whose ending is the format, each whole or not at all; returns the names.
+    """Saves figures atomically by file name, whose suffix is the format; returns the names.
 
     `also` are endings of further files of each.
     """
     for name, figure in figures.items():
-        # A name with dollars in it is no formula; the numbers at logarithmic axes are.
+        # Dollar signs in names are not formulas; tick labels of logarithmic axes are.
         for axes in figure.axes:
             legend = axes.get_legend()
             for text in (axes.title, *(() if legend is None else legend.get_texts())):
@@ -453,12 +453,12 @@ def save_figures(figures: Mapping[str, Any], out: Path, *also: str) -> list[str]
             dated = {"CreationDate": None} if ending == "pdf" else None  # the same figure, the same bytes
             with whole(path) as temporary:
                 figure.savefig(temporary, format=ending, dpi=dpi, metadata=dated)
-            figure.set_layout_engine("none")  # of the next file it is the same, and takes as long as painting
+            figure.set_layout_engine("none")  # the layout is the same for the next file, and expensive
     return list(figures)
 
 
 def blank(width: float, height: float) -> Any:
-    """An empty figure of a size [inches], which a notebook shows by itself."""
+    """An empty figure of a size [inches], which notebooks display."""
     from matplotlib.figure import Figure
 
     class ShownFigure(Figure):
@@ -478,8 +478,8 @@ def new_axes(title: str, ylabel: str, xlabel: str, ax: Any = None) -> tuple[Any,
 
 
 def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:
-    """A figure of pairs of axes one above the other that share what is along them."""
-    figure = blank(7.0 + 0.6 * count, 5.6 + 0.48 * count)  # of the form of all others, beside which it stands
+    """A figure of stacked axes with a shared x axis."""
+    figure = blank(7.0 + 0.6 * count, 5.6 + 0.48 * count)  # aspect of the other figures
     rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     rows[0].set_title(title)
     for axes in rows:

@@ -1,4 +1,4 @@
-"""Where a run comes from: config.yaml with versions, settings and a digest of the input, to repeat it from."""
+"""Provenance of a run: config.yaml with versions, settings and a digest of the input, to repeat it."""
 
 import hashlib
 import json
@@ -19,13 +19,13 @@ from rbpf.sensors.readers.yaml_files import read_plain_yaml
 from rbpf.systems.settings import HEADER
 
 CONFIG = "config.yaml"
-LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"  #: Whose version may change a run's bytes.
-_FILES = "recording", "known_points", "calibration", "known_map"  #: Entries that name files or folders that a run read.
+LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"  #: Libraries whose version may change a run's results.
+_FILES = "recording", "known_points", "calibration", "known_map"  #: Entries that name input files or folders.
 _FLAGS = ("localize",)
-_MADE = "video", "batch"  #: What a run makes besides its data, unless it is asked not to.
+_OUTPUTS = "video", "batch"  #: Optional outputs of a run.
 _HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
 _INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
-#: Settings that cannot change the results: a run may go on with others. All else must be the same.
+#: Settings that do not affect the results, and may differ on resuming; all others must be equal.
 FREE = ("checkpoint_every",)
 
 
@@ -41,7 +41,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def require_own_version(config: Mapping[str, Any], folder: Path) -> None:
-    """Refuses a run of another version, whose settings or files may mean something else; patches are alike."""
+    """Raises InputError: the run is of another version (except patch), whose settings or files may differ in meaning."""
     if str(config["rbpf"]).split(".")[:2] != __version__.split(".")[:2]:
         written = f"{folder} was written by rbpf {config['rbpf']}, this is {__version__}"
         raise InputError(f"{written}; run again with --config {folder / CONFIG}.")
@@ -53,7 +53,7 @@ def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: M
     head = {"rbpf": __version__, "system": system, **sources}
     if digest is not None:
         head["input_sha256"] = digest
-    # Python, the libraries that compute, and the processor's instructions that they choose among.
+    # Python, numerical libraries, and the processor's instruction sets.
     versions = {"python": platform.python_version(), "instructions": instruction_set()}
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):
@@ -62,7 +62,7 @@ def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: M
 
 
 def instruction_set() -> str:
-    """The processor, and its vector instructions that kernels, BLAS and OpenCV may use; others round sums otherwise."""
+    """The processor, and its vector instruction sets, on which the rounding of sums depends."""
     import numba
     from llvmlite import binding
 
@@ -72,9 +72,9 @@ def instruction_set() -> str:
 
 
 def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str | None:
-    """SHA-256 over the names and the content of all files of a run's input; None where one is not there.
+    """SHA-256 over names and contents of all input files; None if one is missing.
 
-    Files in the folder `without`, as the run's own inside its recording, are left out.
+    Files in the folder `without`, such as the run's own inside its recording, are excluded.
     """
     whole = hashlib.sha256()
     for name, path in sorted(sources.items()):
@@ -107,7 +107,7 @@ def decisive_settings(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """What a run reads (`sources`), as text by name: the content of files, whatever they are called, and all else as given.
+    """A run's inputs (`sources`), as text by name: digests of files, regardless of their names, and all else as given.
 
     A recording that is itself the run's folder `out` changes with the run, and is left out.
     """
@@ -123,7 +123,7 @@ def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
 
 
 def require_same(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuses to go on with a run (`path` is its checkpoint) with something else than it was begun with; names the first."""
+    """Raises InputError: a run (`path` is its checkpoint) is resumed with other inputs; names the first difference."""
     for name in [*before, *(name for name in now if name not in before)]:
         if before.get(name) != now.get(name):
             # Digests are cut short.
@@ -138,7 +138,7 @@ def require_same(path: Path, before: Mapping[str, str], now: Mapping[str, str]) 
 def read_origin(config: Path) -> list[str]:
     """System, recording and options that a run was started with, from its config.yaml or the folder of it.
 
-    Refused where what the run read has changed or is gone.
+    Raises InputError: an input has changed or is missing.
     """
     if config.is_dir():
         config = config / CONFIG
@@ -160,18 +160,18 @@ def read_origin(config: Path) -> list[str]:
 
 
 def _options(entries: Mapping[str, Any]) -> list[str]:
-    """What else a run was started with: an entry of config.yaml has its option's name, and perhaps a unit behind it."""
+    """Further options of a run: an entry of config.yaml has the option's name, possibly with a unit."""
     words = list[str]()
     for name in HEADER:
-        if name in entries and name not in (*_HEAD, *_FLAGS, *_MADE):
+        if name in entries and name not in (*_HEAD, *_FLAGS, *_OUTPUTS):
             option = "map" if name == "known_map" else re.sub(r"_(m|s|px)$", "", name).replace("_", "-")
             words += [f"--{option}", str(entries[name])]
     words += [f"--{name}" for name in _FLAGS if entries.get(name)]
-    return words + [f"--no-{name}" for name in _MADE if entries.get(name) is False]
+    return words + [f"--no-{name}" for name in _OUTPUTS if entries.get(name) is False]
 
 
 def command_of(entries: Mapping[str, Any], *defaults: Mapping[str, Any]) -> list[str]:
-    """The command of such a run, by its config.yaml: every setting that is not the default, in all of these, is named."""
+    """The command of a run by its config.yaml, with all non-default settings."""
     words = ["rbpf", "run", str(entries["system"]), str(entries.get("recording", "RECORDING")), *_options(entries)]
     own = decisive_settings({name: value for name, value in entries.items() if name in defaults[0]})
     usual = [decisive_settings(each) for each in defaults]

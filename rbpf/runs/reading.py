@@ -1,7 +1,7 @@
-"""A run folder of any system, read back: what pictures, comparisons and reports are made of.
+"""Reads the run folder of any system, for plots, comparisons and reports.
 
-Each part is read when it is asked for, so that a folder that lacks one still has the others. What is missing, damaged or of
-another version of the program raises an InputError.
+Parts are read lazily, so that a folder with a missing one still has the others. Missing and damaged files, and those of
+another version, raise an InputError.
 """
 
 import csv
@@ -51,8 +51,8 @@ class PathAndMap:
 
     stamps_ns: NDArray[np.int64]  #: (T,).
     world_from_body: Array  #: (T, E).
-    cov_poses: Array  #: (T, d, d) in the right chart at each pose, order [ω, v]; no rows where they are not known.
-    landmarks: MapEstimate = _NO_LANDMARKS  #: those that are points; none of a path alone.
+    cov_poses: Array  #: (T, d, d) in the right chart at each pose, order [ω, v]; no rows if unknown.
+    landmarks: MapEstimate = _NO_LANDMARKS  #: those that are points; empty for a path alone.
 
     @classmethod
     def of_run(cls, run: Run) -> "PathAndMap":
@@ -69,7 +69,7 @@ class PathAndMap:
         return in_space(self.stamps_ns, self.world_from_body)
 
     def at(self, rows: NDArray[np.intp]) -> "PathAndMap":
-        """Some of the poses, with all landmarks."""
+        """A subset of the poses, with all landmarks."""
         covs = self.cov_poses[rows] if len(self.cov_poses) else self.cov_poses
         return PathAndMap(self.stamps_ns[rows], self.world_from_body[rows], covs, self.landmarks)
 
@@ -140,7 +140,7 @@ class RunFolder:
 
     @cached_property
     def corrections(self) -> tuple[Array, Array]:
-        """Corrections (T, r) of the motions and their covariances (T, r, r); r = 0 where the system does not report them."""
+        """Corrections (T, r) of the motions and their covariances (T, r, r); r = 0 if the system does not report them."""
         correction, cov = self._arrays(TRAJECTORY, _CORRECTIONS).values()
         return correction, cov
 
@@ -151,7 +151,7 @@ class RunFolder:
 
     @cached_property
     def map(self) -> MapEstimate:
-        """All landmarks, with the system's columns; `map.points()` are those whose depth is known."""
+        """All landmarks, with the system's columns; `map.points()` are those of known depth."""
         file = self.folder / MAP
         if not file.exists():
             raise InputError(f"{self.folder} holds no {MAP}: expected the folder of a finished run.")
@@ -185,12 +185,12 @@ class RunFolder:
 
     @cached_property
     def measurements(self) -> FeatureLog | Measurements:
-        """What the run used."""
+        """The measurements used by the run."""
         return read_measurements(self.folder)
 
     @property
     def estimate(self) -> PathAndMap:
-        """Poses and the landmarks that are points, with their covariances; of a run of this version of the program."""
+        """Poses and point landmarks, with their covariances; only for a run of this version."""
         require_own_version(self.config, self.folder)
         return replace(self.path, landmarks=self.map.points())
 

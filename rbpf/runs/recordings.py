@@ -1,4 +1,4 @@
-"""What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
+"""Recordings as inputs of systems, opened as a system and the source of its frames."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -35,13 +35,13 @@ from rbpf.systems.stereo.named_pixels import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
 
-Sources = dict[str, str | float | bool]  #: What a run reads, by the name that it has in config.yaml.
+Sources = dict[str, str | float | bool]  #: A run's inputs, by their names in config.yaml.
 
 
 class Opened(NamedTuple):
-    """A recording that is ready to be filtered: a new system, the source of its frames, their times (T,), and the truth.
+    """An opened recording: a new system, the source of its frames, their times (T,), and the truth.
 
-    Times are None where they are not known beforehand, the truth where there is none.
+    Times are None if unknown in advance, and so is a missing truth.
     """
 
     system: System
@@ -80,14 +80,14 @@ class RobotRecording:
 
 @dataclass(frozen=True)
 class MonoRecording:
-    """Images of one camera, and what is known of them beforehand; at most one of known points, board, markers and map."""
+    """Images of one camera, and prior knowledge: at most one of known points, board, markers and map."""
 
     images: Path  #: a sequence of any kind that `open_images` knows, or the number of a camera at this computer.
     known_points: Path | None = None  #: table of known points; None starts without any.
     calibration: Path | None = None  #: camera.yaml in place of the sequence's own camera.
     #: chessboard that is seen in the first image; its corners are the known points, in its frame.
     board: Board | None = None
-    #: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
+    #: run folder, or its map, in which the camera is localised; the map is not changed. None creates a map.
     map: Path | None = None
     #: board of ArUco markers of which some are seen in the first image; likewise known points.
     markers: MarkerBoard | None = None
@@ -111,7 +111,7 @@ class MonoRecording:
 
     @property
     def live(self) -> int | None:
-        """The number of the camera whose images come as they are taken; None of a recording, also one of that name."""
+        """The number of a live camera; None for a recording, also one of that name."""
         is_number = str(self.images).isdecimal() and not self.images.exists()
         return int(str(self.images)) if is_number else None
 
@@ -149,7 +149,7 @@ class MonoRecording:
             found |= {"aruco": f"{board.columns}x{board.rows}", "marker_m": board.side_m, "gap_m": board.gap_m}
             found["dictionary"] = board.dictionary
         if self.map is not None:
-            # Of the folder of a run nothing else is read: times in its tables, and its pictures, may change.
+            # Only this file of a run's folder is an input: timings and plots may change.
             found |= {"known_map": str(map_file(self.map)), "localize": True}
         return found | self.topics.entries() | self.part.entries()
 
@@ -195,7 +195,7 @@ def _given(**named: Path | str | float | None) -> Sources:
 
 
 def part_of_log(log: readers.RobotLog, part: readers.Part) -> readers.RobotLog:
-    """Some frames of a robot's log; the odometry between two of them is composed of that between all in between."""
+    """Some frames of a robot's log; the odometry over skipped frames is composed."""
     if part == WHOLE:
         return log
     stamps = np.array([frame.stamp_ns for frame in log.frames])
@@ -212,7 +212,7 @@ def part_of_log(log: readers.RobotLog, part: readers.Part) -> readers.RobotLog:
 
 
 def open_robot_log(log: readers.RobotLog, config: RangeBearingConfig) -> Opened:
-    """A robot's log in memory; refused where landmarks are to be known by their names, and some have none."""
+    """A robot's log in memory. Raises InputError: known association is selected, and some landmarks have no name."""
     if config.association == "known" and any((frame.landmarks == UNNAMED).any() for frame in log.frames):
         raise InputError(f"{log.name} has observations without a landmark's name: filter it with --association ml")
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
@@ -240,7 +240,7 @@ def open_pairs(sequence: readers.ImageSequence, config: StereoConfig) -> Opened:
 
 
 def open_features(log: FeatureLog, config: MonoConfig | StereoConfig) -> Opened:
-    """A log of named features, of one camera or of a rectified pair, as the settings are.
+    """A log of named features, of one camera or of a rectified pair, depending on the settings.
 
     A pair's log without times, whose stamps count its frames, is taken as one frame per second.
     """
@@ -260,7 +260,7 @@ def open_features(log: FeatureLog, config: MonoConfig | StereoConfig) -> Opened:
 
 
 def first_image(sequence: readers.ImageSequence | LiveCamera) -> np.ndarray:
-    """The image (H, W) that a run starts from. Raises InputError: it cannot be read."""
+    """The first image (H, W) of a run. Raises InputError: it cannot be read."""
     first = next(sequence.frames(), None)
     if first is None or first.image is None:
         reason = "it has no image" if first is None else first.problem
@@ -268,20 +268,20 @@ def first_image(sequence: readers.ImageSequence | LiveCamera) -> np.ndarray:
     return first.image
 
 
-#: What the command line filters: it can be opened as often as one likes, and says what it is made of, for config.yaml.
+#: Input of a run from the command line: it can be opened repeatedly, and has its entries for config.yaml.
 Recording = RobotRecording | MonoRecording | StereoRecording | LaserRecording
 
 
 class SystemKind(NamedTuple):
-    """A system as command line, reports and sweeps know it."""
+    """Registry entry of a system, for command line, reports and sweeps."""
 
     config: type[Any]  #: of its settings.
-    recording: Callable[..., Recording]  #: what it filters, from `paths` in their order.
-    #: What config.yaml calls the paths of a recording; all but the first may be left out.
+    recording: Callable[..., Recording]  #: its input, from `paths` in their order.
+    #: Names of a recording's paths in config.yaml; all but the first are optional.
     paths: tuple[str, ...] = ("recording",)
 
 
-#: By their names; a further system is one line here.
+#: By name; a new system needs one line here.
 SYSTEMS: Mapping[str, SystemKind] = {
     "range-bearing": SystemKind(RangeBearingConfig, RobotRecording),
     "laser": SystemKind(LaserConfig, LaserRecording),
@@ -293,7 +293,7 @@ SYSTEMS: Mapping[str, SystemKind] = {
 def filter_recording(
     recording: Recording, config: Any, out: Path | None = None, resume: bool = False, listeners: Iterable[Listener] = ()
 ) -> Run:
-    """Filters a recording to its end; in `out` it keeps checkpoints, from which `resume` goes on."""
+    """Filters a recording to its end; checkpoints are stored in `out`, from which `resume` continues."""
     opened = recording.open(config)
     if out is None:
         return filter_opened(opened, listeners)
@@ -308,7 +308,7 @@ def filter_opened(
     resume: bool = False,
     inputs: Mapping[str, str] | None = None,
 ) -> Run:
-    """Filters what is opened to its end; see `drive`, and `Run` for `inputs`. The run then knows the truth."""
+    """Filters an opened recording to its end, with its truth; see `drive`, and `Run` for `inputs`."""
     system, source, stamps_ns, truth = opened
     run = Run(source, system, expected=None if stamps_ns is None else len(stamps_ns), inputs=inputs or {})
     drive(run, listeners, checkpoint, system.config.checkpoint_every, resume, stamps_ns)

@@ -1,4 +1,4 @@
-"""A finished run, for people: in a notebook, a script, or a shell.
+"""A finished run, for interactive use in a notebook, a script, or a shell.
 
 run = rbpf.load("RUN")
 run.trajectory, run.covariance, run.map, run.to_dataframe(), run.plot()
@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.runs.plots import plot_map
 from rbpf.runs.reading import RunFolder
 
-#: Entries of summary.json that stand for a run in a notebook.
+#: Entries of summary.json shown for a run in a notebook.
 _SHOWN = (
     "frames", "particles", "ate_rmse_m", "path_rmse_m", "ate_sim3_rmse_m", "filter_minus_batch_rmse_m", "ms_per_frame",
 )  # fmt: skip
@@ -20,7 +20,7 @@ _SHOWN = (
 
 @final
 class Results(RunFolder):
-    """A run folder, see `RunFolder`, with what people look at."""
+    """A run folder, see `RunFolder`, with tables and figures."""
 
     def to_dataframe(self) -> Any:
         """A pandas DataFrame, one row per frame: times, position, diagnostics and timings."""
@@ -55,5 +55,5 @@ class Results(RunFolder):
 
 
 def load(folder: Path | str) -> Results:
-    """Opens a run folder. Raises InputError: it is none, or of another version, or damaged."""
+    """Opens a run folder. Raises InputError: it is not a run folder, of another version, or damaged."""
     return Results.open(folder)

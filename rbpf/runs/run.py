@@ -1,11 +1,11 @@
-"""A run: a system, a recording, and what the system said of every frame; and the one loop that makes it.
+"""A run: a system, a recording, and the results of all frames; and the loop that makes it.
 
     run = Run(source, MonoSlam(camera, config))
     drive(run)                                   # or run.take(frame), one at a time
     run.log["ess"], run.log.poses, run.messages
 
-Whoever wants to follow a run while it is made (a progress bar, a live view, a plot) is a listener: it is called with
-the run and what `track` returned, after each frame.
+Listeners follow a run in progress (a progress bar, a live view, a plot): each is called with the run and the result of
+`track` after every frame.
 """
 
 import json
@@ -25,7 +25,7 @@ from rbpf.systems.system import FrameLog, System, Tracked
 
 
 class Source(Protocol):
-    """Where frames come from: a recording, a camera, anything."""
+    """A source of frames: a recording, a camera, anything."""
 
     @property
     def name(self) -> str:
@@ -36,24 +36,24 @@ class Source(Protocol):
 
 
 SystemT = TypeVar("SystemT", bound=System)
-_BEGUN = "log/begun"  #: Entry of a checkpoint: what the run was begun with.
+_BEGUN = "log/begun"  #: Entry of a checkpoint: the run's inputs at its start.
 
 
 @dataclass(eq=False)
 class Run(Generic[SystemT]):
-    """What a system said of a recording."""
+    """A system's results for a recording."""
 
-    source: Source  #: where the frames come from.
-    system: SystemT  #: as it is now.
-    truth: RunTruth | None = None  #: ground truth of the recording; None where it has none.
-    expected: int | None = None  #: number of frames that the recording has; None where it is not known.
-    #: what is read, as text by name, see `rbpf.runs.provenance.decisive_inputs`; empty where nobody says.
+    source: Source  #: source of the frames.
+    system: SystemT  #: the current system.
+    truth: RunTruth | None = None  #: ground truth of the recording; or None.
+    expected: int | None = None  #: number of frames of the recording, or None if unknown.
+    #: inputs, as text by name, see `rbpf.runs.provenance.decisive_inputs`; empty if not given.
     inputs: Mapping[str, str] = field(default_factory=dict)
     log: FrameLog = field(init=False)  #: one row per frame.
-    frame: Any = None  #: the last one that was taken; None before the first.
-    #: what was worth saying of single frames, in words: "frame 12: …".
+    frame: Any = None  #: the last frame processed; None before the first.
+    #: messages on single frames: "frame 12: …".
     messages: list[str] = field(default_factory=list)
-    failure: str | None = None  #: why the run ended before the recording did, in words; None where it did not.
+    failure: str | None = None  #: why the run ended before the recording, or None.
 
     def __post_init__(self) -> None:
         self.log = FrameLog(self.system)
@@ -65,11 +65,11 @@ class Run(Generic[SystemT]):
         return printable(self.source.name)
 
     def take(self, frame: Any, waiting: float = 0.0) -> Tracked:
-        """Gives the system a frame and keeps what it says; `waiting` is the time [s] that it took to arrive.
+        """Processes a frame and stores the result; `waiting` is the time [s] until it arrived.
 
         Errors as `System.take`.
         """
-        # What the filter warns of stands among a run's messages instead, where the frame stands for its step.
+        # The filter's warnings become messages of the run, with the frame instead of the step.
         health = self.system.filter.health
         health.silent, known = True, len(health.findings)
         started = time.perf_counter()
@@ -89,8 +89,8 @@ class Run(Generic[SystemT]):
         self.system.save(path, self.log.arrays() | own)
 
     def load(self, path: Path) -> None:
-        """Goes on from a checkpoint. Raises InputError: it is missing, damaged, or of another kind, setting or input."""
-        # Before anything else is read, so that the message names the setting and not an array that does not fit.
+        """Continues from a checkpoint. Raises InputError: it is missing, damaged, or of another system, setting or input."""
+        # Checked first, so that the message names the setting and not an array that does not fit.
         found = load_arrays(path, only=f"extra/{_BEGUN}")
         if found:
             with fitting(path):
@@ -118,14 +118,13 @@ def drive(
     resume: bool = False,
     stamps_ns: Sequence[int] | np.ndarray | None = None,
 ) -> Run:
-    """Takes all frames of the run's source that it has not taken yet, and calls the listeners after each.
+    """Processes all remaining frames of the run's source, and calls the listeners after each.
 
-    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A
-    disk that is full ends no run; it goes on with the last checkpoint that could be written. A KeyboardInterrupt from a
-    listener leaves a checkpoint behind, too.
+    A frame that cannot be filtered ends the run, which keeps earlier results and has a `failure`. A full disk does not end a
+    run; the last checkpoint that could be written remains. A KeyboardInterrupt from a listener writes a checkpoint, too.
 
-    A `checkpoint` is written after `every` so many frames; with `resume` the run goes on from it, if it is there.
-    `stamps_ns` (T,) are the times of all frames, where they are known: a checkpoint must be of the same.
+    A `checkpoint` is written every `every` frames; with `resume` the run continues from it, if it exists. `stamps_ns` (T,)
+    are the times of all frames, if known: a checkpoint must have the same.
     """
     if resume and checkpoint is not None and checkpoint.exists():
         run.load(checkpoint)
@@ -159,7 +158,7 @@ def drive(
 
 
 def _keep(run: Run, checkpoint: Path) -> None:
-    """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
+    """Writes a checkpoint; with a full disk the run continues, and the last one remains."""
     try:
         run.save(checkpoint)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Trajectories: poses with time stamps, which of two of them belong together, their alignment and their files.
+"""Trajectories: poses with time stamps, their association in time, alignment and files.
 
 S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE Trans.
 Pattern Analysis and Machine Intelligence 13(4), 1991: s, R, t of smallest Σ |y − (s R x + t)|², det R = 1.
@@ -39,7 +39,7 @@ class Similarity:
         return self.scale * np.einsum("ij,...j->...i", self.rotation, x) + self.translation
 
     def in_dimension(self, dim: int) -> "Similarity":
-        """The same for points of the plane z = 0 where `dim` is 2, of a similarity that keeps that plane."""
+        """The same for points of the plane z = 0 where `dim` is 2, for a similarity that keeps that plane."""
         return Similarity(self.scale, self.rotation[:dim, :dim], self.translation[:dim])
 
     def transform_poses(self, world_from_body: Array) -> Array:
@@ -51,7 +51,7 @@ class Similarity:
 @final
 @dataclass(frozen=True)
 class Trajectory(RowByRow):
-    """Poses in order of time; refused are shapes that do not fit, numbers that are not finite, time that runs backwards."""
+    """Poses in order of time. Raises InputError: shapes do not fit, numbers are not finite, time runs backwards."""
 
     stamps_ns: NDArray[np.int64]  #: (T,) integer nanoseconds; a recording without times counts its steps.
     world_from_body: Array  #: (T, 7) poses [qx, qy, qz, qw, tx, ty, tz] with unit quaternions.
@@ -77,7 +77,7 @@ class Trajectory(RowByRow):
         return float(np.sqrt(np.square(self.positions - self.positions.mean(axis=0)).sum(axis=1).mean()))
 
     def transformed(self, similarity: Similarity) -> "Trajectory":
-        """The trajectory in the world that a similarity leads to."""
+        """The trajectory transformed by a similarity."""
         return Trajectory(self.stamps_ns, similarity.transform_poses(self.world_from_body))
 
 
@@ -91,10 +91,10 @@ def in_space(stamps_ns: NDArray[np.int64], poses: Array) -> Trajectory:
 def associate(
     estimate: Trajectory, reference: Trajectory, max_difference_ns: int = MAX_DIFFERENCE_NS
 ) -> tuple[Trajectory, Trajectory]:
-    """Poses of two trajectories that belong together, paired by time: both with the same number of poses, row by row a pair.
+    """Associates the poses of two trajectories by time; returns both with the paired poses row by row.
 
-    Each estimated pose asks for the reference pose nearest in time (the earlier of two equally near), no further than
-    `max_difference_ns`, 0 for stamps that count steps; of several that ask for the same one, the nearest in time gets it.
+    Each estimated pose is paired with the reference pose nearest in time (the earlier in a tie), within `max_difference_ns`,
+    0 for stamps that count steps; of several with the same reference pose, the nearest in time is kept.
     Raises InputError: no pose has a partner.
     """
     if not len(estimate) or not len(reference):
@@ -115,8 +115,8 @@ def associate(
 def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: bool = False) -> Similarity:
     """Similarity that brings estimated points (N, D) closest to the reference (N, D), D = 2 or 3, Umeyama (1991) (39)-(43).
 
-    Too few points, and points on one line (D = 3) or all in one place, leave the rotation undetermined without changing the
-    residual: the smallest fitting rotation is returned. The scale of an estimate that lies in one place is 1, as it is without
+    Too few points, collinear points (D = 3) or coinciding points leave the rotation undetermined without changing the
+    residual: the smallest fitting rotation is returned. The scale of an estimate at a single point is 1, as without
     `with_scale`. Raises InputError: shapes do not fit, or a coordinate is not finite.
     """
     x, y = _checked(estimate_points, reference_points)
@@ -124,11 +124,11 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
     dx, dy = x - centre_x, y - centre_y
     cov_yx = np.einsum("ni,nj->ij", dy, dx) / len(x)
     u, singular, vt = np.linalg.svd(cov_yx)
-    # What rounding of coordinates far from the origin leaves in the cross-covariance.
+    # Rounding error of the cross-covariance, for coordinates far from the origin.
     spread_x, spread_y = (float(np.sqrt(np.square(d).sum(1).mean())) for d in (dx, dy))
     noise = float(np.abs(x).max()) * spread_y + float(np.abs(y).max()) * spread_x
     rank = int((singular > 32.0 * float(np.finfo(float).eps) * noise).sum())
-    # Within the null spaces every orthogonal matrix fits; the one of largest trace turns least.
+    # Within the null spaces every orthogonal matrix fits; the one of largest trace has the smallest rotation.
     v = vt.T
     left, _, right_t = np.linalg.svd(np.einsum("ki,kj->ij", u[:, rank:], v[:, rank:]))
     u = np.concatenate([u[:, :rank], np.einsum("ij,jk->ik", u[:, rank:], left)], axis=1)
@@ -143,7 +143,7 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
 
 
 def fit(alignment: Alignment | Similarity, estimate_points: Array, reference_points: Array) -> Similarity:
-    """The alignment asked for: none, the best rigid motion or similarity, or one that is already known."""
+    """The requested alignment: none, the best rigid motion or similarity, or a given one."""
     if isinstance(alignment, Similarity):
         return alignment
     if alignment not in ("none", "rigid", "similarity"):

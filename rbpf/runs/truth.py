@@ -17,7 +17,7 @@ from rbpf.systems.system import Gauge
 TRUTH = "truth.npz"
 #: Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored.
 LONGEST_GAP_NS = 500_000_000
-LEAST = 3  #: Frames with a true pose that a comparison needs.
+LEAST = 3  #: Least frames with a true pose for a comparison.
 
 _TRUTH = {
     "rows": integers("rows", least=0, below="steps"),
@@ -30,7 +30,7 @@ _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similari
 
 
 class Precision(NamedTuple):
-    """Standard deviations, per axis, of the poses that are taken for the truth: of positions [m] and rotations [rad]."""
+    """Standard deviations, per axis, of the ground truth itself: of positions [m] and rotations [rad]."""
 
     std_m: float = 0.0
     std_rad: float = 0.0
@@ -46,15 +46,15 @@ class RunTruth:
     rows: np.ndarray  #: (R,) frames that have a true pose.
     poses: np.ndarray  #: (R, E) world_from_body.
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)  #: name of a landmark to its (D,) position.
-    #: what brings the estimate into the truth's world; "none" where both are expressed in the same one.
+    #: alignment of the estimate to the truth's world; "none" if both are in the same one.
     alignment: Alignment = "none"
 
 
 def truth_at(space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray, gauge: Gauge) -> RunTruth | None:
-    """The truth at a run's frames (T,); None where fewer than `LEAST` have a true pose.
+    """The truth at a run's frames (T,); None if fewer than `LEAST` have a true pose.
 
-    Where the run's world (`gauge`) begins at the first frame, so does the truth, if it is known there; else only an alignment
-    brings the two together.
+    If the run's world (`gauge`) starts at the first frame, so does the truth, if it is known there; else only an alignment
+    relates the two.
     """
     rows, poses = poses_at(space, truth.stamps_ns, truth.poses, stamps_ns)
     if rows.size < LEAST:
@@ -74,9 +74,9 @@ def poses_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows of `stamps_ns` that lie inside true stamps (T,), and the interpolated true poses (T, E) there.
 
-    Stamps that count steps are met exactly; between poses the geodesic is followed.
+    Stamps that count steps must match exactly; otherwise poses are interpolated along the geodesic.
     """
-    if not true_ns.size:  # of a log that says where the landmarks are, and not where the robot was
+    if not true_ns.size:  # truth of landmarks only
         return np.zeros(0, dtype=np.intp), poses
     after = np.searchsorted(true_ns, stamps_ns).clip(max=true_ns.size - 1)
     met = true_ns[after] == stamps_ns
@@ -89,7 +89,7 @@ def poses_at(
 
 
 def write_truth(out: Path, truth: RunTruth | None) -> None:
-    """Writes truth.npz, or removes one of an earlier run where there is no truth."""
+    """Writes truth.npz, or removes that of an earlier run if there is no truth."""
     if truth is None:
         (out / TRUTH).unlink(missing_ok=True)
         return
@@ -105,7 +105,7 @@ def write_truth(out: Path, truth: RunTruth | None) -> None:
 
 
 def read_truth(folder: Path, steps: int, size: int) -> RunTruth:
-    """Reads truth.npz of a run of `steps` steps with poses of `size` numbers; refused where there is none for it."""
+    """Reads truth.npz of a run of `steps` steps with poses of `size` numbers; InputError: missing, or not of this run."""
     path = folder / TRUTH
     if not path.is_file():
         raise InputError(f"{folder} has no ground truth: its recording has none; compare it with its batch optimum")

@@ -1,4 +1,4 @@
-"""Settings of the filter that every system has: particles, likelihood, proposal, resampling."""
+"""Filter settings common to all systems: particles, likelihood, proposal, resampling."""
 
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Annotated, Literal
@@ -18,13 +18,13 @@ class LikelihoodConfig(Ranged):
 
     #: Gaussian, truncated Mahalanobis (S05 (6)), Gaussian with outliers, or Student's t; by default the system's.
     kind: Literal["gaussian", "truncated", "outliers", "student"] | None = None
-    truncation: Positive = 4.0  #: T_l of the truncated form, which bounds the weight.
-    #: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated either; 16.3 holds
+    truncation: Positive = 4.0  #: T_l of the truncated form: it bounds the weight.
+    #: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated; 16.3 holds
     #: 99.9 % of a Gaussian in three dimensions.
     update_limit: Positive = 16.3
     outlier_rate: Probability = 0.02  #: ε.
     outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0  #: V, of the measurement space, in its units.
-    dof: Positive = 4.0  #: of Student's t: the fewer degrees of freedom, the more often a measurement is far off.
+    dof: Positive = 4.0  #: of Student's t: fewer degrees of freedom have heavier tails.
 
     def build(self) -> Likelihood:
         if self.kind == "truncated":
@@ -36,7 +36,7 @@ class LikelihoodConfig(Ranged):
 
 @dataclass(frozen=True)
 class ProposalConfig(Ranged):
-    """Where particles are sampled and how they are weighted."""
+    """The proposal distribution and the weights."""
 
     kind: Literal["ekf", "prior"] = "ekf"  #: the motion prior (bootstrap), or the EKF-refined Gaussian (FastSLAM 2.0).
     iterations: Annotated[int, Range(ge=1, le=1000)] = 3  #: linearisations of the refined proposal; 1 is E06.
@@ -44,7 +44,7 @@ class ProposalConfig(Ranged):
     weights: Literal["exact", "linearised"] = "exact"
 
     def build(self, start: np.ndarray | None = None) -> Proposal:
-        """The proposal, `start` as `EkfProposal` has it; a subclass may make another one."""
+        """The proposal, with `start` as of `EkfProposal`; subclasses may return another one."""
         if self.kind == "prior":
             return PriorProposal()
         return EkfProposal(self.weights == "exact", self.iterations, start)
@@ -59,7 +59,7 @@ class ResamplingConfig(Ranged):
     ess_threshold: Fraction = 0.5
 
     def build(self) -> Resampler:
-        """The resampler; a subclass may make another one."""
+        """The resampler; subclasses may return another one."""
         schemes: list[Resampler] = [Systematic(), Stratified(), Residual(), Multinomial()]
         named = {type(scheme).__name__.lower(): scheme for scheme in schemes}
         return EssTriggered(named[self.scheme], self.ess_threshold)
@@ -67,13 +67,13 @@ class ResamplingConfig(Ranged):
 
 @dataclass(frozen=True)
 class RunConfig(Ranged):
-    """A run of any system; what a frame is the system says: an image, a pair, a step of a robot's log, a scan."""
+    """Settings common to the runs of all systems; a frame is an image, a pair, a step of a robot's log or a scan."""
 
     particles: Count = 100  #: number of particles.
     seed: Seed = 0  #: of all random generators.
-    _: KW_ONLY  # a system's own settings follow by their places, as dof of a stereo camera
-    #: frames of the particles' paths that are kept, of pairs only those that update the filter; None keeps all of a
-    #: recording, and the last 150 where no end is known. Where landmarks are a joint map one is kept.
+    _: KW_ONLY  # a system's own settings are positional, such as dof of a stereo camera
+    #: frames of the particles' paths that are kept (of stereo pairs only those that update the filter); None keeps all of a
+    #: recording, and the last 150 of a source without a known end. With a joint map only one is kept.
     lag: Count | None = None
-    checkpoint_every: Count = 500  #: frames taken (images, pairs, steps, scans) between checkpoints.
+    checkpoint_every: Count = 500  #: frames (images, pairs, steps, scans) between checkpoints.
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.

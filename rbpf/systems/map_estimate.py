@@ -1,6 +1,6 @@
-"""The map of a filter as one Gaussian per landmark, within + between particles; poses and points seen from a frame of it.
+"""The map of a filter as one Gaussian per landmark, within + between particles; poses and points relative to a frame in it.
 
-The frame is one that each particle knows in a world of its own, such as that of known points.
+Each particle estimates this frame, such as that of known points, in its own world.
 """
 
 from dataclasses import dataclass, field
@@ -20,19 +20,19 @@ from rbpf.sensors.range_bearing import RelativePosition
 class MapEstimate:
     """Landmarks of a run, M of them."""
 
-    ids: np.ndarray  #: (M,) names: the log's where the association is known, else the map's.
+    ids: np.ndarray  #: (M,) names: the log's for known association, else the map's.
     mean: np.ndarray  #: (M, D) positions in the world, metres.
     cov: np.ndarray  #: (M, D, D).
-    #: what the system adds to each landmark, (M,) by name. `ray` is 1 for one whose depth is not known yet.
+    #: further columns of the system, (M,) by name. `ray` is 1 for a landmark of unknown depth.
     columns: dict[str, np.ndarray] = field(default_factory=dict)
-    #: (M, 2, 3) nearest and farthest point of a ray, NaN for points; None where there are no rays.
+    #: (M, 2, 3) nearest and farthest point of a ray, NaN for points; None without rays.
     ray_ends: np.ndarray | None = None
 
     def named(self) -> dict[int, np.ndarray]:
         return dict(zip(self.ids.tolist(), self.mean, strict=True))
 
     def is_ray(self) -> np.ndarray:
-        """(M,) bool, whether the depth is not known yet."""
+        """(M,) bool, whether the depth is still unknown."""
         return np.asarray(self.columns.get("ray", np.zeros(self.ids.size))) != 0
 
     def in_space(self, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +61,7 @@ def estimate_map(filter_: Filter) -> MapEstimate:
 
 @dataclass(frozen=True)
 class Anchored:
-    """The frame in each particle's own world: world_from_frame (N, E), and a factor (N, d, d) of its covariance there."""
+    """The frame in each particle's world: world_from_frame (N, E), and a factor (N, d, d) of its covariance."""
 
     mean: np.ndarray
     factor: np.ndarray

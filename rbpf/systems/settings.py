@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.ranges import SettingError, former_names
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
 
-#: What a config.yaml says about the run besides its settings.
+#: Entries of a config.yaml that are not settings.
 HEADER = (
     "rbpf", "system", "versions", "input_sha256",
     "recording", "known_points", "board", "square_m", "calibration", "known_map", "localize",
@@ -23,7 +23,7 @@ HEADER = (
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-#: What msgspec's names of types are for who gives a setting.
+#: User-facing words for msgspec's type names.
 PLAIN = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "null": "nothing"}
 PLAIN |= {"array": "a list", "object": "a group of settings"}
 
@@ -37,7 +37,7 @@ def load_settings(
 
     Args:
         kind: dataclass of the settings.
-        system: its name, as a former run's config.yaml has it.
+        system: its name, as in a run's config.yaml.
         path: YAML file, such as the config.yaml of a former run.
         pairs: settings as key=value, nested keys with dots.
         given: settings by name.
@@ -66,8 +66,8 @@ def load_settings(
     try:
         return msgspec.convert(_over(asdict(defaults_of(kind, values)), values), kind, strict=False)
     except msgspec.ValidationError as error:
-        # "Expected `int | null`, got `str` - at `$.search.measurements`", "Invalid enum value 'a' - at …", or a range's own
-        # words and the group's place.
+        # Examples: "Expected `int | null`, got `str` - at `$.search.measurements`", "Invalid enum value 'a' - at …", or a
+        # range's own message and the group's path.
         words, _, place = str(error).partition(" - at `$")
         name = place.rstrip("`").lstrip(".")
         if isinstance(error.__cause__, SettingError):
@@ -81,12 +81,12 @@ def load_settings(
 
 
 def defaults_of(kind: type[Config], values: Mapping[str, Any]) -> Config:
-    """The settings of a system where nothing else is said: they may depend on the `values` that are."""
+    """The default settings of a system, which may depend on the given `values`."""
     return kind() if (chosen := getattr(kind, "defaults", None)) is None else chosen(values)
 
 
 def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values over the system's own defaults: those of a group may differ from the defaults of its class."""
+    """Values merged into the system's defaults, which may differ from the defaults of a group's class."""
     both = dict(defaults)
     for name, value in values.items():
         inner = defaults.get(name)
@@ -95,7 +95,7 @@ def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _choices(kind: Any, name: str) -> list[str]:
-    """The words that a setting may be."""
+    """The allowed values of a setting."""
     *groups, last = name.split(".")
     for group in groups:
         kind = next(item.default_factory for item in fields(kind) if item.name == group)

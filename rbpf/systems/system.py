@@ -1,11 +1,11 @@
-"""What every SLAM system is: an object that takes one frame at a time, and says what it knows after each.
+"""What every SLAM system is: an object that processes one frame at a time and returns its estimate.
 
     slam = MonoSlam(camera, config)
     for stamp_ns, image in source:
         frame = slam.track(image, stamp_ns)      # pose, covariance, state of tracking, what was observed
 
-A system does not know where its frames come from nor how many there are, and keeps what it needs to go on, no more. Who
-wants a record of a run, pictures or files listens to what `track` returns (`FrameLog`, `rbpf.runs`).
+A system does not know the source of its frames or their number, and keeps only the state it needs to continue. Records of a
+run, pictures and files are made from what `track` returns (`FrameLog`, `rbpf.runs`).
 """
 
 from abc import ABC, abstractmethod
@@ -31,40 +31,40 @@ from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.filtering import RunConfig
 from rbpf.systems.map_estimate import MapEstimate
 
-#: Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds.
+#: Name under which `System.restore` gets the ids (M,) of the restored map's landmarks.
 MAP_IDS = "map/ids"
-#: Frames of the particles' paths that are kept where neither the settings nor a recording's length say how many.
+#: Frames of the particles' paths kept if neither the settings nor a recording's length define it.
 LAG = 150
-#: What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
-#: it is the same up to a rigid motion; up to a motion and a scale.
+#: Relation of a system's world to that of the ground truth: identical; starting at the first frame's pose; equal up to a
+#: rigid motion; equal up to a similarity.
 Gauge = Literal["none", "first frame", "rigid", "similarity"]
 
 
 class TrackingState(StrEnum):
     """Whether the pose of a frame can be relied on."""
 
-    #: There is a pose, but earlier ones may still be revised: the scale or the first depths are not settled.
+    #: There is a pose, but poses may still be revised: scale or initial depths have not converged.
     INITIALISING = "initialising"
-    TRACKED = "tracked"  #: The frame was measured and agrees with the map.
-    #: The frame gave no information, or not enough: the pose is the motion model's or the odometry's.
+    TRACKED = "tracked"  #: The frame was measured and is consistent with the map.
+    #: The frame had too little information: the pose is predicted by the motion model or odometry.
     PREDICTED = "predicted"
-    #: The frame was measured, but the map does not say where the camera is: the pose is the last trusted one, or goes
-    #: on from it as assumed.
+    #: The frame was measured, but the camera could not be localised in the map: the pose is the last trusted one, or
+    #: extrapolated from it.
     LOST = "lost"
 
 
 @dataclass(frozen=True)
 class Column:
-    """One number, or one array of fixed shape, that a system says of every frame. Declared once, used everywhere."""
+    """A scalar, or an array of fixed shape, that a system reports for every frame."""
 
     name: str  #: key in `Tracked.values` and in the log of a run.
     meaning: str  #: one sentence, for documentation and the report.
     unit: str = ""  #: SI, as "s" or "px"; empty for pure numbers.
     kind: type = float  #: float, int or bool.
     shape: tuple[int, ...] = ()  #: of the value of one frame.
-    #: file of the run folder that has it as a column, "diagnostics.csv" or "timings.csv"; None for neither.
+    #: file of the run folder with this column, "diagnostics.csv" or "timings.csv"; None for neither.
     table: str | None = None
-    heading: str | None = None  #: its name there; by default `name`. Times are written in milliseconds.
+    heading: str | None = None  #: column heading there; by default `name`. Times are written in milliseconds.
 
 
 DIAGNOSTICS = "diagnostics.csv"
@@ -81,31 +81,31 @@ FILTER_COLUMNS = ESS, RESAMPLED, LOG_EVIDENCE, NIS, NIS_DOF
 
 
 def filter_values(report: StepReport) -> dict[str, Any]:
-    """Of `FILTER_COLUMNS`, after a step."""
+    """Values of `FILTER_COLUMNS` after a step."""
     names = (column.name for column in FILTER_COLUMNS)
     values = report.ess, report.resampled, report.log_evidence, report.nis, report.rows
     return dict(zip(names, values, strict=True))
 
 
 def timing(name: str, meaning: str, heading: str) -> Column:
-    """A part of the time that a frame takes."""
+    """The column of a part of a frame's processing time."""
     return Column(name, meaning, "s", table=TIMINGS, heading=heading)
 
 
 @dataclass(frozen=True)
 class Ragged:
-    """An array per frame whose first axis has as many rows as the frame showed things."""
+    """An array per frame with a variable number of rows, such as one per feature."""
 
     name: str  #: key in `Tracked.observed`.
     meaning: str  #: one sentence.
     shape: tuple[int, ...] = ()  #: of one row.
-    kind: str = "float64"  #: NumPy type that it is kept in.
-    per: str | None = None  #: name of another array that has as many rows in each frame; None where no other has.
+    kind: str = "float64"  #: NumPy type in which it is stored.
+    per: str | None = None  #: name of another array with the same number of rows in each frame, or None.
 
 
 @dataclass(frozen=True, eq=False)
 class Revision:
-    """Poses of earlier frames, the current one included, estimated anew: world_from_body (T, E), cov in the chart at each."""
+    """Re-estimated poses of all frames up to the current one: world_from_body (T, E), cov in the chart at each."""
 
     stamps_ns: Int[np.ndarray, " T"]
     poses: Float[np.ndarray, "T E"]
@@ -114,7 +114,7 @@ class Revision:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What a system says of a frame."""
+    """A system's result for a frame."""
 
     stamp_ns: int  #: time of the frame.
     #: (E,) world_from_body, the mean of the filtered posterior; the body is the camera or the robot.
@@ -122,29 +122,29 @@ class Tracked:
     cov: Float[np.ndarray, "d d"]  #: (d, d) its covariance in the right chart at the mean, [ω, v], rad and m.
     state: TrackingState  #: whether the pose can be relied on.
     values: Mapping[str, Any] = field(default_factory=dict)  #: the system's columns for this frame, by name.
-    #: what was looked for and seen, arrays by name, see `System.observed`.
+    #: searched and observed features, arrays by name, see `System.observed`.
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
-    messages: tuple[str, ...] = ()  #: what was wrong or worth saying, in words.
-    revision: Revision | None = None  #: earlier poses that this frame has changed; None where there are none.
+    messages: tuple[str, ...] = ()  #: warnings and remarks.
+    revision: Revision | None = None  #: earlier poses changed by this frame, or None.
 
 
 #: Columns of every system; times are written in milliseconds.
 COMMON = (
     Column("seconds", "time that the system took, without reading and decoding", "s", table=TIMINGS),
-    Column("state", "state of tracking, as its place in `TrackingState`", kind=int),
+    Column("state", "state of tracking, as its index in `TrackingState`", kind=int),
 )
 
-#: Likewise; written where a system has a name for it (`System.waiting`).
+#: Likewise; written if a system has a name for it (`System.waiting`).
 WAITING = Column("seconds_waiting", "time until the frame was read and decoded", "s")
 _STATES = list(TrackingState)
 
 
 @final
 class FrameLog:
-    """What a run remembers of every frame that a system takes: a row of its columns, and what the frame showed.
+    """The record of all frames of a run: a row of the columns per frame, and the observed features.
 
-    `log["ess"]` is a column (T, …); `log.poses`, `log.covs` and `log.stamps_ns` are the path as it is known now;
-    `log.observed(t)` is what frame t showed.
+    `log["ess"]` is a column (T, …); `log.poses`, `log.covs` and `log.stamps_ns` are the path with all revisions;
+    `log.observed(t)` has the features of frame t.
     """
 
     def __init__(self, system: "System") -> None:
@@ -173,7 +173,7 @@ class FrameLog:
 
     @property
     def poses(self) -> np.ndarray:
-        """(T, E) world_from_body: filtered means, revised ones where the system has revised them."""
+        """(T, E) world_from_body: filtered means, or revised ones."""
         return np.array(self._path["poses"], dtype=float).reshape(len(self), self.space.size)
 
     @property
@@ -187,11 +187,11 @@ class FrameLog:
         return [_STATES[int(state)] for state in self._rows["state"]]
 
     def lost(self) -> np.ndarray:
-        """(T,) bool, whether the system said that it was lost."""
+        """(T,) bool, whether the system was lost."""
         return np.array([state is TrackingState.LOST for state in self.states], dtype=bool)
 
     def observed(self, t: int) -> dict[str, np.ndarray]:
-        """What frame t showed, arrays by name."""
+        """The features of frame t, arrays by name."""
         return {name: frames[t] for name, frames in self._observed.items()}
 
     def append(self, tracked: Tracked, seconds: float, waiting: float = 0.0) -> None:
@@ -205,7 +205,7 @@ class FrameLog:
             self._path[name].append(value)
         revision = tracked.revision
         if revision is not None:
-            known = min(len(self), len(revision.poses))  # a log may have begun later
+            known = min(len(self), len(revision.poses))  # a log may start later
             self._path["poses"][-known:] = list(revision.poses[-known:])
             self._path["covs"][-known:] = list(revision.covs[-known:])
 
@@ -258,23 +258,23 @@ class FrameLog:
 
 
 class System(ABC):
-    """A SLAM system. Subclasses add `track`, with the arguments that their sensor has."""
+    """A SLAM system. Subclasses add `track`, with the arguments of their sensor."""
 
     name: ClassVar[str]  #: as on the command line.
-    frame_word: ClassVar[str] = "frame"  #: what a frame is called in messages.
-    #: how the time until a frame was read and decoded is called in timings.csv; None leaves it out there.
+    frame_word: ClassVar[str] = "frame"  #: word for a frame in messages.
+    #: name of the time until a frame was read and decoded in timings.csv; None omits it.
     waiting: ClassVar[str | None] = None
     columns: tuple[Column, ...]  #: what `Tracked.values` holds, in the order of the tables that are written.
     observed: tuple[Ragged, ...] = ()  #: what `Tracked.observed` holds.
     space: SE2Group | SE3Group  #: group of the poses.
-    gauge: Gauge = "first frame"  #: what its world has in common with the ground truth's.
+    gauge: Gauge = "first frame"  #: relation of its world to that of the ground truth.
     config: RunConfig  #: all settings.
-    filter: Filter  #: the particle filter as it is now.
+    filter: Filter  #: the current particle filter.
     recorded: bool = False  #: whether the frames have a known end, see `keep_paths`.
 
     @property
     def lag(self) -> int | None:
-        """Frames of the particles' paths that are kept, None for all: in bounded memory, unless a recording has an end."""
+        """Frames of the particles' paths that are kept; None keeps all, only for recordings with a known end."""
         return LAG if self.config.lag is None and not self.recorded else self.config.lag
 
     def new_filter(
@@ -285,16 +285,16 @@ class System(ABC):
         proposal: Proposal | None = None,
         window: int = 1,
     ) -> Filter:
-        """The particle filter as the settings have it; a joint map, its first part, is consolidated after `window` steps."""
+        """The particle filter of the settings; a joint map, its first part, is consolidated after `window` steps."""
         config, is_joint, rng = self.config, isinstance(parts[0], JointMap), np.random.default_rng(self.config.seed)
         due = Consolidation(window, config.resampling.ess_threshold) if is_joint else None
         resampler, lag = config.resampling.build(), 1 if is_joint else self.lag
         return Filter(motion, sensor, parts, proposal, resampler, config.particles, rng, lag=lag, consolidation=due)
 
     def keep_paths(self, frames: int) -> None:
-        """So many frames will be taken, of which the particles' whole paths are kept, unless the settings have a lag.
+        """Announces the number of frames, so that the particles' whole paths are kept, unless the settings have a lag.
 
-        Raises InputError: they would not fit into the machine's memory.
+        Raises InputError: they would not fit into memory.
         """
         kept = frames if self.config.lag is None else min(frames, self.config.lag)
         if self.filter.consolidation is None:
@@ -305,28 +305,28 @@ class System(ABC):
 
     @abstractmethod
     def take(self, frame: Any) -> Tracked:
-        """`track` with a frame of a recording; what shows nothing is survived, what no particle explains is refused."""
+        """`track` with a frame of a recording. Passes over frames without information; raises if no particle explains it."""
 
     @abstractmethod
     def map(self) -> MapEstimate:
-        """The landmarks as they are known now, each a Gaussian within + between particles, in the reported world."""
+        """The current landmarks, each a Gaussian (within + between particles), in the reported world."""
 
     @abstractmethod
     def measurements(self, name: str, log: FrameLog) -> FeatureLog | Measurements | None:
-        """What the system used of a recording of this name, landmarks named as in `map`: for a batch optimiser."""
+        """The measurements used, for a batch optimiser; landmarks are named as in `map`, `name` is the recording's."""
 
     @property
     def joint(self) -> JointMap | None:
-        """One Gaussian of the whole map; None where, or as long as, every particle has a map of its own."""
+        """The joint map; None while every particle has its own map."""
         held = self.filter.marginals.parts.get(Part.LANDMARK)
         return held if isinstance(held, JointMap) else None
 
     def particle_poses(self) -> np.ndarray:
-        """(N, E) world_from_body of the particles as they are now, in the reported world."""
+        """(N, E) world_from_body of the current particles, in the reported world."""
         return self.filter.belief().map.world(self.filter.particles.state[:, : self.space.size])
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
-        """Further entries of a run's summary.json; they go before the common ones of the same name."""
+        """Further entries of a run's summary.json; they override common ones of the same name."""
         return {}
 
     def files(self, log: FrameLog) -> Mapping[str, dict[str, np.ndarray] | str]:
@@ -335,7 +335,7 @@ class System(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything besides the filter that a checkpoint must hold."""
+        """The arrays of a checkpoint besides the filter's."""
 
     @abstractmethod
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -346,7 +346,7 @@ class System(ABC):
         self.filter.save(path, self.arrays() | dict(extra or {}))
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        """Goes on from a checkpoint as if nothing had happened; returns the arrays of `extra`, among others.
+        """Continues identically from a checkpoint; returns the arrays of `extra`, among others.
 
         Raises InputError: the file is missing or damaged, or belongs to another system or other settings.
         """

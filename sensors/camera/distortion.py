@@ -6,7 +6,7 @@ Radial-tangential (D. Brown 1966, A. Conrady 1919), OpenCV's k1, k2, p1, p2, k3:
     u ρ(s) + 2 p1 u v + p2 (s + 2 u²),    v ρ(s) + 2 p2 u v + p1 (s + 2 v²).
 
 Equidistant (J. Kannala and S. Brandt 2006), the k1, k2, k3, k4 of `cv2.fisheye` and of Kalibr: a direction at the angle
-θ = atan |(u, v)| from the axis is imaged on the same side of it, at a distance of
+θ = atan |(u, v)| from the axis is imaged at the same azimuth, at the radius
 θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸): Mathematics (equidistant).
 """
 
@@ -18,17 +18,17 @@ import numpy as np
 
 from rbpf.arrays import Bool, Float
 
-#: Errors of `undistort`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted.
+#: Errors of `undistort`, relative to 1 + radius, at which the iteration ends, and up to which it is accepted.
 SETTLED, SOLVED = 1e-14, 1e-12
-STALLED = 0.999  #: A step that leaves more of the error than this has no solution ahead.
-ARMIJO = 0.25  #: Fraction of the decrease promised by the derivative that a step has to keep (L. Armijo 1966).
-ITERATIONS, HALVINGS = 60, 20  #: Of Newton's method, for both lenses, and of one of its steps.
+STALLED = 0.999  #: A step that leaves more than this fraction of the error ends the iteration without a solution.
+ARMIJO = 0.25  #: Fraction of the decrease predicted by the derivative that a step has to achieve (L. Armijo 1966).
+ITERATIONS, HALVINGS = 60, 20  #: Maximum Newton steps, for both lenses, and halvings of a step.
 
 
 @final
 @dataclass(frozen=True)
 class RadialTangential:
-    """The distortion, its derivative, and where it can be undone."""
+    """The distortion, its derivative, its inverse and the inverse's domain."""
 
     coefficients: tuple[float, float, float, float, float]  #: k1, k2, p1, p2, k3.
     coefficient_names: ClassVar = ("k1", "k2", "p1", "p2", "k3")
@@ -37,12 +37,12 @@ class RadialTangential:
 
     @cached_property
     def is_identity(self) -> bool:
-        """Whether nothing is distorted."""
+        """Whether all coefficients are zero."""
         return not any(self.coefficients)
 
     @cached_property
     def monotonic_radius(self) -> float:
-        """Distance from the axis, in normalised coordinates, at which radial distortion folds the image back.
+        """Distance from the axis, in normalised coordinates, at which radial distortion stops being monotonic.
 
         The smallest positive root of d(r ρ(r²))/dr = 1 + 3 k1 r² + 5 k2 r⁴ + 7 k3 r⁶; infinite where there is none.
         """
@@ -74,15 +74,15 @@ class RadialTangential:
         return np.stack([along, across, across, down], axis=-1).reshape(*uv.shape, 2)
 
     def by_coefficients(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """What (u, v) is scaled by (…, 2) more with one more of k1, and of k2."""
+        """Derivative (…, 2) by k1 and k2 of the factor that scales (u, v)."""
         s = np.square(uv).sum(axis=-1)
         return np.stack([s, s * s], axis=-1)
 
     def is_invertible(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether the distortion is one-to-one up to (u, v) (…).
 
-        Within the monotonic radius radial distortion is; with tangential distortion its derivative must be positive
-        definite besides, which a weak one is anywhere near the image.
+        Radial distortion is so within the monotonic radius; with tangential distortion its derivative must also be positive
+        definite, which holds near the image if the tangential part is weak.
         """
         if self.is_identity:
             return np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
@@ -92,10 +92,10 @@ class RadialTangential:
         return within & (trace > 0.0) & (_determinant(slope) > 0.0)
 
     def undistort(self, target: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
-        """Normalised coordinates (K, 2) of distorted ones, NaN where there are none."""
+        """Normalised coordinates (K, 2) of distorted ones, NaN if there are none."""
         if self.is_identity:
             return np.where(self.is_invertible(target)[:, None], target, np.nan)
-        # Half of the radius is clear of the fold, where the derivative has no inverse.
+        # Start within half of the monotonic radius: at the radius itself the derivative is singular.
         length = np.maximum(np.linalg.norm(target, axis=1, keepdims=True), np.finfo(float).tiny)
         uv = target * np.minimum(1.0, 0.5 * self.monotonic_radius / length)
         error = self._misfit(uv, target)
@@ -104,7 +104,7 @@ class RadialTangential:
             if not active.size:
                 break
             reached = error[active].copy()
-            # A step of each, halved until it stays on this side of the fold and brings the error down.
+            # A Newton step of each, halved until it stays in the invertible range and reduces the error.
             miss = target[active] - self.distort(uv[active])
             step = (inverse(self.jacobian(uv[active])) @ miss[..., None])[..., 0]
             waiting = np.arange(active.size)
@@ -122,7 +122,7 @@ class RadialTangential:
         return np.where(found[:, None], uv, np.nan)
 
     def _misfit(self, uv: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Distance (K,) of distorted coordinates from where they should be, relative to 1 + the latter's length."""
+        """Distance (K,) of distorted coordinates from their targets, relative to 1 + the target's length."""
         miss = np.linalg.norm(target - self.distort(uv), axis=-1)
         return miss / (1.0 + np.linalg.norm(target, axis=-1))
 
@@ -136,31 +136,31 @@ def _fold(*k: float) -> float:
 
 
 def _determinant(matrix: np.ndarray) -> np.ndarray:
-    """Of (…, 2, 2) matrices."""
+    """Determinants of (…, 2, 2) matrices."""
     return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
 
 
 def inverse(matrix: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batch 2 2"]:
-    """Of symmetric (…, 2, 2) matrices."""
+    """Inverses of symmetric (…, 2, 2) matrices."""
     a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
     adjugate = np.stack([d, -b, -b, a], axis=-1).reshape(matrix.shape)
     return adjugate / _determinant(matrix)[..., None, None]
 
 
-#: Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.clamp_depth` begins to bend: (u, v)
-#: and its errors grow without bound towards 90°.
+#: Largest angle from the axis that is used, less than where `rbpf.sensors.camera.points.clamp_depth` sets in: (u, v) and
+#: its errors grow without bound towards 90°.
 MAX_ANGLE = np.deg2rad(75.0)
-#: Least depth of a direction over its length, see `rbpf.sensors.camera.points.clamp_depth`; below cos MAX_ANGLE, so that
-#: nothing that is seen is clamped.
+#: Least ratio of depth to length of a direction, see `rbpf.sensors.camera.points.clamp_depth`; below cos MAX_ANGLE, so that
+#: nothing visible is clamped.
 MIN_DEPTH_FRACTION = 0.2
-NEAR = 1e-16  #: Squared distance from the axis below which the lens is its own tangent, to rounding.
+NEAR = 1e-16  #: Squared distance from the axis below which the lens is linear up to rounding.
 ANGLE_SETTLED = 1e-15  #: A step of the angle, relative to 1, that ends the iteration of `undistort`.
 
 
 @final
 @dataclass(frozen=True)
 class Equidistant:
-    """The lens, its derivative, and where it can be undone; the same methods as `RadialTangential`."""
+    """The distortion, its derivative and its inverse; the same methods as `RadialTangential`."""
 
     coefficients: tuple[float, float, float, float]  #: k1, k2, k3, k4.
     coefficient_names: ClassVar = ("k1", "k2", "k3", "k4")
@@ -169,20 +169,20 @@ class Equidistant:
 
     @cached_property
     def max_angle(self) -> float:
-        """Angle from the axis [rad] up to which a direction is seen: 75°, or where the image folds back before.
+        """Largest usable angle from the axis [rad]: 75°, or less where θ_d stops being monotonic.
 
-        There is the smallest positive root of 1 + 3 k1 θ² + 5 k2 θ⁴ + 7 k3 θ⁶ + 9 k4 θ⁸.
+        That is the smallest positive root of 1 + 3 k1 θ² + 5 k2 θ⁴ + 7 k3 θ⁶ + 9 k4 θ⁸.
         """
         return min(float(MAX_ANGLE), _fold(*self.coefficients))
 
     @cached_property
     def monotonic_radius(self) -> float:
-        """Distance from the axis, in normalised coordinates, up to which a direction is seen."""
+        """Distance from the axis, in normalised coordinates, up to which directions are visible."""
         return float(np.tan(self.max_angle))
 
     @cached_property
     def image_radius(self) -> float:
-        """Distance from the axis, in distorted coordinates, of the circle in which it sees."""
+        """Distance from the axis, in distorted coordinates, of the edge of the image circle."""
         return float(self._rises_to(np.array(self.max_angle)))
 
     def distort(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -205,13 +205,13 @@ class Equidistant:
         return np.stack([per, per * angle**2], axis=-1)
 
     def is_invertible(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether a direction (u, v) (…) is seen: nearer to the axis than `max_angle`, where the lens is one-to-one."""
+        """Whether the direction (u, v) (…) is within `max_angle`, where the lens is one-to-one."""
         return np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
 
     def undistort(self, target: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
-        """Normalised coordinates (K, 2) of distorted ones, NaN where there are none.
+        """Normalised coordinates (K, 2) of distorted ones, NaN if there are none.
 
-        The angle by Newton's method, which halves what is left where it would leave it: θ_d rises up to `max_angle`.
+        The angle by Newton's method, safeguarded by bisection: θ_d is monotonic up to `max_angle`.
         """
         length = np.linalg.norm(target, axis=1)
         within = length < self.image_radius

@@ -1,7 +1,7 @@
 """Compiled twins of the pinhole camera and of its observation models, see `rbpf.sensors.camera` and `.points`.
 
-Each loop over the lanes writes few arrays, so that it compiles to vector instructions; rows of the Jacobian by the
-landmark hold the landmark's position until that Jacobian is due.
+Each loop over the lanes writes few arrays, so that it compiles to vector instructions; the rows of the Jacobian by the
+landmark hold the landmark's position until that Jacobian is computed.
 """
 
 import math
@@ -14,14 +14,14 @@ from rbpf.kernels.se3 import back, rotation, times
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
 from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION, NEAR
 
-KIND = 9  #: Place of the lens in `Pinhole.params`, the last one: 0 radial-tangential, 1 equidistant.
+KIND = 9  #: Index of the kind of lens in `Pinhole.params`, the last one: 0 radial-tangential, 1 equidistant.
 #: Pixel of a point and its Jacobian by rows: (px, py, d00, d01, d02, d10, d11, d12).
 Projected = tuple[float, float, float, float, float, float, float, float]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def project(x: float, y: float, z: float, params: np.ndarray) -> Projected:
-    """Pixel of a point (right, down, forward) and its Jacobian, of `Pinhole.params`; z = 0 divides as the error model says."""
+    """Pixel of a point (right, down, forward) and its Jacobian, by `Pinhole.params`; z = 0 gives infinity or NaN."""
     if params[KIND] == 0.0:
         return project_radial(x, y, z, params)
     return project_equidistant(x, y, z, params)
@@ -71,13 +71,13 @@ def project_equidistant(x: float, y: float, z: float, params: np.ndarray) -> Pro
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def clamp_depth(x, y, z):
-    """The depth kept positive."""
+    """The depth, raised to a positive minimum."""
     return max(z, MIN_DEPTH_FRACTION * math.sqrt(x * x + y * y + z * z))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def locate(pose, point, n, place):
-    """Points in the camera's frame, their depth kept positive, into the first three rows of `place`."""
+    """Writes points in the camera's frame, with positive depth, to the first three rows of `place`."""
     for i in range(n):
         r = rotation_at(pose, i)
         a, b = point[i] - pose[4 * BLOCK + i], point[BLOCK + i] - pose[5 * BLOCK + i]
@@ -87,9 +87,9 @@ def locate(pose, point, n, place):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def measure(place, z0, z1, params, n, nu, across, down):
-    """Residuals, and both rows by the state, of what lies at `place` in the camera's frame."""
+    """Residuals and both Jacobian rows by the state, of points `place` in the camera's frame."""
     if params[KIND] != 0.0:
-        # A loop of its own, whose arc tangents would keep the other one from becoming vectors.
+        # A separate loop: its arc tangents would prevent vector instructions in the other one.
         for i in range(n):
             x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
             px, py, d00, d01, d02, d10, d11, d12 = project_equidistant(x, y, depth, params)
@@ -110,7 +110,7 @@ def measure(place, z0, z1, params, n, nu, across, down):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def turn(pose, row, n, by_point):
-    """One row by the point, a Rᵀ, from the −a in the row by the state."""
+    """One Jacobian row by the point, a Rᵀ, from the −a in the row by the state."""
     for i in range(n):
         r = rotation_at(pose, i)
         a0, a1, a2 = -row[3 * BLOCK + i], -row[4 * BLOCK + i], -row[5 * BLOCK + i]
@@ -130,7 +130,7 @@ def camera_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_pixel(place, fx, fy, baseline, n, row):
-    """A row by the state, of fx (x − baseline) / z + fy y / z."""
+    """A Jacobian row by the state, of fx (x − baseline) / z + fy y / z."""
     for i in range(n):
         x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
         gx, gy = fx / depth, fy / depth
@@ -160,7 +160,7 @@ def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _turn_ray(pose, anchor, row, n, by_ray):
-    """One row by (u, v, ρ) from the −a in the row by the state."""
+    """One Jacobian row by (u, v, ρ) from the −a in the row by the state."""
     for i in range(n):
         r, s = rotation_at(pose, i), rotation_at(anchor, i)
         a0, a1, a2 = -row[3 * BLOCK + i], -row[4 * BLOCK + i], -row[5 * BLOCK + i]
@@ -176,7 +176,7 @@ def _turn_ray(pose, anchor, row, n, by_ray):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _scale_shift(ray, n, row):
-    """A direction moves with the camera's position by ρ times as much as a point."""
+    """Scales the position columns by ρ: a ray's direction moves by ρ times as much as a point."""
     for i in range(n):
         rho = ray[2 * BLOCK + i]
         row[3 * BLOCK + i] *= rho
@@ -189,7 +189,7 @@ def _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Residual and derivatives of the full 2-D measurement."""
     pose, ray, anchor, by_ray = flat(state), flat(mean), flat(const), flat(jac_landmark)
     across, down = flat(jac_state[0]), flat(jac_state[1])
-    # As `locate`, of directions R_a (u, v, 1) + ρ (t_a − t).
+    # As `locate`, for directions R_a (u, v, 1) + ρ (t_a − t).
     for i in range(n):
         r, s = rotation_at(pose, i), rotation_at(anchor, i)
         u, v, rho = ray[i], ray[BLOCK + i], ray[2 * BLOCK + i]
@@ -213,7 +213,7 @@ def camera_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _take_out(along, n, first, second):
-    """From vectors (first, second) their part along ∂h/∂ρ, (2, BLOCK) flat."""
+    """Removes the component along ∂h/∂ρ, (2, BLOCK) flat, from vectors (first, second)."""
     for i in range(n):
         a, b = along[i], along[BLOCK + i]
         squared = a * a + b * b
@@ -242,9 +242,9 @@ _FLAGS = types.Array(boolean, 1, "C")
 
 @njit(int64(MATRIX, MATRIX, _FLAGS, VECTOR, VECTOR, VECTOR, INDICES, MATRIX), cache=True, error_model="numpy")
 def in_view(place, first_pose, alive, pose, params, limits, rows, px):
-    """Fills `rows` and their pixels `px` (rows, 2); returns how many there are.
+    """Selects the features in view: fills `rows` and their pixels `px` (rows, 2), returns their number.
 
-    Args of features (F,): `place` (F, 4) homogeneous in the world, `first_pose` (F, 7), `alive` (F,). Of the camera:
+    Inputs per feature (F,): `place` (F, 4) homogeneous in the world, `first_pose` (F, 7), `alive` (F,). Of the camera:
     `pose` (7,), `params` (10,), `limits` (6,) = width, height, margin, monotonic radius, least cosine, most scale.
     """
     r = rotation(pose[0], pose[1], pose[2], pose[3])
@@ -262,12 +262,12 @@ def in_view(place, first_pose, alive, pose, params, limits, rows, px):
         u, v, d00, d01, _, _, d11, _ = project(x, y, z, params)
         if not (low <= u <= right and low <= v <= bottom):
             continue
-        # The distortion must be one-to-one up to there, as `Pinhole.visible` asks.
+        # The distortion must be one-to-one there, as in `Pinhole.visible`.
         along, across, down = d00 * z / params[0], d01 * z / params[0], d11 * z / params[1]
         one_way = along + down > 0.0 and along * down - across * across > 0.0
         if not (math.hypot(x / z, y / z) < limits[3] and one_way):
             continue
-        # Line of sight and distance must nearly be those of the first observation.
+        # Viewing direction and distance must be close to those of the first observation.
         a, b, along = 0.0, 0.0, 0.0
         for k in range(3):
             then, now = place[i, k] - w * first_pose[i, 4 + k], place[i, k] - w * pose[4 + k]

@@ -17,7 +17,7 @@ from rbpf.sensors.camera.distortion import Equidistant, RadialTangential, invers
 
 Lens = RadialTangential | Equidistant
 
-#: By the name of their model of distortion; each has its number, `kind`, that the compiled twin reads.
+#: Lens classes by the name of their distortion model; `kind` is its number in the compiled functions.
 LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidistant": Equidistant}
 
 
@@ -26,7 +26,7 @@ LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidis
 class Pinhole:
     """Pinhole camera with distortion (OpenCV's models and pixel convention).
 
-    Raises InputError: a number is out of its range or not finite, there is no such model of distortion, or it has another
+    Raises InputError: a number is out of its range or not finite, the distortion model is unknown, or needs another
     number of coefficients.
     """
 
@@ -38,7 +38,7 @@ class Pinhole:
     cy: float  #: row of the principal point, px.
     #: k1, k2, p1, p2, k3; of an equidistant lens k1, k2, k3, k4.
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    #: radial-tangential, or equidistant: a fisheye lens, of which 75° from the axis are seen.
+    #: radial-tangential, or equidistant: a fisheye lens, used up to 75° from the axis.
     distortion_model: str = "radial-tangential"
     dim = 2
 
@@ -57,7 +57,7 @@ class Pinhole:
 
     @classmethod
     def from_params(cls, width: int, height: int, params: Float[np.ndarray, "10"]) -> Self:
-        """The camera with these `params`. Raises InputError: as of the constructor, or no lens has this kind."""
+        """The camera with these `params`. Raises InputError: as the constructor, or no lens has this kind."""
         models = {lens.kind: name for name, lens in LENSES.items()}
         model = models.get(float(params[9]), f"of kind {params[9]:g}")
         count = len(LENSES[model].coefficient_names) if model in LENSES else 0
@@ -71,17 +71,17 @@ class Pinhole:
         return replace(self, fx=self.fx * x, fy=self.fy * y, distortion=lens)
 
     def resized(self, width: int, height: int) -> Self:
-        """The camera of its images in another size: the centre of the first pixel stays at (0, 0)."""
+        """The camera for resized images: the centre of the first pixel stays at (0, 0)."""
         x, y = width / self.width, height / self.height
         centre = x * (self.cx + 0.5) - 0.5, y * (self.cy + 0.5) - 0.5
         return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=centre[0], cy=centre[1])
 
     def turned(self, quarters: int) -> Self:
-        """The camera of its images turned clockwise by so many quarters of a turn."""
+        """The camera for images rotated clockwise by `quarters` times 90°."""
         camera = self
         for _ in range(quarters % 4):
             c, lens = camera, camera.distortion
-            if len(lens) == 5:  # the tangential part turns with the axes; what depends on the radius stays
+            if len(lens) == 5:  # the tangential coefficients rotate with the axes; the radial ones stay
                 lens = (lens[0], lens[1], lens[3], -lens[2], lens[4])
             camera = replace(
                 c, width=c.height, height=c.width, fx=c.fy, fy=c.fx, cx=c.height - 1 - c.cy, cy=c.cx, distortion=lens
@@ -97,13 +97,13 @@ class Pinhole:
     @cached_property
     def lens(self) -> Lens:
         """The distortion, in normalised coordinates."""
-        return LENSES[self.distortion_model](self.distortion)  # type: ignore[arg-type]  # counted when made
+        return LENSES[self.distortion_model](self.distortion)  # type: ignore[arg-type]  # length checked by __post_init__
 
     def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels (…, 2) of points (…, 3) in the camera's frame.
 
-        Only the direction counts: (u, v, 1) and a point at infinity work. Nothing is checked, see `visible`; a
-        point in the plane of the camera, z = 0, gets pixels that are not finite.
+        Only the direction matters: (u, v, 1) and a point at infinity work. Nothing is checked, see `visible`; a point with
+        z = 0 gets pixels that are not finite.
         """
         with np.errstate(all="ignore"):
             return self.params[:2] * self.lens.distort(_normalise(point)) + self.params[2:4]
@@ -127,8 +127,8 @@ class Pinhole:
     def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Normalised coordinates (u, v) (…, 2) of pixels (…, 2): the point lies in the direction (u, v, 1).
 
-        Newton's method on the distortion. NaN where no direction in which the distortion is one-to-one projects to
-        the pixel.
+        Newton's method on the distortion. NaN if no direction within the one-to-one range of the distortion projects to the
+        pixel.
         """
         with np.errstate(all="ignore"):
             target = (np.asarray(px, float) - self.params[2:4]) / self.params[:2]
@@ -140,9 +140,9 @@ class Pinhole:
         return inverse(self.lens.jacobian(self.unproject(px))) / self.params[:2]
 
     def field_of_view_mask(self, margin_px: float) -> Bool[np.ndarray, "H W"] | None:
-        """Pixels (H, W) that far inside the circle in which a fisheye lens sees; None where it fills the image.
+        """Pixels (H, W) inside the image circle of a fisheye lens by a margin; None if the circle fills the image.
 
-        It does with radial-tangential distortion: there `unproject` tells the few pixels that have no direction.
+        Radial-tangential lenses have no circle: there `unproject` gives NaN for the few pixels without a direction.
         """
         if np.isinf(self.lens.image_radius):
             return None
@@ -152,7 +152,7 @@ class Pinhole:
         return None if within.all() else within
 
     def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
-        """Whether pixels (…, 2) are in the image (…), and at least `margin_px` from its border.
+        """Mask (…): pixels (…, 2) are in the image, at least `margin_px` from its border.
 
         The image reaches half a pixel beyond the centres of its outermost pixels.
         """
@@ -162,7 +162,7 @@ class Pinhole:
         return within[..., 0] & within[..., 1]
 
     def visible(self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
-        """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
+        """Mask (…): points (…, 3) are in front of the camera, in the distortion's one-to-one range, and in the image."""
         with np.errstate(all="ignore"):
             seen = self.lens.is_invertible(_normalise(point)) & self.inside(self.project(point), margin_px)
         return np.logical_and(seen, np.asarray(point)[..., 2] > 0.0)
@@ -211,12 +211,12 @@ class RectifiedStereo:
         return self.camera.fx * self.baseline_m / disparity * ray
 
     def inside(self, px: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
-        """Whether (u_left, v, u_right) (…, 3) are in both images (…), and at least `margin_px` from their borders."""
+        """Mask (…): (u_left, v, u_right) (…, 3) are in both images, at least `margin_px` from their borders."""
         px = np.asarray(px, float)
         return self.camera.inside(px[..., :2], margin_px) & self.camera.inside(px[..., [2, 1]], margin_px)
 
     def visible(self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
-        """Whether points (…, 3) are seen in both images (…)."""
+        """Mask (…): points (…, 3) are visible in both images."""
         right = self._from_right(point)
         return self.camera.visible(point, margin_px) & self.camera.visible(right, margin_px)
 

@@ -1,9 +1,9 @@
 """Landmarks measured by a camera whose pose is the state, world_from_camera: points (E06 (6)–(9)), rays (§5), stereo points.
 
-Beside them known points that one landmark holds together, see `rbpf.maps.constellation`.
+Also groups of known points stored as one landmark, see `rbpf.maps.constellation`.
 
-For a right perturbation [ω, v] of world_from_camera, the direction c in which a homogeneous world point (x, w) lies,
-c = Rᵀ(x − w t), moves by −ω × c − w v. Where the state holds more than the pose, the pose comes first.
+For a right perturbation [ω, v] of world_from_camera, the direction c = Rᵀ(x − w t) of a homogeneous world point (x, w)
+moves by −ω × c − w v. A state that holds more than the pose starts with the pose.
 """
 
 from abc import abstractmethod
@@ -20,10 +20,10 @@ from rbpf.sensors.camera.distortion import MIN_DEPTH_FRACTION
 
 
 class CameraModel(ObservationModel):
-    """The chain from a landmark to pixels; a subclass says where the landmark lies.
+    """The chain from a landmark to pixels; a subclass maps the landmark to a homogeneous world point.
 
-    `about` (m,) is the substate with which the camera is as given, where it is not known: its last four numbers are those
-    of `Pinhole.tuned`, of a pair the last one is by how much columns of the right image are too large.
+    `about` (m,) is the calibration substate at which the given camera holds, if the calibration is estimated. Its last four
+    numbers are those of `Pinhole.tuned`; for a stereo pair the last one is the offset of the right image's columns.
     """
 
     def __init__(self, camera: Pinhole | RectifiedStereo, about: Given = None) -> None:
@@ -42,7 +42,7 @@ class CameraModel(ObservationModel):
         """Derivatives of x (…, 3, D) and w (…, 1, D) by the landmark."""
 
     def in_camera(self, state: Array, landmark: Array, const: Given = None) -> Array:
-        """Direction (…, 3) from the camera, in its frame; the point itself where w = 1."""
+        """Direction (…, 3) in the camera's frame; the point itself for w = 1."""
         x, w = self.world_point(landmark, const)
         position = SE3.translation(state[..., :7])
         return SE3.inverse_transform(state[..., :7], x + (1.0 - w) * position)
@@ -60,7 +60,7 @@ class CameraModel(ObservationModel):
         return np.concatenate([np.zeros((*slope.shape[:-1], self.about.size - slope.shape[-1])), slope], axis=-1)
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
-        """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the camera's slope."""
+        """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the projection's Jacobian."""
         assert landmark is not None
         direction = clamp_depth(self.in_camera(state, landmark, const))
         slope = self.camera.jacobian(direction)
@@ -79,7 +79,7 @@ class CameraModel(ObservationModel):
 
 
 class CameraPoint(CameraModel):
-    """A world point in metres (E06 §3.2): two numbers from one camera, three from a stereo pair."""
+    """A world point in metres (E06 §3.2): two pixel coordinates from one camera, three from a stereo pair."""
 
     def world_point(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         return landmark, np.ones((*landmark.shape[:-1], 1))
@@ -98,7 +98,7 @@ class CameraPoint(CameraModel):
 class CameraRay(CameraModel):
     """A landmark `InverseDepth` (u, v, q), anchored at world_from_anchor: its 2-D measurement (E06 §5.1).
 
-    `rho` (2,) is the inverse depth of a landmark just started: mean and standard deviation, 1/m.
+    `rho` (2,) is the inverse depth of a new landmark: mean and standard deviation, 1/m.
     """
 
     def __init__(self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), about: Given = None) -> None:
@@ -134,7 +134,7 @@ class CameraRay(CameraModel):
         return Records(np.broadcast_to(mean, (n, k, 3)), np.broadcast_to(full, (n, k, 3, 3)), anchor)
 
     def new_by_substate(self, z: Array) -> Array | None:
-        """What is seen at z lies where another camera sees it: ∂(u, v)/∂s = −(∂z/∂(u, v))⁻¹ ∂z/∂s."""
+        """Another calibration moves the ray of the same z: ∂(u, v)/∂s = −(∂z/∂(u, v))⁻¹ ∂z/∂s."""
         if self.about is None:
             return None
         ahead = np.insert(self.pinhole.unproject(z), 2, 1.0, axis=1)
@@ -152,10 +152,10 @@ class CameraRay(CameraModel):
 class EpipolarRay(CameraRay):
     """The part of a ray's measurement that does not depend on its depth: E06 §5.2, the epipolar constraint.
 
-    y = n̂ᵀ(z − h(b̂)) with n̂ ⟂ ∂h/∂q, which the limit P_qq → ∞ of the 2-D marginal is. It is handed on as the
-    2-D residual n̂ y with noise R: across the line it is y's, along the line a constant that no particle can change,
-    provided that R is a multiple of the identity. It is for features that are displaced in all particles: a camera that
-    has not moved sideways has no epipolar line, and is given the full residual.
+    y = n̂ᵀ(z − h(b̂)) with n̂ ⟂ ∂h/∂q is the limit P_qq → ∞ of the 2-D marginal. It is returned as the 2-D residual n̂ y
+    with noise R: across the line that is y's noise, along it a constant equal in all particles, if R is a multiple of the
+    identity. For features of which every particle's camera has moved sideways; for one that has not there is no epipolar
+    line, and the full residual is returned.
     """
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
@@ -192,9 +192,9 @@ class EpipolarRay(CameraRay):
 class StereoPoint(CameraPoint):
     """A world point in metres, seen by both cameras.
 
-    S05 (4)–(7) compares points in space, with C^L from the pixels' noise; here pixels are compared, which is the same
-    to first order and stays Gaussian where the point is far. With `about` (1,), that many pixels have been taken off
-    every u_right.
+    S05 (4)–(7) compares points in space, with C^L from the pixel noise; here pixels are compared, which is the same to
+    first order and stays Gaussian for far points. With `about` (1,), that column offset has been subtracted from every
+    u_right.
     """
 
     def __init__(self, rig: RectifiedStereo, about: Given = None) -> None:
@@ -234,7 +234,7 @@ class StereoPoint(CameraPoint):
 
 
 def clamp_depth(direction: Array) -> Array:
-    """Directions (…, 3) with the depth kept positive, so that what lies behind the camera projects far outside."""
+    """Directions (…, 3) with the depth raised to a positive minimum: points behind the camera project far outside."""
     length = np.sqrt(np.square(direction).sum(axis=-1))
     depth = np.maximum(direction[..., 2], MIN_DEPTH_FRACTION * length)
     return np.concatenate([direction[..., :2], depth[..., None]], axis=-1)
@@ -244,7 +244,7 @@ def clamp_depth(direction: Array) -> Array:
 class MembersView(ObservationModel):
     """The pixels of the points (p_1, p_2, …) of a `Constellation` at `places` (m,), one after the other: z (2m,).
 
-    Where the state holds more than world_from_camera, the pose comes first.
+    A state that holds more than world_from_camera starts with the pose.
     """
 
     def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
@@ -265,7 +265,7 @@ class MembersView(ObservationModel):
         return px.reshape(*px.shape[:-2], self.dim)
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
-        """Those of a `CameraPoint`, one below the other; a pixel depends on its own point alone."""
+        """Those of `CameraPoint`, stacked; a pixel depends on its own point alone."""
         assert landmark is not None
         by_state, by_point, _ = self._point.jacobians(state[..., None, :], self.in_world(landmark))
         assert by_state is not None and by_point is not None
@@ -276,7 +276,7 @@ class MembersView(ObservationModel):
         return Jacobians(by_state.reshape(*shape, -1), by_landmark.reshape(*shape, -1))
 
     def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
-        """Whether all of its points are in the image."""
+        """Whether all points are in the image."""
         return np.asarray(self.camera.visible(self.in_camera(state, landmark)).all(axis=-1))
 
     def kernel(self) -> FusedKernel | None:

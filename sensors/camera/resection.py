@@ -1,4 +1,4 @@
-"""Camera poses from known points (perspective-n-point): exact, with outliers, and with points of uncertain depth."""
+"""Camera poses from known points (perspective-n-point): without outliers, with outliers, and with uncertain points."""
 
 from dataclasses import dataclass
 from itertools import combinations, islice
@@ -9,25 +9,25 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole
 
-FLAT = 1e-3  #: Points whose second spread is below this fraction of the first lie on a line.
-TRIPLES = 20  #: Triples of points that are tried; four points have four.
+FLAT = 1e-3  #: Points whose second singular value is below this fraction of the first lie on a line.
+TRIPLES = 20  #: Maximum number of triples tried; four points have four.
 
 
 def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
     """Pose world_from_camera (7,) of least reprojection error of points (M, 3) in the world, seen at px (M, 2).
 
-    Every solution of the first triples of points is refined on all of them, because few points have several local
-    optima and a single start may find the wrong one. Raises InputError: there are fewer than four points, they lie on a
-    line, or no pose in front of them explains them.
+    Every P3P solution of the first triples of points is refined on all points, because few points leave several local
+    optima and a single start may reach the wrong one. Raises InputError: there are fewer than four points, they are
+    collinear, or no pose has all of them in front of the camera.
     """
     if points.shape[0] < 4:
-        raise InputError(f"a start from known points needs at least four that are seen, got {points.shape[0]}")
+        raise InputError(f"initialisation from known points needs at least four in the image, got {points.shape[0]}")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[1] <= FLAT * spread[0]:
-        raise InputError("the known points lie on a line: add one beside it, the camera could turn around them")
+        raise InputError("the known points lie on a line: add one off it, else the rotation about it is undetermined")
     uv = camera.unproject(px)
     if not np.isfinite(uv).all():
-        raise InputError("a known point is seen where the camera's distortion has no direction: check the calibration")
+        raise InputError("a known point's pixel has no ray under the camera's distortion: check the calibration")
     # Local optima of the reprojection error, from the solutions of the first triples of points.
     import cv2
 
@@ -42,12 +42,12 @@ def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
         costs = np.square(seen[..., :2] / seen[..., 2:] - uv).sum(axis=(1, 2))
     costs = np.where((seen[..., 2] > 0.0).all(axis=1) & np.isfinite(costs), costs, np.inf)
     if not costs.size or not np.isfinite(costs.min()):
-        raise InputError("no camera in front of the known points sees them as measured: check their names and order")
+        raise InputError("no camera pose has all known points in front of it: check their names and order")
     return poses[int(np.argmin(costs))]
 
 
 def three_point_poses(points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator) -> np.ndarray:
-    """Poses world_from_camera (C, 7) of three of the points (M, 3) each, seen at uv (M, 2), drawn `triples` times."""
+    """P3P poses world_from_camera (C, 7) of random triples of the points (M, 3), seen at uv (M, 2)."""
     matrices = []
     for _ in range(triples):
         rows = rng.choice(points.shape[0], 3, replace=False)
@@ -72,26 +72,26 @@ def _matrix(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return np.column_stack([cv2.Rodrigues(turn)[0], shift])
 
 
-ROUNDS = 10  #: Of Gauss-Newton; points are taken in and out before each.
+ROUNDS = 10  #: Gauss-Newton steps; the inliers are reselected before each.
 
 
 @dataclass(frozen=True)
 class Resected:
-    """A camera world_from_camera (7,), and the points that say so, `inliers` (M,)."""
+    """A camera pose world_from_camera (7,), and its `inliers` (M,)."""
 
     world_from_camera: np.ndarray
-    information: np.ndarray  #: (6, 6) JᵀJ of the inliers' pixels at it, right chart, order [ω, v], 1/px².
+    information: np.ndarray  #: (6, 6) JᵀJ of the inliers' residuals in σ, right chart, order [ω, v].
     inliers: np.ndarray
-    rms_px: float  #: of the inliers, per axis, with their degrees of freedom.
+    rms_px: float  #: residual of the inliers per axis, in σ, corrected for the degrees of freedom.
 
 
 def resect_consensus(
     camera: Pinhole, points: np.ndarray, px: np.ndarray, within_px: float, triples: int, rng: np.random.Generator
 ) -> Resected | None:
-    """The camera that most points (M, 3) agree with, refined on these; they agree if seen at px (M, 2) `within_px`.
+    """RANSAC: the pose of lowest truncated error, refined on its inliers, points (M, 3) `within_px` of px (M, 2).
 
     Returns:
-        None where fewer than four agree, or they do not fix the camera.
+        None with fewer than four inliers, or if they do not determine the pose.
     """
     if points.shape[0] < 4:
         return None
@@ -99,26 +99,26 @@ def resect_consensus(
     if not poses.shape[0]:
         return None
     errors = squared_distances(camera, poses, Sights.known(points, px))
-    # The truncated error tells apart poses that as many points agree with (P. Torr and A. Zisserman 2000).
+    # The truncated error ranks poses with equal numbers of inliers (P. Torr and A. Zisserman 2000).
     pose = poses[np.minimum(errors, within_px**2).sum(axis=1).argmin()]
     return refined(camera, pose, points, px, within_px)
 
 
 def refined(camera: Pinhole, pose: np.ndarray, points: np.ndarray, px: np.ndarray, within_px: float) -> Resected | None:
-    """`refined_on_all` of points (M, 3) that are known and agree if they are seen (M, 2) within so many px."""
+    """`refined_on_all` for known points (M, 3), which are inliers within `within_px` of px (M, 2)."""
     return refined_on_all(camera, pose, Sights.known(points, px), (within_px**2,) * (ROUNDS + 1))
 
 
-GATE = 9.2  #: Squared Mahalanobis distance within which a point agrees: 99 % of two dimensions.
-#: Of each round of Gauss-Newton, and of the result: a first guess may be some pixels off everywhere.
+GATE = 9.2  #: Squared Mahalanobis distance of inliers: 99 % quantile in two dimensions.
+#: Gates of each Gauss-Newton step and of the result; wide at first, as the first guess may be pixels off.
 GATES = tuple(GATE * wider for wider in (16.0, 16.0, 4.0, 4.0, 1.0, 1.0, 1.0, 1.0, 1.0))
 
 
 @dataclass(frozen=True)
 class Sights:
-    """M points (M, 3) in the world and where they may be seen, px (M, 2) with `std_px` (M,) per axis.
+    """M points (M, 3) in the world and their measured pixels px (M, 2) with standard deviation `std_px` (M,) per axis.
 
-    `spread` (M, 3) is the standard deviation of each point along one direction; zero where it is known.
+    `spread` (M, 3) is the standard deviation of each point along one direction; zero for a known point.
     """
 
     points: np.ndarray
@@ -128,25 +128,25 @@ class Sights:
 
     @classmethod
     def known(cls, points: np.ndarray, px: np.ndarray, std_px: float = 1.0) -> "Sights":
-        """Of points that are known, seen equally well."""
+        """Of known points, all with the same pixel noise."""
         return cls(points, np.zeros_like(points), px, np.full(len(px), std_px))
 
     def __add__(self, other: "Sights") -> "Sights":
-        """Both, one after the other."""
+        """Both, concatenated."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
         return Sights(*(np.concatenate(pair) for pair in pairs))
 
 
 def squared_distances(camera: Pinhole, poses: np.ndarray, sights: Sights) -> np.ndarray:
-    """Mahalanobis distances (C, M), squared, of what poses world_from_camera (C, 7) predict; infinite behind them."""
+    """Squared Mahalanobis distances (C, M) from predictions of poses (C, 7); infinite for points behind a camera."""
     return _compared(camera, poses, sights)[0]
 
 
 def refined_on_all(camera: Pinhole, pose: Array, sights: Sights, gates: tuple[float, ...] = GATES) -> Resected | None:
-    """The camera near a first guess world_from_camera (7,) that most points agree on.
+    """Refines a first guess world_from_camera (7,) on its inliers.
 
-    Its information is in 1/px², `rms_px` in σ. `gates` are the squared distances within which a point agrees, in each
-    round of Gauss-Newton and at its end. None where fewer than four agree, or they do not fix the camera.
+    Its `information` and `rms_px` are in σ. `gates` are the squared distances of inliers, for each Gauss-Newton step and
+    for the result. None with fewer than four inliers, or if they do not determine the pose.
     """
     for rounds_left in range(len(gates))[::-1]:
         squared, miss, seen, white = (array[0] for array in _compared(camera, pose[None], sights))
@@ -166,9 +166,9 @@ def refined_on_all(camera: Pinhole, pose: Array, sights: Sights, gates: tuple[fl
 
 
 def _compared(camera: Pinhole, poses: Array, sights: Sights) -> tuple[Array, Array, Array, Array]:
-    """Squared distances (C, M), whitened misses (C, M, 2), points in the camera (C, M, 3), whitening (C, M, 2, 2).
+    """Squared distances (C, M), whitened residuals (C, M, 2), points in the camera (C, M, 3), whitening (C, M, 2, 2).
 
-    With the image's slope d along the spread, the covariance is S = σ² I + d dᵀ, and S^(−1/2) = (I − k d dᵀ) / σ.
+    With d, the spread projected to the image, the covariance is S = σ² I + d dᵀ, and S^(−1/2) = (I − k d dᵀ) / σ.
     """
     seen = SE3.inverse_transform(poses[:, None], sights.points)
     turn = SE3.inverse_transform(poses[:, None], sights.points + sights.spread) - seen

@@ -1,8 +1,8 @@
-"""What finds keypoints in an image and what describes them: the classes to subclass for another front end.
+"""Interfaces of keypoint detectors and descriptors: the classes to subclass for another front end.
 
-- `Detector`: where an image has something to find again. The base class chooses the best, spread over the image.
-- `Descriptor`: vectors of length 1 whose distance says whether two keypoints show one thing.
-- `FeatureExtractor`: both at once, as the stereo system takes it; `Extractor` puts any two together.
+- `Detector`: proposes and scores keypoints. The base class chooses the best, spread over the image.
+- `Descriptor`: vectors of length 1 whose distance tells whether two keypoints show the same point.
+- `FeatureExtractor`: both at once, as used by the stereo system; `Extractor` combines any two.
 
 Pixels are (column, row), with the centre of the top-left one at (0, 0). Images are grey, (H, W) uint8.
 """
@@ -18,7 +18,7 @@ from rbpf.errors import InputError
 
 #: Scale of a keypoint whose SIFT descriptor covers a window of 31 × 31 px; that of corners, which have none.
 WINDOW_SCALE_PX = 2.0
-#: Windows described on one sheet are set apart by copies of their borders: a descriptor may blur the image first.
+#: Padding of windows that are described in one mosaic, by copies of their borders: descriptors may blur the image.
 SHEET_PAD_PX = 6
 
 
@@ -27,7 +27,7 @@ class Keypoints(RowByRow):
     """Keypoints of an image, best first."""
 
     px: np.ndarray  #: (K, 2) pixel.
-    scale: np.ndarray  #: (K,) standard deviation of the Gaussian at which each was found, px.
+    scale: np.ndarray  #: (K,) standard deviation of the Gaussian at which each was detected, px.
     orientation: np.ndarray  #: (K,) direction, [0, 2π), from the columns' axis towards the rows'.
     score: np.ndarray  #: (K,) of the detector, in its unit.
 
@@ -39,7 +39,7 @@ class Keypoints(RowByRow):
         orientation: np.ndarray | float = 0.0,
         score: np.ndarray | float = 0.0,
     ) -> "Keypoints":
-        """Keypoints at pixels (K, 2); what is one number is the same for all."""
+        """Keypoints at pixels (K, 2); scalars apply to all."""
         count = px.shape[0]
         one_each = (np.broadcast_to(np.asarray(value, float), count) for value in (scale, orientation, score))
         return Keypoints(np.asarray(px, float), *one_each)
@@ -56,10 +56,10 @@ class Features(Keypoints):
 class Detector(ABC):
     """Finds keypoints.
 
-    A subclass proposes candidates and scores them; `detect`, which is the same for all, chooses among them.
+    A subclass proposes candidates and scores them; the common `detect` chooses among them.
     """
 
-    margin_px: int = 0  #: What `candidates` needs of the image around a keypoint.
+    margin_px: int = 0  #: Pixels around a keypoint that `candidates` reads.
 
     @abstractmethod
     def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -67,11 +67,11 @@ class Detector(ABC):
 
         Args:
             image: (H, W) uint8.
-            margin_px: no candidate may be nearer to the outermost pixels' centres; the image is larger than twice this.
+            margin_px: least distance of candidates from the outermost pixels' centres; the image is larger than twice this.
             mask: (H, W) bool, where a candidate may be; None for everywhere.
 
         Returns:
-            Pixels (M, 2) and scores (M,). Equal scores are chosen in this order.
+            Pixels (M, 2) and scores (M,). Ties are broken by this order.
         """
 
     @final
@@ -84,12 +84,12 @@ class Detector(ABC):
         border_px: float = 16.0,
         mask: np.ndarray | None = None,
     ) -> Keypoints:
-        """The best keypoints, best first, at least `spacing_px` from each other and from pixels already taken.
+        """The best keypoints, best first, at least `spacing_px` from each other and from occupied pixels.
 
         Args:
             image: (H, W) uint8.
-            count: at most so many.
-            occupied: (M, 2) pixels of features already in the image; those that are not finite are passed over.
+            count: maximum number.
+            occupied: (M, 2) pixels of features already in the image; those that are not finite are ignored.
             spacing_px: the least distance.
             border_px: the least distance from the outermost pixels' centres.
             mask: (H, W) bool, where a keypoint may be; None for everywhere.
@@ -106,7 +106,7 @@ class Detector(ABC):
         if min(image.shape) <= 2 * margin:
             return Keypoints.at(np.zeros((0, 2)))
         px, score = self.candidates(image, margin, mask)
-        # The best one that is free is taken, and what is too near to it is free no more.
+        # Greedy: take the best free one, which blocks all those too close to it.
         order, chosen = np.argsort(-score, kind="stable"), np.empty(count, dtype=np.int64)
         px, taken = px[order].astype(float), np.ascontiguousarray(taken[np.isfinite(taken).all(axis=1)])
         chosen = chosen[: choose_apart(px, taken, spacing_px, chosen)]
@@ -114,7 +114,7 @@ class Detector(ABC):
 
 
 class Descriptor(ABC):
-    """Describes keypoints, so that they are found again without knowing where to look."""
+    """Describes keypoints, so that they are recognised without a predicted position."""
 
     length: int  #: Entries of a descriptor.
 
@@ -124,7 +124,7 @@ class Descriptor(ABC):
 
         Args:
             image: (H, W) uint8.
-            keypoints: K of them, with the scale and the orientation at which they are described.
+            keypoints: K keypoints, with the scale and the orientation for their descriptors.
 
         Raises InputError: the image is not (H, W) uint8.
         """
@@ -145,13 +145,13 @@ class Descriptor(ABC):
 
 
 class FeatureExtractor(ABC):
-    """Finds keypoints and describes them."""
+    """Detects and describes keypoints."""
 
     length: int  #: Entries of a descriptor.
 
     @abstractmethod
     def extract(self, image: np.ndarray) -> Features:
-        """Features of an image (H, W) uint8, best first; none where there is no texture.
+        """Features of an image (H, W) uint8, best first; none without texture.
 
         Raises InputError: the image is not (H, W) uint8.
         """
@@ -160,13 +160,13 @@ class FeatureExtractor(ABC):
 @final
 @dataclass(eq=False)
 class Extractor(FeatureExtractor):
-    """Any detector with any descriptor."""
+    """Combines any detector with any descriptor."""
 
     detector: Detector
     descriptor: Descriptor
-    count: int = 1000  #: keypoints of an image, at most.
-    spacing_px: float = 5.0  #: from each other, at least.
-    border_px: float = 16.0  #: from the image's border, at least.
+    count: int = 1000  #: most keypoints per image.
+    spacing_px: float = 5.0  #: least distance from each other.
+    border_px: float = 16.0  #: least distance from the image's border.
 
     def __post_init__(self) -> None:
         self.length = self.descriptor.length
@@ -178,7 +178,7 @@ class Extractor(FeatureExtractor):
 
 
 def checked_image(image: np.ndarray) -> np.ndarray:
-    """The image, its rows one after the other in memory. Raises InputError: it is not (H, W) uint8."""
+    """The image, contiguous in memory. Raises InputError: it is not (H, W) uint8."""
     if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
         found = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
         raise InputError(f"an image must be grey, (H, W) uint8, got {found}: convert it first")

@@ -1,4 +1,4 @@
-"""Compiled: how good FAST's corners are, which of them is the best among its neighbours, and which are apart."""
+"""Compiled: scores of FAST corners, non-maximum suppression, and selection at a minimum distance."""
 
 import math
 from pathlib import Path
@@ -15,10 +15,10 @@ _PIXELS = types.Array(int64, 2, "C", readonly=True)
 _SOBEL_TO_SLOPE = 1.0 / 8.0  #: Sobel's sums are so many times the slope, in grey levels per pixel.
 
 
-# Few arrays in a loop: with more of them the compiler cannot know that they do not overlap, and takes pixel by pixel.
+# Few arrays per loop: with more the compiler cannot rule out that they overlap, and does not vectorise.
 @njit(cache=True, error_model="numpy")
 def _sobel(above, here, below, u, v):
-    # Whole numbers of 32 bits all through, as many at once as there is room for.
+    # 32-bit integers throughout, so that a vector instruction holds as many as possible.
     for x in range(1, here.shape[0] - 1):
         a, b, c = np.int32(above[x - 1]), np.int32(above[x]), np.int32(above[x + 1])
         d, e = np.int32(here[x - 1]), np.int32(here[x + 1])
@@ -29,7 +29,7 @@ def _sobel(above, here, below, u, v):
 
 @njit(cache=True, error_model="numpy")
 def _exchange(u, v, products, sums):
-    # A row's products take the place of those that leave the window.
+    # Replaces the products of the row that leaves the window, and updates the column sums.
     for x in range(u.shape[0]):
         new = np.int32(u[x] * v[x])
         sums[x] += np.int32(new - products[x])
@@ -38,14 +38,14 @@ def _exchange(u, v, products, sums):
 
 @njit(void(_IMAGE, _PIXELS, int64, VECTOR), cache=True, error_model="numpy")
 def least_eigenvalues(image, px, window, out):
-    """Of the mean of ∇I ∇Iᵀ over the window (odd) around pixels (K, 2), which come row by row: out (K,).
+    """Least eigenvalues out (K,) of the mean of ∇I ∇Iᵀ over odd windows around pixels (K, 2), sorted by row.
 
-    The derivatives are Sobel's. No pixel may be nearer to the image's border than half a window and one more.
+    The derivatives are Sobel's. Pixels must be at least half a window plus one from the image's border.
     """
     count, half, width = px.shape[0], window // 2, image.shape[1]
     if not count:
         return
-    # Of the last rows ∂u², ∂u∂v and ∂v², and their sums down the columns, in whole numbers and so without error.
+    # ∂u², ∂u∂v and ∂v² of the last rows, and their column sums, in integers and thus exact.
     held, sums = np.zeros((window, 3, width), np.int32), np.zeros((3, width), np.int32)
     u, v = np.zeros(width, np.int32), np.zeros(width, np.int32)
     k, first = 0, px[0, 1] - half
@@ -67,7 +67,7 @@ def least_eigenvalues(image, px, window, out):
 
 @njit(void(_PIXELS, VECTOR, MATRIX, types.Array(boolean, 1, "C")), cache=True)
 def highest(px, score, rated, out):
-    """Whether none of the eight neighbours of pixels (K, 2) is one of them and scores higher; `rated` (H, W) is −∞."""
+    """Mask of the pixels (K, 2) of which no candidate among the 8 neighbours scores higher; `rated` (H, W) is −∞."""
     along, width = rated.reshape(rated.size), rated.shape[1]
     for k in range(px.shape[0]):
         along[px[k, 1] * width + px[k, 0]] = score[k]
@@ -82,9 +82,9 @@ def highest(px, score, rated, out):
 
 @njit(int64(READ_ONLY, READ_ONLY, float64, INDICES), cache=True)
 def choose_apart(px, taken, spacing, chosen):
-    """Fills the front of chosen with which of px (K, 2), the first before the next, are so far from `taken` (M, 2) and others.
+    """Greedily chooses rows of px (K, 2) at least `spacing` from `taken` (M, 2) and each other, into `chosen`.
 
-    Returns how many there are.
+    Returns their number.
     """
     count, least = 0, spacing * spacing
     for k in range(px.shape[0]):

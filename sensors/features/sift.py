@@ -1,11 +1,11 @@
 """Keypoints of the difference of Gaussians with SIFT descriptors (D. Lowe, IJCV 60(2), 2004), the features of S05 §III-A.
 
-OpenCV detects and describes.
+OpenCV does both.
 
 A descriptor has 128 entries: 4 × 4 spatial windows of 8 orientations each; or 36, as S05 has it: 3 × 3 windows of 4
-orientations. S05 does not say how its descriptors were formed. Here windows are added two by two in both directions,
-overlapping, so that 4 become 3; and with h_o the histogram's entry at o · 45°, the entry at o · 90° becomes
-h_2o + (h_2o−1 + h_2o+1) / 2, so that every one of the 8 counts once and none is preferred to its mirror image.
+orientations. S05 does not say how its descriptors were formed. Here adjacent windows are added two by two in both
+directions, overlapping, so that 4 become 3; and with h_o the histogram entry at o · 45°, the entry at o · 90° becomes h_2o
++ (h_2o−1 + h_2o+1) / 2, so that each of the 8 has the same total weight and the result is mirror symmetric.
 
 Entries are then scaled to length 1 ("sift"), or to sum 1 and their roots taken ("root"), which makes the product of
 two descriptors the Bhattacharyya coefficient of two histograms (R. Arandjelović, A. Zisserman, CVPR 2012). Either way
@@ -28,9 +28,9 @@ _SIGMA = 1.6  #: Blur of the first image of an octave; OpenCV's default, which i
 class SiftConfig(Ranged):
     """Settings of the detector and of the descriptors."""
 
-    features: CountOrNone = 1000  #: the most keypoints of an image, those of highest contrast; 0 for all.
-    #: the image is reduced by this before it is looked at, 0.5 for half of each side; places and scales stay in
-    #: pixels of the image that was given.
+    features: CountOrNone = 1000  #: maximum number of keypoints per image, those of highest contrast; 0 for all.
+    #: factor by which the image is resized before detection, 0.5 for half of each side; pixels and scales refer to the
+    #: original image.
     working_scale: Annotated[float, Range(gt=0.0, le=1.0)] = 0.5
     #: least contrast of an extremum; OpenCV's unit, Lowe's 0.03 is 0.09 with three layers.
     contrast: NotNegative = 0.04
@@ -42,14 +42,14 @@ class SiftConfig(Ranged):
 
 @final
 class Sift(FeatureExtractor, Descriptor):
-    """Finds and describes keypoints."""
+    """Detects and describes keypoints."""
 
     def __init__(self, config: SiftConfig | None = None) -> None:
         self.config = config or SiftConfig()
         self.length = self.config.length
 
     def extract(self, image: np.ndarray) -> Features:
-        """A place with two strong directions is two keypoints."""
+        """A position with two dominant orientations gives two keypoints."""
         config = self.config
         reduced = self._reduced(image)
         found, histograms = self._sift.detectAndCompute(reduced, None)
@@ -64,12 +64,12 @@ class Sift(FeatureExtractor, Descriptor):
             score=table[:, 4],
             descriptors=descriptors_from_histograms(histograms, config.length, config.norm),
         )
-        # OpenCV keeps the strongest, and ties, in no particular order.
+        # OpenCV returns the strongest in no particular order, and more in case of ties.
         order = np.lexsort((features.orientation, features.px[:, 0], features.px[:, 1], -features.score))
         return features.take(order[: config.features or None])
 
     def describe(self, image: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-        """On the image as it is: what moves between the views, scale and direction, is that of the keypoints."""
+        """On the unresized image, at the keypoints' scale and orientation."""
         import cv2
 
         config = self.config
@@ -96,7 +96,7 @@ class Sift(FeatureExtractor, Descriptor):
         import cv2
 
         config = self.config
-        # Without the precise scaling every pixel is a quarter off.
+        # Without precise upscaling all keypoints are off by a quarter of a pixel.
         return cv2.SIFT.create(config.features, config.layers, config.contrast, config.edge, _SIGMA, True)
 
 

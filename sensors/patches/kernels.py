@@ -1,8 +1,8 @@
 """Compiled resampling, correlation and refinement of image patches, see `rbpf.sensors.patches.search`.
 
-The refinement is Gauss-Newton on the place p that maximises ρ(p) = tᵀw(p), with the template t and the image's window
+The refinement is Gauss-Newton on the position p that maximises ρ(p) = tᵀw(p), with the template t and the image's window
 w(p), each without mean and with unit norm: δ = (JᵀJ)⁻¹Jᵀ(t/ρ − w), J = (I − wwᵀ) ∂w/∂p. The gradients are the window's,
-not the template's: the noise of both then comes out smaller than with gradients computed once from the template.
+not the template's: this reduces the effect of both images' noise, compared to fixed gradients of the template.
 """
 
 import math
@@ -15,7 +15,7 @@ from rbpf.kernels.signature import MATRIX, READ_ONLY, discard_stale, in_parts
 
 discard_stale(Path(__file__).parent)
 
-# What is read may be locked.
+# Input arrays may be read-only.
 IMAGE = types.Array(uint8, 2, "C", readonly=True)
 _WINDOWS = types.Array(uint8, 3, "C", readonly=True)
 _TEMPLATES = types.Array(float32, 3, "C", readonly=True)
@@ -24,10 +24,10 @@ _READ_ONLY_CUBE = types.Array(float64, 3, "C", readonly=True)
 
 @njit(cache=True, error_model="numpy")
 def footprint(a, b, c, d, most):
-    """Offsets (m, 2) in the source whose mean is what a pixel of the template gathers.
+    """Offsets (m, 2) of the source samples whose mean gives one pixel of the template.
 
-    A pixel of the template covers A of a source pixel's square. The source's own pixels are squares already, so
-    what is missing has the covariance (A Aᵀ − I)/12, no less than 0 along each of its axes.
+    A template pixel covers the square of a source pixel mapped by A. Source pixels already average over their own square,
+    so the missing blur has the covariance (A Aᵀ − I)/12, clipped at 0 along each axis.
     """
     uu, uv, vv = a * a + b * b, a * c + b * d, c * c + d * d
     angle = 0.5 * math.atan2(2.0 * uv, uu - vv)
@@ -46,7 +46,7 @@ def footprint(a, b, c, d, most):
 
 @njit(cache=True, error_model="numpy")
 def _step(width, index, count):
-    """The place of one of `count` equal steps around 0 that have the variance of a box of this width."""
+    """One of `count` equidistant samples around 0 that have the variance of a box of this width."""
     if count == 1:
         return 0.0
     return width * (index - 0.5 * (count - 1)) / math.sqrt(count * count - 1.0)
@@ -54,7 +54,7 @@ def _step(width, index, count):
 
 @njit(cache=True, error_model="numpy")
 def surroundings(image, left, top, side):
-    """Grey levels (side, side) from a column and a row on, the image's border repeated."""
+    """Grey levels (side, side) with the top left corner (left, top); the image's border is repeated."""
     height, width = image.shape
     area = np.empty((side, side), np.float32)
     for j in range(side):
@@ -66,7 +66,7 @@ def surroundings(image, left, top, side):
 
 @njit(cache=True, error_model="numpy")
 def cubic(area, x, y):
-    """Catmull-Rom interpolation in `surroundings` from (−1, −1) on, at column x and row y of those."""
+    """Catmull-Rom interpolation in `surroundings` that start at (−1, −1), at column x and row y."""
     u, v = int(x), int(y)
     across, down = weights(x - u), weights(y - v)
     total = 0.0
@@ -80,7 +80,7 @@ def cubic(area, x, y):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def weights(t):
-    """Catmull-Rom weights of the samples at −1, 0, 1, 2 for a place t in 0..1."""
+    """Catmull-Rom weights of the samples at −1, 0, 1, 2 for a position t in 0..1."""
     s = 1.0 - t
     return (-0.5 * t * s * s, 1.0 + t * t * (1.5 * t - 2.5), 1.0 + s * s * (1.5 * s - 2.5), -0.5 * s * t * t)
 
@@ -122,9 +122,9 @@ def cut_window(image, x, y, window):
             window[j, i] = np.uint8(min(max(math.floor(grey + 0.5), 0.0), 255.0))
 
 
-_LANES = 4  #: Columns of a template taken together, so that a sum is loaded and stored once for all of them.
-_BETWEEN = 40  #: Pixels that take as long as the beginning of a line.
-_HALF_DIAGONAL_SQUARED = 0.51  #: A little over ½ px²: the nearest whole pixel is never further.
+_LANES = 4  #: Columns of a template processed together, so that a sum is loaded and stored once for all of them.
+_BETWEEN = 40  #: Cost of starting a line, in pixels.
+_HALF_DIAGONAL_SQUARED = 0.51  #: A little over ½ px²: the nearest whole pixel is never farther away.
 
 
 @njit(cache=True, error_model="numpy")
@@ -151,7 +151,7 @@ def normalised(template, least_std):
 
 @njit(cache=True, error_model="numpy")
 def ellipse(cov, sigmas):
-    """Variances and covariance of the searched ellipse; NaN where they are those of no Gaussian.
+    """Variances and covariance of the searched ellipse; NaN if the covariance is not valid.
 
     Half a pixel's diagonal is added to each half axis in quadrature, so that some whole pixel is always inside.
     """
@@ -164,7 +164,7 @@ def ellipse(cov, sigmas):
 
 @njit(cache=True, error_model="numpy")
 def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores):
-    """Correlation of the unit template at the whole pixels of the ellipse; −1 where the image is flat."""
+    """Correlation of the unit template at the whole pixels of the ellipse; −1 where the image has no texture."""
     half, (height, width) = size // 2, scores.shape
     left, top = columns[0] - half, rows[0] - half
     grey = levels(image[top : top + height + size - 1, left : left + width + size - 1], unit.shape[1] - size)
@@ -172,7 +172,7 @@ def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores)
     cross = np.empty(lines[-1, 1], np.float32)
     y = 0
     while y < height:
-        # Lines are correlated together with what is between them, where that is less than what each of them costs.
+        # Consecutive lines are correlated in one run, gaps included, where that costs less than separate runs.
         start, end = lines[y]
         y += 1
         while y < height and lines[y, 0] - end <= _BETWEEN:
@@ -189,7 +189,7 @@ def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores)
         if count > 0:
             _window_sums(sums[first:], size, count, window)
             _window_sums(squares[first:], size, count, window_squares)
-            # Scores from Σ unit · grey and the windows' sums, whose variance is exact.
+            # Scores from Σ unit · grey and the windows' sums, which give exact variances.
             n, products = size * size, cross[lines[y, 0] :]
             for x in range(count):
                 spread = float(n) * window_squares[x] - float(window[x]) * float(window[x])
@@ -200,7 +200,7 @@ def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores)
 
 @njit(cache=True, error_model="numpy")
 def lines_inside(centre, cov, sigmas, columns, rows, stride):
-    """Of each row the first pixel of the ellipse and one beyond the last, counted along rows of this length (height, 2)."""
+    """For each row the first pixel of the ellipse and one past the last (height, 2), as indices with this row stride."""
     uu, uv, vv = ellipse(cov, sigmas)
     slope = uv / vv
     narrow, height = max(uu - uv * slope, 0.0), rows[1] - rows[0] + 1
@@ -218,9 +218,9 @@ def lines_inside(centre, cov, sigmas, columns, rows, stride):
 
 @njit(cache=True, error_model="numpy")
 def levels(part, padding):
-    """Grey levels with columns of zeros behind them.
+    """Grey levels, padded on the right by columns of zeros.
 
-    Their mean is taken off: a template without mean does not feel it, and rounding comes down.
+    Their mean is subtracted: it does not affect a zero-mean template, and rounding errors become smaller.
     """
     grey = np.zeros((part.shape[0], part.shape[1] + padding), np.float32)
     total = 0
@@ -236,7 +236,7 @@ def levels(part, padding):
 
 @njit(cache=True, error_model="numpy")
 def _slide(row, sign, sums, squares):
-    """Adds a row of the image to the sums of each column, or takes it off."""
+    """Adds a row of the image to the sums of each column, or subtracts it."""
     for x in range(sums.shape[0]):
         grey = np.int32(row[x])
         sums[x] += np.int32(sign) * grey
@@ -245,7 +245,7 @@ def _slide(row, sign, sums, squares):
 
 @njit(cache=True, error_model="numpy")
 def _window_sums(columns, size, count, out):
-    """Sums over `size` columns from each of the first `count` on."""
+    """Sums over `size` columns, starting at each of the first `count` columns."""
     total = np.int32(0)
     for x in range(size - 1):
         total += columns[x]
@@ -257,7 +257,7 @@ def _window_sums(columns, size, count, out):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _correlate(grey, unit, start, count, cross):
-    """Σ unit · grey at `count` pixels from the one numbered `start` on, counted along the rows."""
+    """Σ unit · grey at `count` consecutive pixels from index `start`, in row-major order."""
     along, stride = grey.reshape(grey.size), grey.shape[1]
     for x in range(count):
         cross[x] = 0.0
@@ -271,21 +271,21 @@ def _correlate(grey, unit, start, count, cross):
 
 
 _EVALUATIONS = 12
-#: Determinant of JᵀJ over the product of its diagonal, below which the window has slopes along one line only.
+#: Determinant of JᵀJ over the product of its diagonal, below which the window has gradients along one direction only.
 _SINGULAR = 1e-9
-#: Error of the place, per axis, that remains without noise: measured on random textures blurred by 0.5 px.
+#: Position error per axis that remains without noise: measured on random textures blurred by 0.5 px.
 _INTERPOLATION_PX = 0.02
 _SETTLED_PX = 0.01
-_REACH_PX = 1.0  #: A maximum further from the best whole pixel along rows or columns is none of this peak.
-_MARGIN = 4  #: What a window needs around it to be moved by `_REACH_PX`, interpolated and differentiated.
+_REACH_PX = 1.0  #: A maximum farther from the best whole pixel along rows or columns belongs to another peak.
+_MARGIN = 4  #: Margin that a window needs to be moved by `_REACH_PX`, interpolated and differentiated.
 
 
 @njit(cache=True, error_model="numpy")
 def refine(image, unit, size, column, row, found):
-    """Writes place, score and covariance, found[0:2], [2] and [4:7].
+    """Subpixel refinement; writes position, score and covariance, found[0:2], [2] and [4:7].
 
-    A step after which ρ is lower is taken back by half. Where no maximum is near, the whole pixel and the score
-    that the caller wrote stay, and the covariance is NaN.
+    A step that lowers ρ is halved. If no maximum is near, the whole pixel and its score, which the caller wrote, stay, and
+    the covariance is NaN.
     """
     found[0], found[1], found[4:] = float(column), float(row), np.nan
     reach = size // 2 + _MARGIN
@@ -309,9 +309,9 @@ def refine(image, unit, size, column, row, found):
         if max(abs(du), abs(dv)) < _SETTLED_PX:
             break
     found[0], found[1], found[2] = column + x + du, row + y + dv, highest
-    # The residual's variance times (JᵀJ)⁻¹, and the interpolation's own error. Half of the residual is taken as the window's
-    # noise: a central difference halves its variance, so that a quarter of the residual's square sum is what noise adds to
-    # each diagonal element of JᵀJ. Where noise explains the slopes the covariance stays NaN.
+    # The residual's variance times (JᵀJ)⁻¹, plus the interpolation error. Half of the residual is attributed to the window's
+    # noise, whose variance a central difference halves: noise adds a quarter of the residual's square sum to each diagonal
+    # element of JᵀJ, which is subtracted. If noise explains all gradients, the covariance stays NaN.
     unexplained = max(1.0 - highest * highest, 0.0)
     variance, uu, vv = unexplained / (size * size - 4), uu - 0.25 * unexplained, vv - 0.25 * unexplained
     determinant, least = uu * vv - uv * uv, _INTERPOLATION_PX * _INTERPOLATION_PX
@@ -322,7 +322,7 @@ def refine(image, unit, size, column, row, found):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def interpolate(area, x, y, window):
-    """The window moved by (x, y), one pixel larger on each side, by cubics along rows and then along columns."""
+    """The window moved by (x, y), one pixel larger on each side, by cubic interpolation along rows, then columns."""
     u, v = math.floor(x), math.floor(y)
     across, down = weights(np.float32(x - u)), weights(np.float32(y - v))
     a, b, c, d = np.float32(across[0]), np.float32(across[1]), np.float32(across[2]), np.float32(across[3])
@@ -340,9 +340,9 @@ def interpolate(area, x, y, window):
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc"})
 def _centre(window, w):
-    """Fills w with the inside of the window without mean and with unit norm; the norm it had.
+    """Fills w with the window's interior, zero mean and unit norm; returns the previous norm.
 
-    All pixels are one run, of which many are added at a time.
+    All pixels form one contiguous run, for vector instructions.
     """
     size, inside = w.shape[0], w.reshape(w.size)
     for j in range(size):
@@ -363,7 +363,7 @@ def _centre(window, w):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _slopes(window, w, unit, norm):
-    """JᵀJ (three numbers), Jᵀt (two) and ρ, where window slopes are central differences."""
+    """JᵀJ (three numbers), Jᵀt (two) and ρ; the window's gradients are central differences."""
     size, zero = w.shape[0], np.float32(0.0)
     su, sv, wu, wv, tu, tv, uu, uv, vv, rho = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     for j in range(size):
@@ -380,13 +380,13 @@ def _slopes(window, w, unit, norm):
     return squared * uu, squared * uv, squared * vv, scale * along_u, scale * along_v, rho
 
 
-APART_PX = 3  #: Two peaks of the score are two places from this distance on, along rows or columns.
+APART_PX = 3  #: Least distance of two separate peaks of the score, along rows or columns.
 OUTSIDE = np.float32(-2.0)  #: In a map of scores: not searched.
 
 
 @njit(cache=True, error_model="numpy")
 def interval(centre, cov, sigmas, most, shape, size):
-    """First and last column and row of the whole pixels to search; empty where the last is before the first."""
+    """First and last column and row of the whole pixels to search; empty if the last is before the first."""
     half = size // 2
     uu, _, vv = ellipse(cov, sigmas)
     if not (math.isfinite(uu) and math.isfinite(vv) and math.isfinite(centre[0]) and math.isfinite(centre[1])):
@@ -398,7 +398,7 @@ def interval(centre, cov, sigmas, most, shape, size):
 
 @njit(cache=True, error_model="numpy")
 def _clipped(centre, reach, first, last):
-    """Whole numbers within reach of the centre and in first..last."""
+    """The integers within reach of the centre, clipped to first..last."""
     if centre + reach < first or centre - reach > last:
         return 0, -1
     return int(max(np.ceil(centre - reach), first)), int(min(np.floor(centre + reach), last))
@@ -406,14 +406,14 @@ def _clipped(centre, reach, first, last):
 
 @njit(cache=True, error_model="numpy")
 def second(scores, row, column):
-    """Row and column of the highest peak elsewhere, −1 where there is none."""
+    """Row and column of the second-highest peak, −1 if there is none."""
     height, width = scores.shape
     v, u, highest = -1, -1, np.float32(-1.0)
     for y in range(height):
         for x in range(width):
             if not (scores[y, x] > highest and max(abs(y - row), abs(x - column)) >= APART_PX):
                 continue
-            # A peak has no searched neighbour that scores higher.
+            # A peak has no higher score among its searched neighbours.
             peak = True
             for b in range(max(y - 1, 0), min(y + 2, height)):
                 for a in range(max(x - 1, 0), min(x + 2, width)):
@@ -425,10 +425,10 @@ def second(scores, row, column):
 
 @in_parts(IMAGE, _TEMPLATES, READ_ONLY, _READ_ONLY_CUBE, float64, float64, float64, MATRIX)
 def search_all(k, arguments):
-    """Fills places (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv, of one template in one ellipse each.
+    """Fills places (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv; one template and ellipse per row.
 
-    Arguments are (image, templates, centres, covs, sigmas, most_px, least_std, places); parts are templates. What was not
-    found keeps what the caller put there.
+    `arguments` are (image, templates, centres, covs, sigmas, most_px, least_std, places); parts are templates. Rows that
+    are not matched keep the caller's values.
     """
     image, templates, centres, covs, sigmas, most, least_std, places = arguments
     template, centre, cov, found = templates[k], centres[k], covs[k], places[k]
@@ -450,7 +450,7 @@ def search_all(k, arguments):
     if p >= 0:
         other = np.full(found.shape[0], float(scores[p, q]))
         refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
-        # The better of two peaks, with the other one's score as the second.
+        # After refinement the better of the two peaks is kept, with the other's score as the second.
         found[3] = other[2]
         if other[2] > found[2]:
             other[3] = found[2]

@@ -1,4 +1,4 @@
-"""Image patches of landmarks: cut at the first observation, warped to the predicted view, searched for (E06 §4.1).
+"""Image patches of landmarks: cut at the first observation, warped to the predicted view, matched by correlation (E06 §4.1).
 
 Pixels are (column, row), with the centre of the top-left one at (0, 0). Images are grey, (H, W) uint8.
 """
@@ -11,36 +11,36 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.features.interface import checked_image
 
-#: What a product of grey levels and a template count beside the pairs of `rbpf.kernels.signature`: a quarter of what they
-#: cost, so that threads are woken for a millisecond at least. On a busy machine a frame would wait for them far longer.
+#: Weight of one product of a grey level and a template, in pairs of `rbpf.kernels.signature`: a quarter of their real cost,
+#: so that threads start only for a millisecond of work or more. On a busy machine a frame would wait for them longer.
 PAIRS_PER_PRODUCT, PAIRS_PER_TEMPLATE = 1.0 / 1600.0, 75.0
-LARGEST_SIZE = 101  #: Of a template: sums of squares over a window stay far inside 32 bits.
+LARGEST_SIZE = 101  #: Largest side of a template: sums of squares over a window fit 32 bits.
 
 
 @final
 @dataclass(frozen=True)
 class PatchMatches:
-    """Where templates were found, one row each."""
+    """Matches of templates, one row each."""
 
-    px: np.ndarray  #: (K, 2) place to a fraction of a pixel; NaN where nothing was searched.
-    score: np.ndarray  #: (K,) normalised cross-correlation at the place, −1 where nothing was searched.
-    second: np.ndarray  #: (K,) that of the next peak in the ellipse, at least 3 px away; −1 where there is none.
-    #: (K, 2, 2) of the place, from the residual and the image's slopes [px²]; NaN where the place is a whole pixel on
-    #: a slope that rises beyond the ellipse, or where noise alone explains the image's slopes.
+    px: np.ndarray  #: (K, 2) subpixel position; NaN if not searched.
+    score: np.ndarray  #: (K,) normalised cross-correlation there, −1 if not searched.
+    second: np.ndarray  #: (K,) score of the second-best peak in the ellipse, at least 3 px away; −1 if there is none.
+    #: (K, 2, 2) covariance of the position, from the residual and the image gradients [px²]; NaN if the score still rises
+    #: beyond the ellipse, so that the position is a whole pixel, or if noise alone explains the gradients.
     cov: np.ndarray
 
     @property
     def ratio(self) -> np.ndarray:
-        """(K,) second over best score, from 0 (unmistakable) to 1 (ambiguous, or not found)."""
+        """(K,) second over best score, from 0 (unambiguous) to 1 (ambiguous, or not matched)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.maximum(self.second, 0.0) / self.score
         return np.where(self.score > 0.0, ratio, 1.0)
 
 
 def cut(image: np.ndarray, px: np.ndarray, half: int = 15) -> np.ndarray | None:
-    """A window (2 half + 1, 2 half + 1) uint8 around a place (2,), None where it reaches beyond the image.
+    """A window (2 half + 1, 2 half + 1) uint8 around a pixel (2,), None if it reaches beyond the image.
 
-    Exact at a whole pixel, else interpolated by cubics (Catmull-Rom). Raises InputError: the image is not (H, W) uint8.
+    Exact at a whole pixel, else by cubic interpolation (Catmull-Rom). Raises InputError: the image is not (H, W) uint8.
     """
     from rbpf.sensors.patches.kernels import cut_window
 
@@ -54,17 +54,17 @@ def cut(image: np.ndarray, px: np.ndarray, half: int = 15) -> np.ndarray | None:
 
 
 def warp(sources: np.ndarray, affines: np.ndarray, size: int = 11) -> np.ndarray:
-    """Templates (K, size, size) float32: windows as another view would see them.
+    """Templates (K, size, size) float32: windows warped to another view.
 
-    Where the new view is smaller, each pixel gathers all the source pixels that it covers. NaN where the new view shows
-    what the source does not, or the affine map is not finite.
+    Where the new view is smaller, each pixel averages all source pixels that it covers. NaN if the template reaches beyond
+    the source, or the affine map is not finite.
 
     Args:
         sources: (K, S, S) uint8, from `cut`.
         affines: (K, 2, 2), source offset [px] by offset in the new view [px]: 2 I for a view of half the size.
         size: odd.
 
-    Raises InputError: a shape or type is another one, or a size is even.
+    Raises InputError: a shape or type is wrong, or a size is even.
     """
     from rbpf.sensors.patches.kernels import warp_all
 
@@ -91,24 +91,24 @@ def search(
     most_px: float = 40.0,
     least_std: float = 3.0,
 ) -> PatchMatches:
-    """Looks for each template in the ellipse where it is expected, by zero-mean normalised cross-correlation.
+    """Searches each template in its predicted ellipse, by zero-mean normalised cross-correlation.
 
-    Every whole pixel of the ellipse is tried where the whole template fits into the image; half a pixel's diagonal is
-    added to the half axes in quadrature, so that one at least is. The best one is refined to a fraction of a pixel.
+    All whole pixels of the ellipse are tried at which the template fits into the image; half a pixel's diagonal is added to
+    the half axes in quadrature, so that there is at least one. The best is refined to subpixel precision.
 
     Args:
         image: (H, W) uint8.
         templates: (K, size, size) float32 from `warp`, size odd.
-        centres: (K, 2) expected places.
+        centres: (K, 2) predicted pixels.
         covs: (K, 2, 2) their covariances [px²].
         sigmas: the ellipse's half axes in standard deviations.
-        most_px: the furthest column and row from the centre; infinite to search a whole image.
+        most_px: largest distance from the centre in columns and rows; infinite to search a whole image.
         least_std: a template whose grey levels have a smaller standard deviation is not searched.
 
     Returns:
-        The matches. Nothing is found for a template that is not finite, or where centre or covariance are none.
+        The matches. A template, centre or covariance that is not valid is not searched.
 
-    Raises InputError: a shape or type is another one.
+    Raises InputError: a shape or type is wrong.
     """
     from rbpf.kernels.signature import run_driver
     from rbpf.sensors.patches.kernels import search_all
@@ -127,7 +127,7 @@ def search(
         raise InputError(f"sigmas must be positive and most_px not negative, got {limits[0]!r} and {limits[1]!r}")
     found = np.full((count, 7), np.nan)
     found[:, 2:4] = -1.0
-    # What it costs, in the unit of `rbpf.kernels.signature`.
+    # The cost, in the unit of `rbpf.kernels.signature`.
     reach = np.minimum(limits[0] * np.sqrt(np.fmax(covs.diagonal(axis1=1, axis2=2), 0.0)), limits[1])
     sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])
     products = float(sides.prod(axis=1).sum()) * templates.shape[1] ** 2
@@ -137,5 +137,5 @@ def search(
 
 
 def _fits(size: int) -> bool:
-    """Whether a template may have this size."""
+    """Whether this is a valid template size."""
     return 3 <= size <= LARGEST_SIZE and size % 2 == 1

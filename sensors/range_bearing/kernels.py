@@ -12,7 +12,7 @@ from rbpf.kernels.signature import BLOCK, observation_kernel
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _face_planar(state, mean, n, point, heading):
-    """The landmark in the robot's frame, and cosine and sine of the heading, into the first two rows of each."""
+    """Writes the landmark in the robot's frame, and cosine and sine of the heading, to the first two rows of each."""
     for i in range(n):
         c, s = cos_sin(state[i])
         dx, dy = mean[i] - state[BLOCK + i], mean[BLOCK + i] - state[2 * BLOCK + i]
@@ -22,14 +22,14 @@ def _face_planar(state, mean, n, point, heading):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _in_sensor(params, x, y):
-    """A point of the robot's frame in the sensor's, in the plane."""
+    """Transforms a planar point from the robot's to the sensor's frame."""
     a, b = x - params[4], y - params[5]
     return params[0] * a + params[2] * b, params[1] * a + params[3] * b
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_planar(row, a0, a1, params, c, s, x, y, jac_state, jac_landmark, i):
-    """One row (a0, a1) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
+    """One row (a0, a1) in the sensor's frame: rotated to the robot's frame, then chained to ∂/∂ξ and ∂/∂landmark."""
     d0, d1 = params[0] * a0 + params[1] * a1, params[2] * a0 + params[3] * a1
     jac_state[3 * row * BLOCK + i] = d0 * y - d1 * x
     jac_state[(3 * row + 1) * BLOCK + i] = -d0
@@ -74,7 +74,7 @@ def position_planar(state, mean, const, z, params, n, nu, jac_state, jac_landmar
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark, i):
-    """One row (a0, a1, a2) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
+    """One row (a0, a1, a2) in the sensor's frame: rotated to the robot's frame, then chained to ∂/∂ξ and ∂/∂landmark."""
     d0, d1, d2 = times(params, a0, a1, a2)
     store_by_state(d0, d1, d2, p[0], p[1], p[2], jac_state, 6 * row * BLOCK + i)
     start = 3 * row * BLOCK + i
@@ -83,7 +83,7 @@ def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _locate(state, mean, params, n, point):
-    """The landmark in the sensor's frame, into the rows of `point`."""
+    """Writes the landmark in the sensor's frame to the rows of `point`."""
     for i in range(n):
         r = rotation_at(state, i)
         a, b = mean[i] - state[4 * BLOCK + i], mean[BLOCK + i] - state[5 * BLOCK + i]
@@ -95,7 +95,7 @@ def _locate(state, mean, params, n, point):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _in_robot(params, a, b, c):
-    """A point of the sensor's frame in the robot's."""
+    """Transforms a point from the sensor's to the robot's frame."""
     x, y, z = times(params, a, b, c)
     return x + params[9], y + params[10], z + params[11]
 

@@ -18,11 +18,10 @@ from rbpf.lie import Array, SE2Group, SE3Group
 
 
 class RigidPointModel(ObservationModel):
-    """A sensor mounted on a robot that measures points; a subclass says what is measured in the sensor's frame.
+    """A sensor mounted on a robot that measures points; a subclass defines the measurement of a point in the sensor's frame.
 
-    A landmark's mean is taken as a world point and its constants are not read: anchored ones need a model of their own.
-    The mounting pose robot_from_sensor (E,) in SE2 or SE3 is by default the robot's origin; where it is not known for certain
-    see `tuned`.
+    A landmark's mean is read as a world point and its constants are ignored: anchored landmarks need a model of their own.
+    The mounting pose robot_from_sensor (E,) in SE2 or SE3 is by default the identity; `tuned` is for one that is estimated.
     """
 
     _by_about: Array
@@ -40,12 +39,12 @@ class RigidPointModel(ObservationModel):
         self.mounting = np.concatenate([rotation.ravel(), self.space.translation(self.robot_from_sensor)])
 
     def tuned(self, about: Array, free: Array) -> Self:
-        """Of a sensor that a substate s (m,), which is `about` (m,), moves to robot_from_sensor Exp(free s), free (d, m)."""
+        """The sensor mounted at robot_from_sensor Exp(free s), linearised at the substate s = `about` (m,); free (d, m)."""
         moved = self.space.exp(free @ about)
         tuned = copy(self)
         tuned._mount(self.space.compose(self.robot_from_sensor, moved))
         tuned.about, tuned.reads = about, self.reads | {Part.SUBSTATE}
-        # How its pose moves with s, in the right chart there.
+        # The mounting pose's derivative by s, in the right chart there.
         tuned._by_about = self.space.right_jacobian(free @ about) @ free
         return tuned
 
@@ -59,7 +58,7 @@ class RigidPointModel(ObservationModel):
 
     @abstractmethod
     def locate(self, z: Array) -> Array:
-        """The point (…, D) in the sensor's frame that is measured as z (…, p)."""
+        """The point (…, D) in the sensor's frame with the measurement z (…, p)."""
 
     def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         assert landmark is not None
@@ -72,7 +71,7 @@ class RigidPointModel(ObservationModel):
         return self.space.inverse_transform(self.robot_from_sensor, self.space.inverse_transform(state, landmark))
 
     def by_substate(self, state: Array, landmark: Array, const: Given = None) -> Array:
-        """As p_robot moves with the robot, so does p_sensor with the sensor: D [−ω × p | −I] of its own frame."""
+        """As the derivative by the robot's pose, D [−ω × p | −I], but in the sensor's frame."""
         at = self._in_sensor(state, landmark)
         return -self.measure_jacobian(at) @ self.space.transform_jacobian(at) @ self._by_about
 
@@ -83,7 +82,7 @@ class RigidPointModel(ObservationModel):
         return turned @ self._by_about
 
     def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
-        """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D taken to the robot's frame."""
+        """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D rotated to the robot's frame."""
         assert landmark is not None
         in_robot = self.space.inverse_transform(state, landmark)
         slope = self.measure_jacobian(self.space.inverse_transform(self.robot_from_sensor, in_robot))

@@ -1,7 +1,7 @@
 """Readers of recordings: robot logs, laser scanners, image sequences of one camera or two, known points.
 
-What is missing, or not as the module of a format describes it, is an InputError that names file and line in one sentence,
-from whatever function here reads it.
+Missing files, and files that differ from the description in a format's module, raise an InputError that names file and line
+in one sentence, whichever function here reads them.
 """
 
 from rbpf.sensors.feature_log import Truth

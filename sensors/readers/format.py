@@ -1,4 +1,4 @@
-"""What a format of recordings is, and which one a recording has: robot logs, laser scanners and images alike."""
+"""The interface of recording formats, and their recognition: for robot logs, laser scanners and images."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -8,24 +8,24 @@ from typing import Any, Generic, TypeVar
 from rbpf.errors import InputError
 from rbpf.sensors.readers.text import quoted, read_bytes
 
-Options = TypeVar("Options", contravariant=True)  #: What a caller may say about a recording.
-Recording = TypeVar("Recording", covariant=True)  #: What reading it gives.
+Options = TypeVar("Options", contravariant=True)  #: A caller's options for a recording.
+Recording = TypeVar("Recording", covariant=True)  #: The result of reading it.
 
 
 class Format(ABC, Generic[Options, Recording]):
     """A format of recordings."""
 
-    kind: str  #: What it is and which files make it, for messages.
+    kind: str  #: Its name and files, for messages.
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Whether a file or folder is meant to be of this format."""
+        """Whether a file or folder appears to be of this format."""
 
     @abstractmethod
     def read(self, path: Path, options: Options) -> Recording:
         """Read the recording in a file or folder.
 
-        Raises InputError: a file is missing, or a line is not as the format's module describes; it names file and line.
+        Raises InputError: a file is missing or malformed; the message names file and line.
         """
 
 
@@ -33,9 +33,9 @@ AnyFormat = TypeVar("AnyFormat", bound=Format[Any, Any])
 
 
 def recognised(path: str | Path, formats: Sequence[AnyFormat], what: str, kind: str = "kind") -> tuple[Path, AnyFormat]:
-    """The path, and the first of these formats that recognises it; `kind` is the attribute that says what a format is.
+    """The path, and the first of these formats that recognises it; `kind` is the attribute that describes a format.
 
-    Raises InputError: nothing is there, where `what` was expected, or it is of no known format.
+    Raises InputError: the path does not exist (`what` was expected), or is of no known format.
     """
     path = Path(path)
     try:
@@ -46,7 +46,7 @@ def recognised(path: str | Path, formats: Sequence[AnyFormat], what: str, kind: 
     for one in formats:
         if one.recognises(path):
             return path, one
-    # No format recognises what is there.
+    # No format recognises it.
     kinds = "; or ".join(getattr(one, kind) for one in formats)
     if path.is_dir():
         names = sorted(entry.name for entry in path.iterdir())

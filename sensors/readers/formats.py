@@ -1,4 +1,4 @@
-"""Recognises the format of a recording and opens it: another format is one file, and one line here."""
+"""Recognises the format of a recording and opens it: a new format needs one file, and one line here."""
 
 import logging
 from pathlib import Path
@@ -17,7 +17,7 @@ from rbpf.sensors.readers.part import WHOLE, Part
 from rbpf.sensors.readers.robot_log import LogNoise, RobotLog
 from rbpf.sensors.readers.victoria_park import VictoriaPark
 
-#: The first that recognises a recording reads it.
+#: Formats in order; the first that recognises a recording reads it.
 ROBOT_LOGS: tuple[Format[LogNoise, RobotLog], ...] = (Mrpt(), Mrclam(), VictoriaPark())
 IMAGES: tuple[ImageFormat, ...] = (RosBag(), Tum(), Euroc(), Kitti(), SevenScenes(), Photos(), Video(), Folder())
 _log = logging.getLogger(__name__)
@@ -26,8 +26,8 @@ _log = logging.getLogger(__name__)
 def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
     """Read a robot log, a folder or a file, of any known format, which the modules of the readers describe.
 
-    `noise` are standard deviations to use in place of the log's. Raises InputError: nothing is there, it is of no known
-    format, or a file of it is malformed.
+    `noise` has standard deviations that replace the log's. Raises InputError: the path does not exist, is of no known
+    format, or has a malformed file.
     """
     path, found = recognised(path, ROBOT_LOGS, "a robot log")
     return found.read(path, noise or LogNoise())
@@ -41,11 +41,11 @@ def open_images(
     Args:
         path: of the sequence; only its first image is decoded.
         calibration: a `camera.yaml` to use in place of the sequence's own camera.
-        topics: of a ROS bag, where they have to be named.
+        topics: of a ROS bag, if they have to be named.
         part: which of its images, and in which size.
 
-    Raises InputError: nothing is there, it is of no known format, no image of it can be read, or another of its files
-    is malformed; a topic is named that is not there.
+    Raises InputError: the path does not exist, is of no known format, has no readable image, or another of its files is
+    malformed; a named topic does not exist.
     """
     return _opened(path, ReadOptions(None if calibration is None else Path(calibration), topics), part)
 
@@ -59,19 +59,19 @@ def open_stereo(
 ) -> ImageSequence:
     """Open the images of two cameras side by side: EuRoC ASL (`cam0`, `cam1`), KITTI (`image_0`, `image_1`), ROS bags.
 
-    Images of EuRoC and of bags are paired by their times; what has no partner is left out, which `notes` says. Images
-    that are not rectified become so by the two `sensor.yaml` or CameraInfo; the truth is then that of the rectified left
-    camera. KITTI's images are rectified and have numbers: one that is missing on either side is a pair with a problem.
+    Images of EuRoC and of bags are paired by their times; those without a partner are left out, with an entry in `notes`.
+    Unrectified images are rectified by the two `sensor.yaml` or CameraInfo; the truth is then that of the rectified left
+    camera. KITTI's images are rectified and numbered: one that is missing on either side gives a pair with a problem.
 
     Args:
         path: its folder, or a ROS bag.
         calibration: a `camera.yaml` of the rectified left camera, in place of the sequence's own calibration; with
             `baseline_m`, in place of its baseline, too.
-        tolerance_s: images of two cameras whose times differ by no more belong together.
+        tolerance_s: largest time difference of two images that form a pair.
         topics: as of `open_images`.
         part: likewise.
 
-    Raises InputError: as of `open_images`, no two images belong together, the two cameras' images differ in size, the
+    Raises InputError: as of `open_images`, no two images form a pair, the two cameras' images differ in size, the
     baseline is zero, or the right camera is not to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s, stereo=True)

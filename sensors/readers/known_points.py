@@ -1,12 +1,12 @@
-"""`known_points.csv`: landmarks of known position and where they are in the first image.
+"""`known_points.csv`: landmarks of known position and their pixels in the first image.
 
     id,u_px,v_px,x_m,y_m,z_m,sigma_m
     1,517.426,320.498,-0.25433,0.12486,1.60044,0.0365
 
-sigma_m is the standard deviation of the place as a whole, the root of its covariance's trace: the root mean square
-distance from where the point truly is. A further column across_m is the standard deviation of the place along each axis
-across the line of sight of the first image: sigma_m / √3 of points that were surveyed, alike in all directions. The columns
-may come in any order, and others beside them are passed over.
+sigma_m is the standard deviation of the position as a whole, the root of its covariance's trace: the root mean square
+distance from the true point. A further column across_m is the standard deviation along each axis perpendicular to the line
+of sight of the first image: sigma_m / √3 for surveyed points, whose errors are isotropic. Columns may be in any order;
+others are ignored.
 Pixel centres are at whole numbers.
 """
 
@@ -20,28 +20,27 @@ from rbpf.errors import InputError
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_table, quoted
 
 COLUMNS, ACROSS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m"), "across_m"
-ROUNDED = 0.01  #: Numbers are rounded in a table: a variance may be too large by this fraction.
+ROUNDED = 0.01  #: Tolerance of a variance for rounding of the table's numbers, relative.
 
 
 @dataclass(frozen=True)
 class KnownPixels:
-    """Landmarks of known position and where they are in the first image.
+    """Landmarks of known position and their pixels in the first image.
 
-    Raises InputError: a shape is another one, a number is not finite, or a standard deviation is negative.
+    Raises InputError: a shape is wrong, a number is not finite, or a standard deviation is negative.
     """
 
     names: np.ndarray  #: (M,) int64, each once.
     px: np.ndarray  #: (M, 2) pixels in the first image as it is stored (distorted).
     positions: np.ndarray  #: (M, 3) in the world, m.
     std_m: np.ndarray  #: (M,) standard deviation of each position as a whole, the root of its covariance's trace, m.
-    #: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground truth knows
-    #: nothing.
+    #: the positions are in a frame of the points' own, such as a chessboard's, unrelated to the recording's ground truth.
     own_frame: bool = False
-    #: (M,) standard deviation along each axis across the line of sight, m; None: nothing but what the first image says.
+    #: (M,) standard deviation along each axis across the line of sight, m; None: only the first image constrains them.
     across_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Checks what is given: the points may be made by hand."""
+        """Validates the fields, as the points may be made by hand."""
         schema = {"names": integers("M"), "px": numbers("M", 2), "positions": numbers("M", 3)}
         stds = ("std_m",) if self.across_m is None else ("std_m", "across_m")
         require("the known points", vars(self), schema | dict.fromkeys(stds, numbers("M", least=0.0)))
@@ -54,7 +53,7 @@ class KnownPixels:
 def read_known_points(path: str | Path) -> KnownPixels:
     """Read a table of known points.
 
-    Raises InputError: the file is missing, a column is, or a line is not as described above.
+    Raises InputError: the file or a column is missing, or a line is not as described above.
     """
     path = Path(path)
     rows = numbered_lines(path, f"a table with the columns {', '.join(COLUMNS)}")

@@ -1,6 +1,6 @@
-"""Recordings of a laser scanner on a robot: CARMEN logs, plain or packed by gzip, and ROS bags.
+"""Recordings of a laser scanner on a robot: CARMEN logs, plain or gzip-compressed, and ROS bags.
 
-**CARMEN** logs are lines of words, of which these are read (`[…]` repeats as often as the number before says):
+**CARMEN** logs are lines of words, of which these are read (`[…]` repeats as often as the number before it):
 
     FLASER n [range] x y theta odom_x odom_y odom_theta time host logged
     ROBOTLASER1 type start field_of_view resolution max_range accuracy mode n [range] m [remission]
@@ -9,21 +9,20 @@
     ODOM x y theta speed turn_rate acceleration time host logged
     PARAM name value
 
-in metres, radians and Unix seconds; RLASER, ROBOTLASER2, RAWLASER2 are a second scanner. The odometry is that of the scans'
-own lines, else of the lines ODOM, interpolated. FLASER says nothing of its beams: they are 1° apart (180 and 181 readings,
-the first at -90°), 0.5° (360 and 361) or 0.25° (400 and 401, the first at -50°), as of SICK's scanners, and any other number
-spreads over 180°. Where the scanner sits on the robot is the difference of a line's two poses where all lines agree on it (in
-a log whose path was corrected they do not), else what the parameters `robot_frontlaser_offset`, `…_side_offset` and
-`…_angular_offset` say.
+in metres, radians and Unix seconds; RLASER, ROBOTLASER2, RAWLASER2 are a second scanner. The odometry is that in the scans'
+own lines, else of the ODOM lines, interpolated. FLASER does not state its beams: they are 1° apart (180 and 181 readings,
+the first at -90°), 0.5° (360 and 361) or 0.25° (400 and 401, the first at -50°), as of SICK's scanners; any other number
+spreads over 180°. The scanner's mounting pose is the difference of a line's two poses if all lines agree on it (they do not
+in a log with a corrected path), else from the parameters `robot_frontlaser_offset`, `…_side_offset` and `…_angular_offset`.
 
 **ROS bags** hold sensor_msgs LaserScan, the odometry as nav_msgs Odometry or as the transform from a frame called `odom` in
-`/tf`, and where the scanner sits in `/tf` or `/tf_static`, upside down or not.
+`/tf`, and the scanner's mounting pose in `/tf` or `/tf_static`, upside down or not.
 
-A range of zero or less, or one that is not a number, is not valid; one of the greatest range or more is no return. The
-greatest range is what the log says (`robot_front_laser_max` up to 80 m); where it says nothing 80 m, or 8.18 m where no range
-is beyond the 8.19 m that SICK's scanners reach in millimetres. Without odometry the log has None for it. Scans whose time is
-not after that of all before them, by up to a second, come of programs that write at once; they are left out, which is said.
-A clock that is set back by more is refused. Scans that turn against the odometry are said; odometry that jumps is kept.
+A range of zero or less, or NaN, is invalid; one of the maximum range or more is no return. The maximum range is the log's
+(`robot_front_laser_max` up to 80 m); without one 80 m, or 8.18 m if no range exceeds the 8.19 m that SICK's scanners reach
+in millimetres. Without odometry the log has None for it. Scans up to a second out of order, from programs that write
+concurrently, are left out with a warning; a clock set back by more is refused. Scans that rotate against the odometry give
+a warning; jumps of the odometry are kept.
 """
 
 import logging
@@ -44,15 +43,15 @@ from rbpf.sensors.readers.images.bag import SUFFIXES, Bag, numbers_of, opened
 from rbpf.sensors.readers.part import WHOLE, Part
 from rbpf.sensors.readers.text import line_error, numbered_lines, parse_number, parse_time, quoted
 
-#: Messages of a CARMEN log that hold scans; the first that a log has is read where none is named.
+#: CARMEN messages that hold scans; by default the first that a log has is read.
 SCANNERS = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER", "ROBOTLASER2", "RAWLASER2")
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
-LATE_NS = 1_000_000_000  #: A scan may be written so much after one of a later time.
+LATE_NS = 1_000_000_000  #: Largest delay of a scan written after one of a later time.
 
 _FAR_M, _MILLIMETRES_M = 80.0, (8.18, 8.2)
-#: For a mirrored scanner so many turns [rad] are looked at, so far apart; two scans see one wall so near to each other.
+#: Test for a mirrored scanner: most rotations used, their least angle [rad], largest scan distance, σ of matching ends [m].
 _TURNS, _TURNED, _NEAR_M, _WALL_M = 50, 0.2, 2.0, 0.2
 _HEAD = ("type", "start angle", "field of view", "angular resolution", "maximum range", "accuracy", "remission mode")
 _POSES = ("x", "y", "theta", "odometry's x", "odometry's y", "odometry's theta")
@@ -61,12 +60,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LaserOptions(Ranged):
-    """What a recording may leave open. Raises InputError: the greatest range is not positive."""
+    """Options for what a recording may not state. Raises InputError: the greatest range is not positive."""
 
     scanner: str | None = None  #: name of the message (CARMEN) or topic (ROS) of its scans; None takes the first.
     #: the scanner is mounted upside down, or its readings run clockwise: the angles are mirrored.
     upside_down: bool = False
-    max_range_m: Positive | None = None  #: what is farther gives no return; None takes what the log says.
+    max_range_m: Positive | None = None  #: beyond it there is no return; None takes the log's.
     part: Part = WHOLE  #: which of its scans.
 
 
@@ -74,32 +73,32 @@ class LaserOptions(Ranged):
 class ScansOfFile:
     """All scans of one scanner, S of them, at least one, in the order of the file; each has odometry, or none has."""
 
-    angles: Array  #: (B,) of the beams, from one side to the other.
-    places: np.ndarray  #: (S,) where each stands in the file, in words.
+    angles: Array  #: (B,) of the beams, ascending or descending.
+    places: np.ndarray  #: (S,) location of each in the file, for messages.
     stamps_ns: np.ndarray  #: (S,) int64.
     ranges: Array  #: (S, B).
     odometry: Array | None = None  #: (S, E) world_from_robot.
     min_range_m: float = 0.0
-    max_range_m: float | None = None  #: None where the log does not say.
+    max_range_m: float | None = None  #: None if the log has none.
     robot_from_sensor: Array = field(default_factory=SE2.identity)  #: (E,).
     upside_down: bool = False
 
     def take(self, rows: np.ndarray) -> Self:
-        """Some of the scans."""
+        """The scans of these rows."""
         kept = {name: getattr(self, name)[rows] for name in ("places", "stamps_ns", "ranges")}
         return replace(self, **kept, odometry=None if self.odometry is None else self.odometry[rows])
 
 
 def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> LaserLog:
-    """Read a recording of a scanner, a CARMEN log or a ROS bag, which the head of this module describes.
+    """Read a recording of a scanner, a CARMEN log or a ROS bag, as this module's docstring describes.
 
-    Raises InputError: nothing is there, a line is not as described (it is named), there are no scans or none of the
-    scanner that is asked for, all are outside of the part, or the clock runs backwards.
+    Raises InputError: the path does not exist, a line is malformed (it is named), there are no scans or none of the
+    requested scanner, all are outside the part, or the clock runs backwards.
     """
     options = options or LaserOptions()
     path, found = recognised(path, LASERS, "; or ".join(one.kind for one in LASERS))
     read = found.read(path, options)
-    # In order of time; those that come a little late are left out.
+    # Scans in order of time; those slightly out of order are left out.
     late_ns = np.maximum.accumulate(read.stamps_ns)[:-1] - read.stamps_ns[1:]
     if (far := np.flatnonzero(late_ns > LATE_NS)).size:
         problem = f"the time runs backwards by {late_ns[far[0]] * 1e-9:.3f} s, expected scans in order of time"
@@ -108,7 +107,7 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
         _log.warning("%s: left out %d scans whose time is not after that of the scan before.", path, left)
         read = read.take(np.flatnonzero(np.append(True, late_ns < 0)))
     read = read.take(options.part.rows((read.stamps_ns - read.stamps_ns[0]) * 1e-9, f"{path}: no scan is left"))
-    # What a range means: too near, a wall, nothing.
+    # Ranges: too near (NaN), a hit, or no return (inf).
     ranges = read.ranges
     longest = ranges[np.isfinite(ranges)].max(initial=0.0)
     millimetres = _MILLIMETRES_M[0] <= longest < _MILLIMETRES_M[1]
@@ -127,21 +126,21 @@ def read_laser_log(path: str | Path, options: LaserOptions | None = None) -> Las
     whole = path.resolve()
     name = whole.name if whole.is_dir() else whole.name.removesuffix(".gz").rpartition(".")[0] or whole.name
     log = LaserLog(name, scanner, read.stamps_ns, ranges, odometry)
-    _tell_mirrored(path, log)
+    _warn_if_mirrored(path, log)
     return log
 
 
 def _chosen(path: Path, what: str, names: Sequence[str], given: str | None = None) -> str:
-    """The one given, or the first, which is said where there are several."""
+    """The given name, or the first, with a warning if there are several."""
     if len(names) > 1:
         _log.warning("%s: %s of %s, of %s.", path, what, given or names[0], ", ".join(names))
     return given or names[0]
 
 
-def _tell_mirrored(path: Path, log: LaserLog) -> None:
-    """Says so where the scans before and after turns lie on each other with their angles mirrored, and not as they are."""
+def _warn_if_mirrored(path: Path, log: LaserLog) -> None:
+    """Warns if the scans before and after rotations match each other only with mirrored angles."""
     if log.odometry is None:
-        return  # what has no turns of its own is as consistent in a mirror
+        return  # without rotations the mirrored scans are equally consistent
     angles, mount = log.scanner.angles, log.scanner.robot_from_sensor
     every, gains, first = -(-angles.size // 200), list[float](), 0
     towards = np.stack([np.cos(angles), np.sin(angles)], axis=1)[::every]
@@ -163,13 +162,13 @@ def _tell_mirrored(path: Path, log: LaserLog) -> None:
             break
     if len(gains) >= _TURNS // 5 and np.mean(gains) > 5.0 * np.std(gains) / np.sqrt(len(gains)):
         _log.warning(
-            "%s: the scans turn against the odometry, %d of %d turns fit better in a mirror: is the scanner upside down "
+            "%s: the scans rotate against the odometry, %d of %d rotations fit better mirrored: is the scanner upside down "
             "(--upside-down mirrors it), or the odometry's heading reversed?", path, (np.array(gains) > 0.0).sum(), len(gains),
         )  # fmt: skip
 
 
 def _interpolated(path: Path, scans: ScansOfFile, stamps_ns: list[int], poses: list[Array]) -> ScansOfFile:
-    """Scans with odometry of other times than theirs; those before it begins and after it ends are left out."""
+    """Interpolates the odometry at the scans' times; scans outside its time span are left out."""
     if not poses:
         return scans
     times, first = np.unique(np.array(stamps_ns, dtype=np.int64), return_index=True)
@@ -250,7 +249,7 @@ class Carmen(Format[LaserOptions, ScansOfFile]):
         else:
             laser, odometry = np.stack([one.poses for _, one in found if one.poses is not None], axis=1)
             scans, mounts = replace(scans, odometry=odometry), SE2.between(odometry, laser)
-        # Where it sits: as all lines imply, else as the parameters say, zero where they do not.
+        # The mounting pose: from the lines if all agree, else from the parameters, by default zero.
         stated = np.array([params.get(key, 0.0) for key in offsets])
         same = len(mounts) > 0 and float(np.abs(SE2.local(mounts[0], mounts)).max()) < 1e-3
         if same and (np.abs(mounts[0]).max() > 1e-3 or not stated.any()):
@@ -258,9 +257,7 @@ class Carmen(Format[LaserOptions, ScansOfFile]):
         elif not rear:
             mount = np.asarray(SE2.normalise(stated))
         else:
-            _log.warning(
-                "%s: nothing says where %s sits; taken as in the robot's middle, looking backwards.", path, name
-            )
+            _log.warning("%s: no mounting pose of %s; assumed at the robot's origin, facing backwards.", path, name)
             mount = np.array([np.pi, 0.0, 0.0])
         farthest = first.head[4] if first.head else min(params.get(f"robot_{side}_laser_max", 0.0), _FAR_M)
         return replace(scans, max_range_m=farthest if farthest > 0.0 else None, robot_from_sensor=mount)
@@ -285,13 +282,13 @@ class _Line(NamedTuple):
             return _numbers(path, number, names, words[at - len(names) : at])
 
         def take_list(what: str) -> Array:
-            """Readings after their count; the line must have more words, at least a time."""
+            """Readings after their count; at least a time must follow in the line."""
             nonlocal at
             count = float(take((f"the number of {what}",))[0])
             if not (count == int(count) and 0 <= count < len(words) - at):
                 problem = f"expected {count:g} {what} and what follows them, found {len(words) - at} words"
                 raise line_error(path, number, problem)
-            values = []  # which may be nan or inf
+            values = []  # may be nan or inf
             for word in words[at : at + int(count)]:
                 try:
                     values.append(float(word))
@@ -310,7 +307,7 @@ class _Line(NamedTuple):
         if not name.startswith("RAW"):
             poses = np.roll(take(_POSES).reshape(2, 3), 1, axis=1)
             at += 0 if old else 5
-        # The time, and then mostly the name of a computer and the time at which the line was written.
+        # The time, usually followed by a host name and the time at which the line was written.
         if not 1 <= len(words) - at <= 3:
             problem = f"expected a time, a host and a time after {at} words, found {len(words) - at} words"
             raise line_error(path, number, f"{problem}; is the number of readings right?")
@@ -318,13 +315,13 @@ class _Line(NamedTuple):
 
     @property
     def beams(self) -> str:
-        """In words, which differ where they do."""
+        """A description of the beams, equal for equal beams."""
         named = [f"{name} {value:g}" for name, value in zip(_HEAD[1:5], self.head[1:5], strict=False)]
         return ", ".join([f"{self.ranges.size} readings", *named])
 
 
 def _not_beams(start: float, step: float, count: int) -> str:
-    """What is wrong with so many beams, the first at an angle and each a step further; empty where nothing is."""
+    """The error of `count` beams from `start` in increments of `step`; empty if they are valid."""
     sound = np.isfinite([start, step]).all() and (step or count == 1)
     if count and sound and max(abs(start), abs(step) * (count - 1)) <= 2.0 * np.pi + 1e-3:
         return ""
@@ -332,7 +329,7 @@ def _not_beams(start: float, step: float, count: int) -> str:
 
 
 def _numbers(path: Path, line: int, names: Sequence[str], words: list[str]) -> Array:
-    """Words as finite numbers; a line that ends before the last name is refused."""
+    """Words as finite numbers. Raises InputError: there are fewer words than names."""
     if len(words) < len(names):
         raise line_error(path, line, f"expected {names[len(words)]}, found the end of the line")
     return np.array([parse_number(path, line, *pair) for pair in zip(names, words, strict=True)])
@@ -382,7 +379,7 @@ class LaserBag(Format[LaserOptions, ScansOfFile]):
             stamps, poses, base = transforms.odometry(frame)
             mount = transforms.mount(base, frame)
         if mount is None:
-            _log.warning("%s: nothing says where the scanner sits; taken as in the robot's middle.", where)
+            _log.warning("%s: no mounting pose of the scanner; assumed at the robot's origin.", where)
             mount = SE3.identity()
         scans = ScansOfFile(
             np.asarray(start + step * np.arange(count), dtype=float),
@@ -398,13 +395,13 @@ class LaserBag(Format[LaserOptions, ScansOfFile]):
 
 
 def _planar(pose: Array) -> Array:
-    """(E,) of SE2 from a pose (7,) in space."""
+    """Projects a pose (7,) in space to SE2 (E,)."""
     yaw, _, _ = SE3.ypr(pose)
     return np.array([float(yaw), *SE3.translation(pose)[:2]])
 
 
 class _Transforms:
-    """The odometry and the tree of transforms of a bag; poses are parent_from_child."""
+    """The odometry and the tf tree of a bag; poses are parent_from_child."""
 
     def __init__(self, bag: Bag) -> None:
         self._bag = bag
@@ -424,7 +421,7 @@ class _Transforms:
                         self._poses[child].append((stamp.sec * 10**9 + stamp.nanosec, pose))
 
     def odometry(self, scanner: str) -> tuple[list[int], list[Array], str]:
-        """Times, poses (E,), and the frame of the robot: of a topic, or of the transforms; none where there is none."""
+        """Times, poses (E,), and the robot's frame: from a topic, or from the transforms; empty if there are none."""
         topics = self._bag.of_type(ODOMETRY)
         if topics:
             given = "/odom" if "/odom" in topics else None
@@ -445,7 +442,7 @@ class _Transforms:
         return [], [], chain[-1] if len(chain) > 1 else ""
 
     def mount(self, base: str, scanner: str) -> Array | None:
-        """robot_from_sensor (7,), None where the transforms do not say."""
+        """robot_from_sensor (7,), None if the transforms do not contain it."""
         pose = SE3.identity()
         for child in self._chain(scanner):
             if child == base:
@@ -463,12 +460,12 @@ class _Transforms:
 
 
 def _pose(message: Any) -> Array | None:
-    """(7,), None where it is none."""
+    """(7,), None if it is not a valid pose."""
     pose = numbers_of(message)
     if not (np.isfinite(pose).all() and abs(float(np.linalg.norm(pose[:4])) - 1.0) < 1e-2):
         return None
     return np.asarray(SE3.normalise(pose))
 
 
-#: The first that recognises a recording reads it.
+#: Formats in order; the first that recognises a recording reads it.
 LASERS: tuple[Format[LaserOptions, ScansOfFile], ...] = (LaserBag(), Carmen())

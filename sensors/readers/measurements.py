@@ -24,7 +24,7 @@ _UNIT = 1e-6
 @final
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Odometry, and observations of landmarks whose association is settled; T steps, K observations.
+    """Odometry, and observations of landmarks with fixed association; T steps, K observations.
 
     Raises InputError: shapes do not fit together, or a number is not as described.
     """
@@ -34,12 +34,12 @@ class Measurements:
     measurement: Kind  #: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
     pitch_sign: float  #: +1 where positive pitch points up, -1 where it points down.
     robot_from_sensor: Array  #: (E,) mounting pose.
-    start: Array  #: (E,) world_from_robot of step 0, which is known.
+    start: Array  #: (E,) world_from_robot of step 0, taken as exact.
     stamps_ns: NDArray[np.int64]  #: (T,) time of each step, integer nanoseconds.
     deltas: Array  #: (T - 1, E) odometry, previous_robot_from_robot of the steps from 1 on.
     covs: Array  #: (T - 1, d, d) their covariance in the right chart there, order [omega, v]; may be singular.
     steps: NDArray[np.int64]  #: (K,) the step of each observation.
-    landmarks: NDArray[np.int64]  #: (K,) the map's name of the landmark seen.
+    landmarks: NDArray[np.int64]  #: (K,) the map's name of the observed landmark.
     z: Array  #: (K, p) what was measured.
     cov_z: Array  #: (K, p, p) covariance of its noise.
 
@@ -49,7 +49,7 @@ class Measurements:
         if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
             expected = f"a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1"
             raise InputError(f"Expected {expected}, found {self.measurement!r} and {self.pitch_sign!r}.")
-        # A measurement has as many numbers as a landmark has coordinates.
+        # Measurements and landmarks have the same dimension.
         dim, point, poses = self.space.dim, self.space.point_dim, partial(elements, self.space)
         schema = {
             "robot_from_sensor": poses(),
@@ -72,7 +72,7 @@ class Measurements:
 
 
 class InitialEstimate(NamedTuple):
-    """Where an optimiser starts: world_from_body (T, E), and name of each landmark to its (D,) position."""
+    """The initial values of an optimiser: world_from_body (T, E), and name of each landmark to its (D,) position."""
 
     world_from_body: Array
     landmarks: Mapping[int, Array]
@@ -84,7 +84,7 @@ def dead_reckoning(m: Measurements) -> Array:
 
 
 def initial_estimate(m: Measurements) -> InitialEstimate:
-    """Dead reckoning, and every landmark where its first observation from there puts it."""
+    """Dead reckoning, and every landmark initialised by its first observation from there."""
     path, model = dead_reckoning(m), m.model()
     by_step = np.argsort(m.steps, kind="stable")
     names, first = np.unique(m.landmarks[by_step], return_index=True)
@@ -94,14 +94,14 @@ def initial_estimate(m: Measurements) -> InitialEstimate:
 
 
 def are_covariances(cov: Array) -> NDArray[np.bool_]:
-    """Which of (K, n, n) finite matrices are symmetric and positive semi-definite up to rounding, (K,)."""
+    """Mask (K,) of the finite matrices (K, n, n) that are symmetric and positive semi-definite up to rounding."""
     largest = np.abs(cov).max((-1, -2), initial=0.0)
     symmetric = np.abs(cov - cov.mT).max((-1, -2), initial=0.0) <= _NEGATIVE * largest
     return symmetric & (np.linalg.eigvalsh(cov)[:, 0] >= -_NEGATIVE * largest)
 
 
 def are_poses(space: SE2Group | SE3Group, poses: Array) -> NDArray[np.bool_]:
-    """Which of (K, E) elements have a quaternion of length 1, (K,); all of them in the plane."""
+    """Mask (K,) of the elements (K, E) that have a quaternion of length 1; in the plane all of them."""
     if isinstance(space, SE2Group):
         return np.ones(len(poses), dtype=bool)
     return np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1.0) <= _UNIT

@@ -6,16 +6,15 @@ A folder with blank-separated tables, `#` starting a comment; `Robot1` stands fo
 - `Robot1_Odometry.dat`: time [s], forward speed [m/s], turn rate [rad/s] (left positive). A reading holds
   from its time until the next one; before the first one the robot stands still.
 - `Robot1_Measurement.dat`: time [s], barcode, range [m], bearing [rad] (from the heading, left positive).
-  Its header says subject where it means barcode. Robots, which move, and unknown barcodes are left out; a
-  logged message counts them. What it calls the range is how far away a barcode is along the camera's axis, as its height
-  in the image tells: see `ranges_of_depths`.
+  Its header says subject where it means barcode. Robots, which move, and unknown barcodes are left out; a logged message
+  counts them. Its range is the depth of a barcode along the camera's axis, computed from its height in the image: see
+  `ranges_of_depths`.
 - `Robot1_Groundtruth.dat`, `Landmark_Groundtruth.dat`, if the truth is known: time [s], x [m], y [m], heading
   [rad], and subject, x [m], y [m], standard deviations of both [m].
 
 A frame is an instant at which at least one landmark was observed. The motion between two frames and its covariance come
-from `integrate`, with the standard deviations of `DEFAULT_NOISE`, as the log names none. Some barcodes
-are misread, which the log cannot say either. A folder with several robots is
-read by the path of one's `..._Measurement.dat`.
+from `integrate`, with the standard deviations of `DEFAULT_NOISE`, as the log has none. Some barcodes are misread, which the
+log does not show. Of a folder with several robots pass the path of one `..._Measurement.dat`.
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, "The UTIAS multi-robot cooperative localization and
 mapping dataset", IJRR 30(8), 2011.
 """
@@ -40,7 +39,7 @@ DEFAULT_NOISE = LogNoise(
 )
 
 _LAST_ROBOT = 5
-_WIDEST_RAD = 1.2  #: No camera of these robots sees anything further to the side.
+_WIDEST_RAD = 1.2  #: Largest bearing within the field of view of these robots' cameras.
 _SUFFIX = "_Measurement.dat"
 _log = logging.getLogger(__name__)
 
@@ -73,7 +72,7 @@ class Mrclam(Format[LogNoise, RobotLog]):
         barcodes.require(barcodes["subject"] >= 1, "subject", "1 or more")
         names = barcodes.names("barcode").tolist(), barcodes.names("subject").tolist()
         subjects = dict(zip(*names, strict=True))
-        # The observations of landmarks, whose instants are the frames.
+        # The observations of landmarks; their times define the frames.
         file = folder / f"{prefix}{_SUFFIX}"
         table = read_columns(file, ("time", "barcode", "range", "bearing"), self.kind)
         require_ranges(table, "range", "bearing")
@@ -91,11 +90,11 @@ class Mrclam(Format[LogNoise, RobotLog]):
             z, cov_z = ranges_of_depths(z, cov_z)
         else:
             _log.warning("%s: bearings reach further to the side than a camera's: ranges are taken as they are.", file)
-        # The motion between them.
+        # The motion between the frames.
         table = read_columns(folder / f"{prefix}_Odometry.dat", ("time", "forward speed", "turn rate"), self.kind)
         readings_ns = table.stamps_ns()
         require_seconds(table.path, readings_ns, "odometry's rows")
-        # Holding the last reading longer than any reading was ever held would invent motion.
+        # Holding the last reading longer than any other was held would make up motion.
         late = int(stamps[-1]) - int(readings_ns[-1])
         if late > int(np.diff(readings_ns).max(initial=0)):
             ends = f"the odometry ends {late / 1e9:.3f} s before the last observation"
@@ -134,8 +133,8 @@ def _read_truth(path_file: Path, landmark_file: Path) -> Truth | None:
 def ranges_of_depths(z: Array, cov_z: Array) -> tuple[Array, Array]:
     """Ranges and bearings (n, 2), and their covariance (n, 2, 2), from depths along a camera's axis and bearings.
 
-    A barcode's height in a rectified image tells its depth, which is range × cos(bearing). On data set 6, robot 1, the log's
-    "range" is the true depth to 0.042 m (standard deviation, once a scale of 1.025 is taken off), the true range to 0.122 m.
+    A barcode's height in a rectified image gives its depth, range × cos(bearing). On data set 6, robot 1, the log's "range"
+    is the true depth to 0.042 m (standard deviation, after removing a scale of 1.025), the true range to 0.122 m.
     """
     depth, bearing = z.T
     distance = depth / np.cos(bearing)
@@ -157,11 +156,11 @@ def integrate(
         e_omega ~ N(0, std_turn_rate^2),  e_v ~ N(0, std_speed^2).
 
     Its covariance is sum_k G_k diag(std_turn_rate^2, std_speed^2) G_k^T dt_k with G_k the derivative in the right
-    chart. No piece slips sideways, so that the covariance of a single piece is singular.
+    chart. No piece has lateral noise, so that the covariance of a single piece is singular.
 
-    Of readings of the turn rate (n,) [rad/s] and the forward speed (n,) [m/s] at times (n,) in order, before the first of
-    which the robot stands still, and of instants (T,) in strict order. Returns delta (T - 1, 3), elements of SE(2), and their
-    covariance (T - 1, 2, 3, 3) by unit noise of the turn rate and by unit noise of the speed, in the right chart at delta.
+    Args are readings of the turn rate (n,) [rad/s] and the forward speed (n,) [m/s] at ordered times (n,), before the first
+    of which the robot stands still, and strictly ordered instants (T,). Returns delta (T - 1, 3), elements of SE(2), and
+    their covariances (T - 1, 2, 3, 3) per unit noise of the turn rate and of the speed, in the right chart at delta.
     """
     if len(instants_ns) == 1:
         return np.empty((0, 3)), np.empty((0, 2, 3, 3))
@@ -171,7 +170,7 @@ def integrate(
     reading = np.searchsorted(readings_ns, edges[:-1], side="right") - 1
     moving = np.where(reading >= 0, dt, 0.0)
     xi = np.stack([moving * turn_rate[reading], moving * speed[reading], np.zeros_like(dt)], axis=1)
-    # The product of all motions before each piece, and of all: headings add up, then translations do.
+    # The cumulative product of the motions: headings are summed up, then translations.
     motion = SE2.exp(xi)
     chain = np.zeros((len(xi) + 1, 3))
     chain[1:, 0] = np.cumsum(xi[:, 0])
@@ -179,7 +178,7 @@ def integrate(
     bounds = np.searchsorted(edges, instants_ns)
     start, end = bounds[:-1], bounds[1:]
     delta = SE2.between(chain[start], chain[end])
-    # The noise of a piece of a piece is carried through the rest of its interval.
+    # The noise of a piece is propagated through the rest of its interval.
     end_from_piece = SE2.between(chain[np.repeat(end, end - start)], chain[1:])
     gain = np.moveaxis(SE2.adjoint(end_from_piece) @ SE2.right_jacobian(xi)[:, :, :2], 2, 1)
     gain *= np.sqrt(dt)[:, None, None]

@@ -10,10 +10,10 @@ A folder with, comma-separated under a header line:
   Without the column landmark_id, or where it is -1, it is not known which landmark was observed: for
   `--association ml`. Yaw is positive to the left. z is (range, yaw) in the plane, where pitch must be 0,
   and (range, yaw, pitch) in space.
-- `sensor.yaml`: where the sensor sits, and whether positive pitch is up or down, as in
+- `sensor.yaml`: the sensor's mounting pose, and whether positive pitch is up or down, as in
   `robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}`,
   `std: {range_m: 0.01, yaw_deg: 0.1}` and `positive_pitch: down`.
-  `std` is optional and for people to read: every observation brings its own standard deviations.
+  `std` is optional and not read: every observation has its own standard deviations.
 - `robot_path_groundtruth.csv` and `landmarks_groundtruth.csv`, if the truth is known: step, x_m, y_m, z_m,
   yaw_rad, pitch_rad, roll_rad (world_from_robot), and id, x_m, y_m, z_m.
 
@@ -61,7 +61,7 @@ class Mrpt(Format[LogNoise, RobotLog]):
         planar = odometry.columns == PLANAR
         applicable = ["std_range_m", "std_bearing_rad", "scale_odometry"] + ["std_pitch_rad"] * (not planar)
         noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
-        # Where the sensor sits; in the plane its height is left out.
+        # The sensor's mounting pose; in the plane its height is ignored.
         entries = read_yaml(path / "sensor.yaml", self.kind).entries(("robot_from_sensor", "positive_pitch"), ("std",))
         placed = entries["robot_from_sensor"].entries(_MOUNT, optional=())
         x, y, height, *angles = (placed[key].number() for key in _MOUNT)
@@ -92,7 +92,7 @@ class Mrpt(Format[LogNoise, RobotLog]):
             row = int(np.argmin(ordered))
             backwards = f"time runs backwards from step {step[row - 1]} to {step[row]}"
             raise table.error(row, f"{backwards}, expected rows in order")
-        # Those without a name may be many in a step; each counts as one of its own here.
+        # A step may have several unnamed observations; here each counts as a landmark of its own.
         apart = np.where(landmarks == UNNAMED, UNNAMED - 1 - np.arange(len(step)), landmarks)
         if named:
             table.require(landmarks >= UNNAMED, "landmark_id", f"{UNNAMED} or the number of a landmark")

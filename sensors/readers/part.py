@@ -1,4 +1,4 @@
-"""Part of a recording: from one time to another, every so many-th of its frames, images smaller."""
+"""Part of a recording: a time interval, every n-th of its frames, and images resized."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -14,15 +14,15 @@ from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Sour
 @final
 @dataclass(frozen=True)
 class Part:
-    """Which frames of a recording are used, and images in which size.
+    """Which frames of a recording are used, and the size of its images.
 
     Raises InputError: a number is out of its range.
     """
 
-    start_s: NotNegative = 0.0  #: the first is the first one so long after the recording's first, s.
-    end_s: float | None = None  #: the last is the last one no longer after it, s; None for the recording's.
-    every: Count = 1  #: of these each so many-th.
-    #: width that they are made smaller to, px; the height follows. None leaves them as they are.
+    start_s: NotNegative = 0.0  #: start of the part, s after the recording's first frame.
+    end_s: float | None = None  #: end of the part, s after the recording's first frame; None for the recording's end.
+    every: Count = 1  #: of these every n-th.
+    #: width to which images are reduced, px; the height follows. None keeps their size.
     resize_px: Count | None = None
 
     def __post_init__(self) -> None:
@@ -32,17 +32,17 @@ class Part:
 
     @classmethod
     def of(cls, entries: Mapping[str, Any]) -> Self:
-        """The part that a run's config.yaml names."""
+        """The part stated in a run's config.yaml."""
         return cls(**{name: entries[name] for name in asdict(WHOLE) if name in entries})
 
     def entries(self) -> dict[str, float]:
-        """For a run's config.yaml; what `of` takes."""
+        """The entries for a run's config.yaml, which `of` reads."""
         return {name: value for name, value in asdict(self).items() if value != getattr(WHOLE, name)}
 
     def apply(self, sequence: ImageSequence) -> ImageSequence:
         """The part of a sequence, with its camera; the images keep their times.
 
-        Raises InputError: no image is left, or they would become larger.
+        Raises InputError: no image is left, or they would be enlarged.
         """
         stamps, camera = np.asarray(sequence.stamps_ns), sequence.camera
         rows = self.rows((stamps - stamps[:1]) * 1e-9, f"{sequence.name}: no image is left")
@@ -55,9 +55,9 @@ class Part:
         return replace(sequence, camera=camera, stamps_ns=stamps[rows], source=source)
 
     def rows(self, after_s: np.ndarray, problem: str, unit: str = "s") -> np.ndarray:
-        """Numbers of the frames used, of all (T,) that come so long after the first, s or what the unit says.
+        """Indices of the frames used, from the times (T,) since the first, in `unit`.
 
-        Raises InputError: none is left, with the problem as its beginning.
+        Raises InputError: none is left; the message starts with `problem`.
         """
         end_s = np.inf if self.end_s is None else self.end_s
         rows = np.flatnonzero((after_s >= self.start_s) & (after_s <= end_s))[:: self.every]
@@ -73,7 +73,7 @@ WHOLE = Part()
 @final
 @dataclass(frozen=True)
 class Chosen(Source):
-    """Some images of another source: rows (T,) and their times; `shape` is what they are made smaller to, None as they are."""
+    """Some images of another source: rows (T,) and their times; they are reduced to `shape`, or None."""
 
     source: Source
     rows: np.ndarray

@@ -1,7 +1,7 @@
-"""What every reader of a robot log returns: odometry, observations of landmarks and, where known, the truth.
+"""What every reader of a robot log returns: odometry, observations of landmarks and, if known, the truth.
 
-Below it stands what the readers of these logs share: noise that a caller puts in place of the log's, covariances as logs
-write them (upper triangles, in additive coordinates, rounded to a few digits), and frames from arrays.
+Also what these readers share: noise parameters of a caller in place of the log's, conversion of the logs' covariances
+(upper triangles, in additive coordinates, rounded to a few digits), and frames from arrays.
 """
 
 from collections.abc import Collection
@@ -18,19 +18,19 @@ from rbpf.ranges import NotNegative, Positive, Ranged
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.text import Table
 
-UNNAMED = -1  #: In place of a landmark's name where it is not known which one was observed.
-_ROUNDING = 1e-5  #: Of a covariance's printed digits, relative.
+UNNAMED = -1  #: In place of a landmark's name for unknown association.
+_ROUNDING = 1e-5  #: Rounding error of a covariance's printed digits, relative.
 Numbers = NDArray[np.int64]  #: Times, steps, names of landmarks.
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One filter step: the motion since the previous frame and what was then observed."""
+    """One filter step: the motion since the previous frame and the observations after it."""
 
     stamp_ns: int  #: time of the observations, integer nanoseconds; a log without times counts steps.
     delta: np.ndarray | None  #: (E,) odometry, previous_robot_from_robot; None in the first frame.
     cov_delta: np.ndarray | None  #: (d, d) its covariance in the right chart at `delta`; None in the first frame.
-    #: (K,) integer names that the log gives the landmarks observed, `UNNAMED` where it gives none.
+    #: (K,) the log's integer names of the observed landmarks, `UNNAMED` without a name.
     landmarks: np.ndarray
     z: np.ndarray  #: (K, p) measurements.
     cov_z: np.ndarray  #: (K, p, p) their covariance.
@@ -46,14 +46,14 @@ class RobotLog:
     robot_from_sensor: np.ndarray  #: (E,) mounting pose of the sensor.
     frames: list[Frame]  #: the steps in order of time.
     pitch_sign: float = 1.0  #: +1 where positive pitch points up, -1 where it points down.
-    truth: Truth | None = None  #: ground truth, None where the log has none.
-    #: whether a reading may be of another landmark than the log says, as of barcodes read by a camera.
+    truth: Truth | None = None  #: ground truth, or None.
+    #: whether associations in the log may be wrong, as for barcodes read by a camera.
     misread: bool = False
 
 
 @dataclass(frozen=True)
 class LogNoise(Ranged):
-    """Noise of a log; None takes what the log says, or the reader's documented default where it says nothing.
+    """Noise of a log; None takes the log's value, or else the reader's documented default.
 
     Raises InputError: one is not finite, or negative, or zero where only a positive one makes sense.
     """
@@ -68,7 +68,7 @@ class LogNoise(Ranged):
     scale_odometry: NotNegative | None = None  #: multiplies the odometry's standard deviations.
 
     def require_only(self, applicable: Collection[str], path: Path, kind: str) -> None:
-        """Refuse what would have no effect on a log at a path, of a kind that takes the fields of these names."""
+        """Refuses fields that have no effect on a `kind` of log, which takes only the `applicable` ones."""
         for name in self.given():
             if name not in applicable:
                 choice = ", ".join(sorted(applicable))
@@ -84,7 +84,7 @@ class LogNoise(Ranged):
 
 
 def std_column(table: Table, column: str, given: float | None) -> Array:
-    """(n,) a column of standard deviations, or the given one in its place, with which zeros pass."""
+    """(n,) a column of standard deviations, or the given value in its place, for which the column may hold zeros."""
     if given is None:
         table.require(table[column] > 0, column, "positive")
         return table[column]
@@ -107,14 +107,14 @@ def require_ranges(table: Table, distance: str, *angles: str) -> None:
 def read_covariances(table: Table, first: str, last: str) -> Array:
     """Symmetric matrices (n, d, d) from the columns of their upper triangle, row by row, from the first to the last entry.
 
-    A matrix that is positive semi-definite up to the rounding of its printed digits passes.
+    A matrix that is positive semi-definite up to the rounding of its printed digits is accepted.
     """
     triangle = table.block(first, last)
     dim = int(np.sqrt(2 * triangle.shape[1]))
     row, column = np.triu_indices(dim)
     cov = np.empty((len(triangle), dim, dim))
     cov[:, row, column] = cov[:, column, row] = triangle
-    # Judged on the correlations, because metres and radians differ by orders of magnitude.
+    # Tested on the correlation matrix, because metres and radians differ by orders of magnitude.
     variance = np.einsum("nii->ni", cov)
     std = np.sqrt(np.maximum(variance, 0.0))
     bound = std[:, :, None] * std[:, None, :] * (1.0 + _ROUNDING)
@@ -161,10 +161,10 @@ def spatial_to_chart(delta: Array, ypr: Array, cov: Array) -> Array:
 def assemble(
     stamps_ns: Numbers, delta: Array, cov_delta: Array, frame: Numbers, landmarks: Numbers, z: Array, cov_z: Array
 ) -> list[Frame]:
-    """T frames in order, at times (T,), of which one without an observation is empty.
+    """T ordered frames at times (T,); frames without observations are empty.
 
-    From each to the next leads a motion (T - 1, E) with its covariance (T - 1, d, d). Of S observations in order each has its
-    frame (S,), its landmark (S,), its measurement (S, p) and the covariance of that (S, p, p).
+    Consecutive frames are linked by motions (T - 1, E) with covariances (T - 1, d, d). The S observations, in order, have
+    frames (S,), landmarks (S,), measurements (S, p) and their covariances (S, p, p).
     """
     bounds = np.searchsorted(frame, np.arange(len(stamps_ns) + 1))
     motions = [(None, None), *zip(delta, cov_delta, strict=True)]

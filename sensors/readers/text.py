@@ -1,4 +1,4 @@
-"""Strict reading of text files and tables of numbers: whatever is not as expected is named with its file and line.
+"""Strict reading of text files and tables of numbers: errors name the file and the line.
 
 A file is UTF-8 text whose last line is complete. Numbers are decimal, finite and at most `LARGEST` in size, which keeps
 every product that a reader forms far from overflow.
@@ -23,9 +23,9 @@ from rbpf.lie import Array
 MOST_BYTES = 1 << 30  #: No table of a recording is larger.
 LARGEST = 1e12
 LATEST_S = 4e9
-#: Seconds between rows, on the median: what is read here comes neither as often nor, unless that is stated, as seldom.
+#: Limits of the median seconds between rows: real data are neither denser nor, unless a rate is stated, sparser.
 SHORTEST_GAP_S, LONGEST_GAP_S = 1e-4, 5.0
-#: Times as long as stated between rows: beyond it the unit is rather a thousandth of what it should be.
+#: Beyond this multiple of the stated interval the times are probably in milliseconds.
 OFF_RATE = 1e3**0.5
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
@@ -43,14 +43,14 @@ def quoted(text: str) -> str:
 
 
 def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
-    """Content of a file of at most so many bytes, or `MOST_BYTES`; `hint` is what is expected to lie there, for messages.
+    """Content of a file of at most so many bytes, or `MOST_BYTES`; `hint` describes the expected file, for messages.
 
     Raises InputError: the file is missing, too large or cannot be read.
     """
     most, expected = MOST_BYTES if most is None else most, hint and f"; expected {hint}"
     try:
         status = path.stat()
-        if not S_ISREG(status.st_mode):  # a pipe would be waited for, a device read without end
+        if not S_ISREG(status.st_mode):  # a pipe would block, a device never end
             kind = "a folder" if S_ISDIR(status.st_mode) else "a device or a pipe"
             raise InputError(f"{path}: cannot be read: it is {kind}, no file{expected}.")
         if status.st_size > most:
@@ -66,9 +66,9 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
 
 
 def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
-    """Text of a file, which may be packed by gzip, without a byte-order mark.
+    """Text of a file, plain or gzip-compressed, without a byte-order mark.
 
-    Raises InputError: as `read_bytes`, or the file is empty, but for a byte-order mark, or not UTF-8.
+    Raises InputError: as `read_bytes`, or the file is empty apart from a byte-order mark, or not UTF-8.
     """
     data = read_bytes(path, hint, most)
     if data.startswith(b"\x1f\x8b"):  # packed by gzip
@@ -91,7 +91,7 @@ def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
 
 
 def read_lines(path: Path, hint: str = "") -> list[str]:
-    """Lines of a file whose last line is complete, without their ends."""
+    """Lines of a file without line ends; its last line must be complete."""
     lines = read_text(path, hint).split("\n")
     if lines[-1]:
         raise line_error(path, len(lines), "the file ends inside this line; copy it again, or end it if it is complete")
@@ -99,7 +99,7 @@ def read_lines(path: Path, hint: str = "") -> list[str]:
 
 
 def numbered_lines(path: Path, hint: str = "") -> list[tuple[int, str]]:
-    """Lines of a file, stripped, with their numbers from 1, but for blank ones and comments, which start with #."""
+    """Stripped lines of a file with their numbers from 1, without blank ones and comments (#)."""
     numbered = ((number, line.strip()) for number, line in enumerate(read_lines(path, hint), 1))
     return [(number, line) for number, line in numbered if line and not line.startswith("#")]
 
@@ -127,31 +127,31 @@ class Table:
         return line_error(self.path, self.lines[row], problem)
 
     def require(self, valid: NDArray[np.bool_], column: str, expected: str) -> None:
-        """Refuse the first row where `valid` (n,) is False."""
+        """Raises InputError for the first row at which `valid` (n,) is False."""
         if not valid.all():
             row = int(np.argmin(valid))
             raise self.error(row, f"expected {column} to be {expected}, found {self[column][row]:.12g}")
 
     def integers(self, column: str) -> NDArray[np.int64]:
-        """(n,) a column of whole numbers."""
+        """(n,) a column that must hold whole numbers."""
         self.require(self[column] == np.floor(self[column]), column, "a whole number")
         return self[column].astype(np.int64)
 
     def names(self, column: str) -> NDArray[np.int64]:
-        """(n,) a column of whole numbers that must differ from one another."""
+        """(n,) a column that must hold distinct whole numbers."""
         names = self.integers(column)
         if (row := _second(names)) is not None:
-            raise self.error(row, f"{column} {names[row]} comes a second time, expected it once")
+            raise self.error(row, f"{column} {names[row]} occurs twice, expected it once")
         return names
 
     def require_distinct(self, frame: NDArray[np.int64], landmarks: NDArray[np.int64], when: str) -> None:
-        """Refuse a landmark (n,) that one frame (n,) observes twice; `when` is what the recording calls a frame."""
+        """Refuses landmarks (n,) that occur twice in a frame (n,); `when` is the recording's word for a frame."""
         if (row := _second(np.stack([frame, landmarks], axis=1))) is not None:
-            again = f"landmark {landmarks[row]} comes a second time in {when} {frame[row]}"
+            again = f"landmark {landmarks[row]} occurs twice in {when} {frame[row]}"
             raise self.error(row, f"{again}, expected it once")
 
     def stamps_ns(self) -> NDArray[np.int64]:
-        """(n,) the first column, times in seconds, as nanoseconds; digits beyond these are dropped.
+        """(n,) the first column, times in seconds, as nanoseconds; further digits are dropped.
 
         The decimal text is converted, not its rounded float.
         """
@@ -159,7 +159,7 @@ class Table:
 
 
 def _second(values: NDArray[np.int64]) -> int | None:
-    """The first row (n,) or (n, k) that was there before; None where each is there once."""
+    """The first row of values (n,) or (n, k) that repeats an earlier one; None if all are distinct."""
     _, first = np.unique(values, axis=0, return_index=True)
     later = np.setdiff1d(np.arange(len(values)), first)
     return int(later[0]) if later.size else None
@@ -171,7 +171,7 @@ def read_columns(path: Path, columns: tuple[str, ...], hint: str = "") -> Table:
 
 
 def read_csv(path: Path, headers: Sequence[tuple[str, ...]], hint: str = "") -> Table:
-    """File of comma-separated columns under one of these headers; the table's columns tell which one was found."""
+    """File of comma-separated columns under one of these headers; the table's `columns` are the one found."""
     lines = read_lines(path, hint)
     found = tuple(name.strip() for name in lines[0].split(","))
     if found not in headers:
@@ -183,13 +183,13 @@ def read_csv(path: Path, headers: Sequence[tuple[str, ...]], hint: str = "") -> 
 def parse_table(
     path: Path, columns: tuple[str, ...], numbered: Iterable[tuple[int, str]], separator: str | None = None
 ) -> Table:
-    """Numbers in numbered lines of a file; blank lines are passed over. The separator None stands for blanks."""
+    """Numbers in numbered lines of a file; blank lines are ignored. The separator None means whitespace."""
     filled = [(number, line) for number, line in numbered if line.strip()]
     if not filled:
         raise InputError(f"{path}: expected rows of {', '.join(columns)}, found none.")
     lines, rows = [number for number, _ in filled], [line for _, line in filled]
-    # The whole file goes through NumPy's parser. Only when that refuses, or lets something suspicious through, are the
-    # lines read one by one: characters beyond those of plain numbers (nan, 0x1p3, quotes) mean something to NumPy.
+    # NumPy's parser reads the whole file. Only if it fails, or accepts something suspicious, are the lines read one by one:
+    # characters beyond those of plain numbers (nan, 0x1p3, quotes) have a meaning in NumPy.
     values = None
     if not "".join(rows).translate(_PLAIN):
         with suppress(ValueError):
@@ -216,7 +216,7 @@ def parse_number(path: Path, line: int, column: str, field: str) -> float:
 
 
 def parse_time(path: Path, line: int, text: str) -> int:
-    """Time in seconds in a line, counted from 1, as nanoseconds; digits beyond these are dropped."""
+    """Time in seconds in a line, counted from 1, as nanoseconds; further digits are dropped."""
     if not (_NUMBER.fullmatch(text) and abs(float(text)) <= LATEST_S):
         problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
         raise line_error(path, line, problem)
@@ -232,7 +232,7 @@ def _parse_nanoseconds(path: Path, line: int, text: str) -> int:
 def _stamps_ns(
     path: Path, lines: list[int], texts: list[str], parse: Callable[[Path, int, str], int]
 ) -> NDArray[np.int64]:
-    """Times (n,) of lines; one before the one it follows is refused."""
+    """Times (n,) of lines; decreasing times are refused."""
     stamps = [parse(path, line, text) for line, text in zip(lines, texts, strict=True)]
     for row in range(1, len(stamps)):
         if stamps[row] < stamps[row - 1]:
@@ -245,7 +245,7 @@ def _stamps_ns(
 class StampedLines:
     """Lines of a file that begin with a time, in order of time; equal times are allowed.
 
-    Each has its number from 1, its time in `stamps_ns` (T,), and the text after it, in which `separator` is between columns.
+    Each has its line number from 1, its time in `stamps_ns` (T,), and the remaining text, split by `separator`.
     """
 
     path: Path
@@ -255,26 +255,26 @@ class StampedLines:
     separator: str | None
 
     def files(self, folder: Path) -> list[Path]:
-        """The texts as files in a folder."""
+        """The remaining texts as files in a folder."""
         for line, rest in zip(self.lines, self.rests, strict=True):
             if not rest:
                 raise line_error(self.path, line, "expected a time and the file of an image, found only a time")
         return [folder / rest for rest in self.rests]
 
     def table(self, columns: tuple[str, ...]) -> Table:
-        """The texts as numbers; columns beyond these are passed over."""
+        """The remaining texts as numbers; further columns are ignored."""
         cut = ((self.separator or " ").join(rest.split(self.separator)[: len(columns)]) for rest in self.rests)
         return parse_table(self.path, columns, zip(self.lines, cut, strict=True), self.separator)
 
 
 def read_stamped(path: Path, hint: str, nanoseconds: bool = False) -> StampedLines:
-    """Lines of a time and something else; lines that start with # are comments.
+    """Lines that start with a time; lines that start with # are comments.
 
     Args:
         path: the file.
-        hint: what is expected to lie there, for the message.
-        nanoseconds: whether times are whole nanoseconds, and commas stand between columns; else they are seconds, whose
-            further digits are dropped, and blanks do.
+        hint: describes the expected file, for messages.
+        nanoseconds: whether times are whole nanoseconds and columns separated by commas; else they are seconds, of which
+            digits beyond nanoseconds are dropped, and columns are separated by whitespace.
     """
     separator, parse = (",", _parse_nanoseconds) if nanoseconds else (None, parse_time)
     kept = [(line, text.split(separator, 1)) for line, text in numbered_lines(path, hint)]
@@ -284,14 +284,14 @@ def read_stamped(path: Path, hint: str, nanoseconds: bool = False) -> StampedLin
     rests = ["".join(parts[1:]).strip() for _, parts in kept]
     stamps_ns = _stamps_ns(path, lines, texts, parse)
     if nanoseconds and 0.0 < (gap_s := _median_gap_s(stamps_ns)) < SHORTEST_GAP_S:
-        raise InputError(f"{path}: times are {1e9 * gap_s:.0f} apart, too little for nanoseconds; write them in these.")
+        raise InputError(f"{path}: times are {1e9 * gap_s:.0f} apart, too little: write them in nanoseconds.")
     return StampedLines(path, lines, stamps_ns, rests, separator)
 
 
 def require_seconds(path: Path, stamps_ns: NDArray[np.int64], rows: str, rate_hz: float | None = None) -> None:
-    """Refuse times (n,) of a file's `rows` that look like milliseconds, or smaller units, counted from 0.
+    """Refuses times (n,) of a file's `rows` that are probably in milliseconds, or smaller units.
 
-    The time between rows alone tells them from a time lapse, which has to state its rate.
+    Only the interval distinguishes them from a time lapse, which therefore has to state its rate.
     """
     gap_s = _median_gap_s(stamps_ns)
     if gap_s > LONGEST_GAP_S and not (rate_hz and gap_s * rate_hz < OFF_RATE):

@@ -69,7 +69,7 @@ class VictoriaPark(Format[LogNoise, RobotLog]):
             problem = f"expected a path without loops, found a return to pose {start[0]}"
             raise odometry.error(int(np.argmax(stop == start[0])), problem)
         poses = np.concatenate([start[:1], stop])
-        # Landmarks are seen from these poses, once from each, and have numbers of their own.
+        # Landmarks are observed from these poses, once per pose, and share no number with a pose.
         pose, landmarks = observations.integers("pose"), observations.integers("landmark")
         observations.require(np.isin(pose, poses), "pose", "a pose of the odometry")
         observations.require(~np.isin(landmarks, poses), "landmark", "a landmark's number, not a pose's")

@@ -1,4 +1,4 @@
-"""YAML files of which every value knows its line; no tag of a file can construct anything that is not plain."""
+"""YAML files whose values know their lines; tags cannot construct anything but plain values."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ import yaml
 from rbpf.errors import InputError
 from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_text
 
-DEEPEST = 20  #: Lists and mappings within each other.
+DEEPEST = 20  #: Maximum nesting of lists and mappings.
 MOST_BYTES = 1 << 20  #: Settings and calibrations are a few kilobytes.
-#: That of libyaml, in a tenth of the time, where PyYAML was built with it.
+#: The loader of libyaml, ten times as fast, if PyYAML was built with it.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
 class YamlValue:
-    """A value in a YAML file, and its key; whoever asks for what it is not gets an InputError that names its line."""
+    """A value in a YAML file, and its key; reading it as a wrong type raises an InputError that names its line."""
 
     path: Path
     name: str
@@ -29,7 +29,7 @@ class YamlValue:
         return line_error(self.path, self.node.start_mark.line + 1, problem)
 
     def entries(self, required: Collection[str], optional: Collection[str] | None = None) -> dict[str, "YamlValue"]:
-        """Values of a mapping by their keys, each once: those that must be there and others that may be, None for any."""
+        """Values of a mapping by their distinct keys: the required ones and optional ones, None for any."""
         expected = f"expected the keys {', '.join(required)}"
         if not isinstance(self.node, yaml.MappingNode):
             raise self.error(f"{expected}, found no mapping such as `{next(iter(required))}: ...`")
@@ -37,7 +37,7 @@ class YamlValue:
         for key, node in self.node.value:
             name = YamlValue(self.path, "a key", key).text()
             if name in found:
-                raise YamlValue(self.path, name, key).error(f"{name} comes a second time, expected it once")
+                raise YamlValue(self.path, name, key).error(f"{name} occurs twice, expected it once")
             if optional is not None and name not in required and name not in optional:
                 others = f"; also known: {', '.join(optional)}" if optional else ""
                 raise YamlValue(self.path, name, key).error(f"{expected}{others}; found {quoted(name)}")
@@ -48,13 +48,13 @@ class YamlValue:
         return found
 
     def text(self) -> str:
-        """A single value: no list and no mapping."""
+        """A scalar: neither a list nor a mapping."""
         if not isinstance(self.node, yaml.ScalarNode):
             raise self.error(f"expected {self.name} to be a single value, found a list or a mapping")
         return str(self.node.value)
 
     def choice(self, allowed: Collection[str]) -> str:
-        """One of a few words."""
+        """One of the `allowed` words."""
         text = self.text()
         if text not in allowed:
             raise self.error(f"expected {self.name} to be {' or '.join(allowed)}, found {quoted(text)}")
@@ -89,17 +89,17 @@ class YamlValue:
 
 
 def read_yaml(path: Path, hint: str) -> YamlValue:
-    """Content of a YAML file; `hint` is what is expected to lie there, for messages.
+    """Content of a YAML file; `hint` describes the expected file, for messages.
 
-    Raises InputError: the file is missing, too large, empty, or no YAML.
+    Raises InputError: the file is missing, too large, empty, or not YAML.
     """
     text = read_text(path, hint, MOST_BYTES)
     if text.startswith("%YAML:"):
-        # OpenCV writes this first line with a colon, which YAML does not have.
+        # OpenCV writes "%YAML:1.0", with a colon that YAML does not allow.
         text = "#" + text
     try:
-        # Before anything is built: a few nested aliases stand for more values than memory holds, and what is nested
-        # thousands deep takes minutes.
+        # Checked before construction: a few nested aliases can expand to more values than fit in memory, and thousands of
+        # nested levels take minutes.
         depth = 0
         for event in yaml.parse(text, _LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -122,9 +122,9 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
 
 
 def read_plain_yaml(path: Path) -> Any:
-    """What a YAML file says in plain values: mappings, lists, text, numbers, dates.
+    """The content of a YAML file as plain values: mappings, lists, text, numbers, dates.
 
-    Raises InputError: as `read_yaml`, a key comes twice, a tag is not plain, or a value is none of its type.
+    Raises InputError: as `read_yaml`, a key occurs twice, a tag is not plain, or a value does not fit its type.
     """
     whole = read_yaml(path, "settings")
     _require_plain(whole)
@@ -134,11 +134,11 @@ def read_plain_yaml(path: Path) -> Any:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise line_error(path, line, f"expected plain values, found another tag ({error.problem})") from None
     except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, ValueError) as error:
-        raise InputError(f"{path} holds a value that is none of its type: {error}") from None
+        raise InputError(f"{path} has a value that does not fit its type: {error}") from None
 
 
 def _require_plain(value: YamlValue) -> None:
-    """Refuses keys that come twice."""
+    """Refuses duplicate keys."""
     if isinstance(value.node, yaml.MappingNode):
         for inner in value.entries(()).values():
             _require_plain(inner)

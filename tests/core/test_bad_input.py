@@ -72,9 +72,9 @@ def test_construction(message):
 
 ODOMETRY = [
     (np.zeros(2), np.eye(3), r"odometry needs delta \(3,\) and cov \(3, 3\), got \(2,\)"),
-    (np.zeros(3), -np.eye(3), "the covariance of the odometry is not one: .*negative eigenvalue"),
-    (np.zeros(3), np.triu(np.ones((3, 3))), "the covariance of the odometry is not one: .*not symmetric"),
-    (np.zeros(3), np.full((3, 3), np.nan), "the covariance of the odometry is not one: .*not finite"),
+    (np.zeros(3), -np.eye(3), "the covariance of the odometry is not valid: .*negative eigenvalue"),
+    (np.zeros(3), np.triu(np.ones((3, 3))), "the covariance of the odometry is not valid: .*not symmetric"),
+    (np.zeros(3), np.full((3, 3), np.nan), "the covariance of the odometry is not valid: .*not finite"),
     (np.array([0.0, np.nan, 0.0]), np.eye(3), "the odometry increment .* holds NaN or infinity"),
 ]
 
@@ -100,7 +100,7 @@ class TestMeasurements:
         [
             ([[np.nan]], None, "a measurement of Curved or its covariance is not finite"),
             ([[1.0]], [[[np.inf]]], "a measurement of Curved or its covariance is not finite"),
-            ([[1.0]], [[[-1.0]]], "the noise of Curved has no covariance: .*negative eigenvalue"),
+            ([[1.0]], [[[-1.0]]], "the noise covariance of Curved is not valid: .*negative eigenvalue"),
             ([[1.0, 2.0]], None, r"Curved measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)"),
             ([[1.0]], [[1.0]], r"got \(1, 1\) and \(1, 1\)"),
         ],
@@ -197,8 +197,8 @@ class TestLandmarks:
         ("ids", "match"),
         [
             (None, "RangeBearing reads a landmark: its observations need ids"),
-            ([3], "names landmark 3, which the map does not hold"),
-            ([[4]] * (N - 1) + [[10**9]], "names landmark 1000000000, which the map does not hold"),
+            ([3], "is of landmark 3, which is not in the map"),
+            ([[4]] * (N - 1) + [[10**9]], "is of landmark 1000000000, which is not in the map"),
             ([1, 2], rf"ids of 1 measurements must be \(1,\) or \({N}, 1\), got \(2,\)"),
             ([-3], "ids of RangeBearing must be integers: landmarks, NULL = -1 or NEW = -2"),
             ([1.0], "ids of RangeBearing must be integers"),
@@ -212,13 +212,13 @@ class TestLandmarks:
     def test_reading_the_map(self, filter_):
         landmark_map = filter_.belief().map
         for use in (landmark_map.read, landmark_map.remove):
-            with pytest.raises(InputError, match="the map holds no landmark 3"):
+            with pytest.raises(InputError, match="the map has no landmark 3"):
                 use(np.array([3]))
-        with pytest.raises(InputError, match="the map holds no landmark 7"):
+        with pytest.raises(InputError, match="the map has no landmark 7"):
             filter_.belief().project(RangeBearing(SE2), np.array([7]))
-        with pytest.raises(InputError, match="the map holds no landmark -1"):
+        with pytest.raises(InputError, match="the map has no landmark -1"):
             landmark_map.landmark_of(-1)
-        with pytest.raises(InputError, match="no landmark was named"):
+        with pytest.raises(InputError, match="no landmark id was given"):
             landmark_map.read(np.zeros(0, dtype=int))
 
     def test_landmarks_that_cannot_be_added(self, filter_):
@@ -230,11 +230,11 @@ class TestLandmarks:
         for changed, match in (
             ({"mask": np.ones((N, 1), dtype=bool)}, "only need a map with evidence=True"),
             ({"z": np.array([[np.nan, 0.0]])}, "a new Point has a mean or covariance that is not finite"),
-            ({"model": Bearing(SE2)}, r"Bearing cannot start landmarks: override invert or"),
+            ({"model": Bearing(SE2)}, r"Bearing cannot initialise landmarks: override invert or"),
         ):
             with pytest.raises(InputError, match=match):
                 held.add(replace(new, **changed), filter_.particles.state)
-        with pytest.raises(InputError, match="keeps no log-odds: build it with evidence=True"):
+        with pytest.raises(InputError, match="has no log-odds: build it with evidence=True"):
             held.set_log_odds(np.array([4]), np.zeros((N, 1)))
 
 

@@ -60,7 +60,7 @@ def test_a_filter_that_has_diverged_says_so():
         filter_ = driven(50, 100)
     assert findings(filter_) >= {"innovations", "copies"}
     assert [str(warning.message) for warning in caught] == list(filter_.health.findings.values()), "each is told once"
-    assert "step 200: what is measured is " in filter_.health.findings["innovations"]
+    assert "step 200: squared innovations are " in filter_.health.findings["innovations"]
     assert "have had all the weight" in filter_.health.findings.get("weights", "have had all the weight")
 
 
@@ -97,7 +97,7 @@ def test_evidence_that_collapses(proposal):
     assert not filter_.health.findings
     with pytest.warns(HealthWarning):
         follow(filter_, np.linspace(40.0, 400.0, 30))
-    assert "the log-evidence of one number fell from" in filter_.health.findings["evidence"]
+    assert "the log-evidence per component fell from" in filter_.health.findings["evidence"]
 
 
 def test_sound_filters_are_not_suspected():

@@ -159,7 +159,7 @@ def test_two_maps_agree_with_one(tmp_path: Path):
 def test_what_does_not_fit_together_is_said():
     raw = Observations.raw(0.0, MODE)
     fails(still(3), "raw data are for a mode, which this filter does not hold", [raw])
-    fails(still(3, LandmarkMap(Euclidean(1), part=MODE)), "LandmarkMap takes no raw data, but rows", [raw])
+    fails(still(3, LandmarkMap(Euclidean(1), part=MODE)), "LandmarkMap takes no raw data, only rows", [raw])
     with pytest.raises(InputError, match="two parts of the filter are named 'mode': give one of them another name"):
         still(3, Modes(), Modes())
     with pytest.raises(InputError, match="two parts of the filter are named 'landmark'"):

@@ -310,13 +310,13 @@ def test_kinds_that_a_joint_map_does_not_hold():
     joint, _ = rays(2)
     one = Records(np.zeros((2, 1, 3)), np.zeros((2, 1, 3, 3)))
     for landmark in (MixturePoint(2, 3), Point(2), AnchoredPoint(SE2)):
-        with pytest.raises(InputError, match="anchored at a pose"):
+        with pytest.raises(InputError, match="or anchored landmarks"):
             joint.add_records(one, landmark)
     with pytest.raises(InputError, match="override seen_from"):
         JointMap(SE2).register(Mute())
     with pytest.raises(InputError, match="one parametrisation at a time"):
         joint.read(np.array([5, 20]))
-    with pytest.raises(InputError, match=r"into Point\(3\)"):
+    with pytest.raises(InputError, match=r"to Point\(3\)"):
         joint.promote(np.array([5]))
     twice = Observations(np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1)), CameraRay(CAMERA), ids=np.array([20, 20]))
     with pytest.raises(InputError, match="unknown depth twice"):

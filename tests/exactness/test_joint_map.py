@@ -299,7 +299,7 @@ def test_what_a_joint_map_does_not_take(world):
     refused = {
         "one association for all particles": replace(group, ids=np.zeros((12, 1), dtype=np.int64)),
         "update state and landmarks": replace(group, updates=frozenset({Part.STATE})),
-        "holds no landmark 7": replace(group, ids=one + 7),
+        "has no landmark 7": replace(group, ids=one + 7),
     }
     for words, wrong in refused.items():
         filter_ = plane(Consolidation(1))
@@ -309,7 +309,7 @@ def test_what_a_joint_map_does_not_take(world):
     with pytest.raises(InputError, match=r"holds Point\(2\)"):
         plane(Consolidation(1)).step(Frame([], [NewLandmarks(z, covs, Relative(), Point(3))]))
     space = Euclidean(2)
-    with pytest.raises(InputError, match="LandmarkMap cannot take in"):
+    with pytest.raises(InputError, match="LandmarkMap cannot be consolidated"):
         Filter(Walk(), Scripted(), LandmarkMap(space), n=5, consolidation=Consolidation(1)).step(Frame())
     with pytest.raises(InputError, match="window must be a whole number"):
         Consolidation(window=0)

@@ -126,7 +126,7 @@ def test_an_update_by_other_groups_than_the_refinement_is_by_the_groups_it_is_gi
     # A landmark that is removed after the refinement is missed by the update.
     landmark_map.information(state, sighting(1), Prior.exactly(SE2, state))
     landmark_map.remove(np.array([1]))
-    with pytest.raises(InputError, match="names landmark 1, which the map does not hold"):
+    with pytest.raises(InputError, match="is of landmark 1, which is not in the map"):
         landmark_map.correct(state, increment, sighting(1))
 
 

@@ -234,7 +234,7 @@ def test_the_common_case_is_one_batch_without_masks():
 
 @pytest.mark.parametrize("ids", [[6], [7], [[0]] * (N - 1) + [[6]]])
 def test_landmarks_that_are_not_held(ids):
-    with pytest.raises(InputError, match=r"names landmark [67], which the map does not hold"):
+    with pytest.raises(InputError, match=r"is of landmark [67], which is not in the map"):
         make_plan([group(ids)], N, kinds, PLAIN)
 
 

@@ -122,12 +122,12 @@ class TestTooLittle:
     @pytest.mark.parametrize("count", [0, 1, 7])
     def test_too_few_matches(self, count):
         matches = worlds.simulate(worlds.ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(count))
-        self.refused(matches, f"{count} matches are there, 8 are needed")
+        self.refused(matches, f"{count} matches are valid, 8 are needed")
 
     def test_left_and_right_swapped(self):
         matches = worlds.simulate(worlds.ROOM, 30, np.random.default_rng(0)).matches
         swapped = replace(matches, z_prev=matches.z_prev[:, [2, 1, 0]], z_now=matches.z_now[:, [2, 1, 0]])
-        complaint = "30 of 30 matches have a negative disparity: are left and right swapped? 0 are left"
+        complaint = "30 of 30 matches have a negative disparity: are left and right swapped? 0 are valid"
         self.refused(swapped, f"{complaint}, 8 are needed")
 
     def test_nothing_agrees(self):
@@ -181,7 +181,7 @@ class TestDegenerate:
     [
         (np.zeros((5, 2)), np.zeros((5, 2)), COV, r"\(K, 3\) arrays \(u_left, v, u_right\), got \(5, 2\)"),
         (np.zeros((5, 3)), np.full((5, 3), np.nan), COV, "NaN or infinity"),
-        (np.zeros((5, 3)), np.zeros((5, 3)), np.ones((3, 3)), "cov_prev is no covariance of pixels"),
+        (np.zeros((5, 3)), np.zeros((5, 3)), np.ones((3, 3)), "cov_prev is not a covariance of pixels"),
         (np.zeros((5, 3)), np.zeros((5, 3)), np.ones(3), r"cov_prev must be \(3, 3\) or \(5, 3, 3\), got \(3,\)"),
     ],
 )
@@ -256,7 +256,7 @@ class TestCandidateMotions:
     def test_without_a_motion_there_is_the_prior(self):
         none = worlds.simulate(worlds.ROOM, 20, np.random.default_rng(0)).matches.take(np.arange(0))
         prior, motions, failure = self.step(none, np.full(6, 0.3), std_turn=0.5, std_speed=2.0)
-        assert motions == () and failure == "0 matches are there, 8 are needed"
+        assert motions == () and failure == "0 matches are valid, 8 are needed"
         np.testing.assert_allclose(prior.delta, SE3.exp(np.full(6, 0.03)))
         np.testing.assert_allclose(prior.cov, np.diag(self.DT**2 * np.repeat([0.25, 4.0], 3)))
 

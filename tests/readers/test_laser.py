@@ -114,7 +114,7 @@ def told_of_a_mirror(text, folder, caplog, **options) -> tuple[bool, ...]:
         ]
         caplog.clear()
         log_of(folder, "".join(" ".join(words) + "\n" for words in turned), LaserOptions(**options), name)
-        told.append("the scans turn against the odometry" in caplog.text)
+        told.append("the scans rotate against the odometry" in caplog.text)
     return tuple(told)
 
 
@@ -174,7 +174,7 @@ def test_bags_that_say_less(tmp_path, caplog):
             bag.scan("/scan", stamp, [1.0, 2.0], reach=(0.0, 0.0))
     log = read_laser_log(tmp_path / "bare.bag")
     assert log.odometry is None and log.scanner.max_range_m == 80.0
-    assert "nothing says where the scanner sits" in caplog.text
+    assert "no mounting pose of the scanner" in caplog.text
     with pytest.raises(InputError, match=r"expected a topic /other, found /scan of LaserScan"):
         read_laser_log(tmp_path / "bare.bag", LaserOptions("/other"))
     with recorded(tmp_path / "uneven.bag") as bag:

@@ -30,13 +30,13 @@ FORMATS = {
 every_format = pytest.mark.parametrize("name", FORMATS)
 
 LINES = """
-MRCLAM | Barcodes.dat | 3 | 3 5 | barcode 5 comes a second time
+MRCLAM | Barcodes.dat | 3 | 3 5 | barcode 5 occurs twice
 MRCLAM | Barcodes.dat | 3 | 2 14.5 | expected barcode to be a whole number
 MRCLAM | Robot3_Odometry.dat | 3 | 100.3 0.2 | expected 3 columns (time, forward speed, turn rate), found 2
 MRCLAM | Robot3_Odometry.dat | 3 | 99.9 0.2 1.0 | time runs backwards from 100.0 to 99.9
 MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 0 0 | expected range to be positive, found 0
 MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 2 30 | expected bearing to be in radians, within a turn, found 30
-MRCLAM | Landmark_Groundtruth.dat | 3 | 6 3 4 0 0 | subject 6 comes a second time
+MRCLAM | Landmark_Groundtruth.dat | 3 | 6 3 4 0 0 | subject 6 occurs twice
 MRCLAM | Landmark_Groundtruth.dat | 3 | 7 3 4 0 -1 | expected std of y to be zero or positive
 MRPT | odometry.csv | 1 | step,x | expected the header
 MRPT | odometry.csv | 3 | 1,1,0,0,1,0,0,1,0,1 | expected step to be one more than in the row before
@@ -44,7 +44,7 @@ MRPT | odometry.csv | 3 | 2,1,,0,1,0,0,1,0,1 | expected dy_m to be a finite numb
 MRPT | odometry.csv | 3 | 2,1,0,0,-1,0,0,1,0,1 | expected cxx to cpp to be a covariance
 MRPT | observations.csv | 2 | -1,7,3,0.1,0,0.01,0.02,0 | expected step to be one with odometry, 0 to 3
 MRPT | observations.csv | 3 | 2.5,8,4,0,0,0.03,0.04,0 | expected step to be a whole number, found 2.5
-MRPT | observations.csv | 3 | 0,7,4,0,0,0.03,0.04,0 | landmark 7 comes a second time in step 0
+MRPT | observations.csv | 3 | 0,7,4,0,0,0.03,0.04,0 | landmark 7 occurs twice in step 0
 MRPT | observations.csv | 3 | 3,8,4,0,0,0.03,0.04,0 | line 4: time runs backwards from step 3 to 2
 MRPT | observations.csv | 3 | 0,8,0,0,0,0.03,0.04,0 | expected range_m to be positive, found 0
 MRPT | observations.csv | 3 | 0,8,4,0,0.1,0.03,0.04,0 | expected pitch_rad to be 0, as the odometry is planar
@@ -54,12 +54,12 @@ MRPT | sensor.yaml | 2 | MOUNT with roll_deg: 5 | as the odometry is planar
 MRPT | sensor.yaml | 3 | x: 1 | expected the keys robot_from_sensor, positive_pitch; also known: std; found 'x'
 MRPT | sensor.yaml | 4 | positive_pitch: left | expected positive_pitch to be up or down, found 'left'
 MRPT | robot_path_groundtruth.csv | 3 | 0,3,4,0,0,0,0 | expected step to be later
-MRPT | landmarks_groundtruth.csv | 3 | 7,1,2,3 | id 7 comes a second time
+MRPT | landmarks_groundtruth.csv | 3 | 7,1,2,3 | id 7 occurs twice
 graph | graph.txt | 2 | LANDMRK 1 2 3 -4 0.5 0.1 0.25 | expected ODOMETRY or LANDMARK, found 'LANDMRK'
 graph | graph.txt | 2 | LANDMARK 1 2 3 -4 0.5 0.5 0.25 | expected cxx to cyy to be a covariance
 graph | graph.txt | 2 | LANDMARK 8 2 3 -4 0.5 0.1 0.25 | expected pose to be a pose of the odometry, found 8
 graph | graph.txt | 2 | LANDMARK 1 3 3 -4 0.5 0.1 0.25 | expected landmark to be a landmark's number, not a pose's,
-graph | graph.txt | 5 | LANDMARK 1 2 7 8 0.5 0 0.5 | landmark 2 comes a second time in pose 1
+graph | graph.txt | 5 | LANDMARK 1 2 7 8 0.5 0 0.5 | landmark 2 occurs twice in pose 1
 graph | graph.txt | 3 | ODOMETRY 2 3 1 0 0 1 0 0 0 0 1 | expected odometry from pose 1, where the one before ends, fou
 graph | graph.txt | 3 | ODOMETRY 1 0 1 0 0 1 0 0 0 0 1 | expected a path without loops, found a return to pose 0
 CARMEN | robot.clf | 2 | PARAM robot_frontlaser_offset far | expected robot_frontlaser_offset to be a finite number
@@ -79,7 +79,7 @@ path | path.tum | 2 | 0.5 1 2 3 0 0 0 0.9 | expected a quaternion of length 1, f
 relations | some.relations | 2 | 0 1 1 0 0 0 0 | expected 8 columns (t1, t2, x, y, z, roll, pitch, yaw), found 7
 relations | some.relations | 2 | 0 5e9 1 0 0 0 0 0 | expected the time in seconds
 known | known_points.csv | 1 | id,u_px,v_px,x_m,y_m,z_m | expected a header with the columns id,u_px,v_px,x_m,y_m
-known | known_points.csv | 3 | 7,2,3,4,5,6,0.1 | id 7 comes a second time
+known | known_points.csv | 3 | 7,2,3,4,5,6,0.1 | id 7 occurs twice
 known | known_points.csv | 2 | 1,2,3,4,5,6,-0.1 | expected sigma_m to be zero or positive, found -0.1
 """
 """Format, file, number of the line, what stands there in place of what is right, and the words about it."""
@@ -257,7 +257,7 @@ def test_whole_and_distinct_numbers(tmp_path):
     read = table(tmp_path, "1 2\n\n1 2.5\n")
     with pytest.raises(InputError, match=re.escape("line 3: expected x to be a whole number, found 2.5")):
         read.integers("x")
-    with pytest.raises(InputError, match=re.escape("line 3: time 1 comes a second time")):
+    with pytest.raises(InputError, match=re.escape("line 3: time 1 occurs twice")):
         read.names("time")
 
 

@@ -287,9 +287,9 @@ def on_a_line() -> FeatureLog:
 @pytest.mark.parametrize(
     ("log", "words"),
     [
-        (seeing(0), "needs at least four that are seen, got 0"),
-        (seeing(3), "needs at least four that are seen, got 3"),
-        (one_outside(FIRST), "needs at least four that are seen, got 3"),
+        (seeing(0), "needs at least four in the image, got 0"),
+        (seeing(3), "needs at least four in the image, got 3"),
+        (one_outside(FIRST), "needs at least four in the image, got 3"),
         (on_a_line(), "the known points lie on a line"),
         (
             changed(FIRST, 1, lambda f: replace(f, landmarks=-1 - np.arange(len(f.landmarks)))),

@@ -55,4 +55,4 @@ def test_a_good_run_is_not_suspected(name):
 
 
 def test_what_a_filter_is_suspected_of_names_the_frame_once():
-    assert re.match(r"step \d+: what is measured is", robot("joint", noise=0.1).messages[0])
+    assert re.match(r"step \d+: squared innovations are", robot("joint", noise=0.1).messages[0])

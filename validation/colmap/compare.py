@@ -1,4 +1,4 @@
-"""A reconstruction by COLMAP, and how far a run's path and map, or the truth, are from it.
+"""Reconstruction by COLMAP, and its comparison with a run's path and map, or the truth.
 
 It is made from key frames of a sequence: its own features, no knowledge of the filter. SIFT, sequential matching, incremental
 mapping; the calibration is held fixed. What it finds shares the images and the calibration with the filter and nothing else.
@@ -7,8 +7,8 @@ J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 
 Compared are camera centres, and distances between clouds.
 
-COLMAP's world and scale are its own: its cameras are brought onto the reference's by the best similarity, or by the
-best rigid motion where a stereo pair gave the scale. Then one metre is the reference's.
+COLMAP's world and scale are arbitrary: its cameras are aligned to the reference's by the best similarity, or by the best
+rigid motion if a stereo pair gave the scale. One metre is then the reference's.
 
 Two detectors seldom choose the same spots, so the nearest point is about as far as the cloud is sparse. The distance
 from the plane of the nearest points does not depend on that where the surface is smooth.
@@ -37,8 +37,8 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import OVER_IMAGES, from_colmap_pose, recorded_images, to_colmap_camera
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
-LEAST_FRAMES = 3  #: Key frames; two have no third view that tells a wrong match.
-OVERLAP = 10  #: Each key frame is matched with so many that follow, and with those 2^i further on.
+LEAST_FRAMES = 3  #: Least key frames; two have no third view to detect wrong matches.
+OVERLAP = 10  #: Each key frame is matched with this many that follow, and with those 2^i further on.
 NEIGHBOURS = 6  #: Points of the cloud that a plane is laid through.
 LEAST_POINTS = 3  #: Of a cloud, for a plane.
 
@@ -48,7 +48,7 @@ LEAST_POINTS = 3  #: Of a cloud, for a plane.
 class ReconstructionOptions(Ranged):
     """How images are reconstructed."""
 
-    every: Count = 5  #: every so many frames is a key frame, from the first on.
+    every: Count = 5  #: every n-th frame is a key frame, from the first on.
     features: Count = 4096  #: most of them per image.
     least_angle_deg: Angle = 16.0  #: between the rays of the two images that it begins with.
     seed: Seed = 0  #: of RANSAC.
@@ -57,11 +57,11 @@ class ReconstructionOptions(Ranged):
 @final
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What COLMAP found, in a world of its own; in metres if a baseline told the scale."""
+    """COLMAP's reconstruction, in its own world; in metres if a baseline gives the scale."""
 
     name: str  #: of the sequence.
     chosen: NDArray[np.int64]  #: (C,) frames that were handed to it.
-    frames: NDArray[np.int64]  #: (R,) those of which it found the pose, ascending.
+    frames: NDArray[np.int64]  #: (R,) those with a reconstructed pose, ascending.
     path: Trajectory  #: (R,) the poses, with the frames' times.
     points: Array  #: (M, 3).
     metric: bool  #: whether the scale is that of a stereo pair's baseline; otherwise it is arbitrary.
@@ -246,7 +246,7 @@ def compare_folder_with_colmap(
 def compare_with_colmap(
     estimate: PathAndMap, sequence: ImageSequence, options: ReconstructionOptions | None = None
 ) -> tuple[ColmapComparison, ColmapComparison | None]:
-    """A run beside the reconstruction of its images, and this beside the truth: how good COLMAP itself is, None without."""
+    """Compares a run with the reconstruction of its images, and that with the truth, None without."""
     found = reconstruct(sequence, options)
     run = compare_with_path(found, estimate.trajectory, estimate.landmarks)
     return run, None if sequence.truth is None else compare_with_truth(found, sequence.truth)
@@ -255,7 +255,7 @@ def compare_with_colmap(
 def compare_with_path(
     found: Reconstruction, reference: Trajectory, points: MapEstimate | None = None
 ) -> ColmapComparison:
-    """COLMAP beside a filter's path and, if given, its map: poses at the key frames' times, of which there must be enough."""
+    """Compares COLMAP with a filter's path and, if given, its map, at the key frames' times, of which enough are needed."""
     ours, theirs = associate(found.path, reference)
     if len(ours) < LEAST_FRAMES:
         raise InputError(
@@ -280,7 +280,7 @@ def compare_with_path(
 
 
 def compare_with_truth(found: Reconstruction, truth: Truth) -> ColmapComparison:
-    """COLMAP beside the truth, interpolated at the key frames; an InputError where there is too little."""
+    """Compares COLMAP with the truth, interpolated at the key frames. Raises InputError: there is too little truth."""
     rows, poses = poses_at(SE3, truth.stamps_ns, truth.poses, found.path.stamps_ns)
     if len(rows) < LEAST_FRAMES:
         raise InputError(

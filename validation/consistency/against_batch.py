@@ -1,18 +1,18 @@
-"""A run beside the batch optimum of the same measurements: path, map, covariances, likelihood.
+"""Comparison of a run with the batch optimum of the same measurements: path, map, covariances, likelihood.
 
-Frame and chart. Both are given in the run's own world. A pose's covariance is carried from the chart at the filter's
+Frame and chart. Both are given in the run's own world. A pose's covariance is transformed from the chart at the filter's
 pose to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
 
-What is conditioned on what. The map and the last pose know the same measurements in filter and batch, and are compared as
-Gaussians; of an earlier online pose, which knows its past only, see `rbpf.validation.consistency.statistic.posterior_ratio`.
+Conditioning. The map and the last pose use the same measurements in filter and batch, and are compared as Gaussians; earlier
+online poses use only past measurements, see `rbpf.validation.consistency.statistic.posterior_ratio`.
 
-A second witness. The weights of draws from a robot's batch posterior (`rbpf.validation.gtsam.path_sampling`) say whether it is
-the Gaussian that filter and covariances are compared with.
+Check of the posterior. The importance weights of draws from a robot's batch posterior (`rbpf.validation.gtsam.path_sampling`)
+tell whether it is the Gaussian with which filter and covariances are compared.
 
-Gauge. One camera without known points does not measure the scale: the filter's is its prior's, the batch's is held.
-Both begin at the same first pose; the filter is scaled about it, so that its path fits the optimum's best, and
-densities are compared in the directions that a change of scale does not move: across the line from the first camera
-(two of a landmark's three, five of a pose's six).
+Gauge. One camera without known points does not measure the scale: the filter's is that of its prior, the batch's is fixed.
+Both start at the same first pose; the filter is scaled about it so that its path fits the optimum's best, and densities are
+compared in scale-invariant directions: perpendicular to the line from the first camera (two of a landmark's three, five of a
+pose's six).
 """
 
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ from rbpf.validation.metrics import gaussian_differences as gaussians
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
 POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the batch optimum"
-LEAST_STEPS = 3  #: Of a run that is compared.
-DRAWS = 200  #: Of paths and maps from a robot's batch posterior.
-LEAST_COUNT = 0.1  #: Fraction of them that has to count for the posterior to be a witness.
+LEAST_STEPS = 3  #: Least steps of a run for a comparison.
+DRAWS = 200  #: Number of paths and maps drawn from a robot's batch posterior.
+LEAST_COUNT = 0.1  #: Least effective fraction of them for the posterior to be used as reference.
 SAME = "one world: nothing to fix"
 SCALED = "the filter scaled about the first camera onto the optimum; densities across the line from that camera"
 
@@ -46,17 +46,17 @@ SCALED = "the filter scaled about the first camera onto the optimum; densities a
 @final
 @dataclass(frozen=True, eq=False)
 class AgainstBatch:
-    """A run beside its batch optimum."""
+    """A run and its batch optimum."""
 
     name: str  #: of the recording.
-    gauge: str  #: how the two worlds were made one, in words.
-    scale: float  #: by which the filter was multiplied; 1 where the scale is measured.
+    gauge: str  #: description of the alignment of the two worlds.
+    scale: float  #: factor applied to the filter; 1 if the scale is measured.
     filter: PathAndMap  #: the run, in that scale.
     optimum: Optimum  #: the batch.
     path: AbsoluteError  #: distances of the filter's online positions from the optimum's, per step, without alignment.
     landmarks: gaussians.Differences  #: Gaussians of the map.
-    poses: gaussians.Differences  #: Gaussians of the last pose; none where the covariances are not known.
-    #: of the observations of landmarks that both have, see `fit_of`, by the filter's online poses and its last map.
+    poses: gaussians.Differences  #: Gaussians of the last pose; none without covariances.
+    #: fit of the observations of common landmarks, see `fit_of`, by the filter's online poses and its last map.
     fit_filter: dict[str, float]
     fit_batch: dict[str, float]  #: by the optimum.
 
@@ -66,7 +66,7 @@ class AgainstBatch:
         return self.filter.at(self.optimum.steps)
 
     def statistics(self) -> list[Statistic]:
-        """Whether poses and landmarks are as far from the truth, by the batch's posterior, as the filter says."""
+        """Consistency statistics of poses and landmarks, with the batch's posterior instead of the truth."""
         both = self.landmarks
         poses = posterior_ratio(POSES, *self.pose_errors())
         landmarks = posterior_ratio(LANDMARKS, both.cov, both.cov_other, both.delta, same_data=True)
@@ -91,21 +91,21 @@ class AgainstBatch:
 
 
 def compare_run(run: Run) -> AgainstBatch:
-    """A run in memory beside its batch optimum; see `compare`."""
+    """Compares a run in memory with its batch optimum; see `compare`."""
     return compare(PathAndMap.of_run(run), run.system.measurements(run.name, run.log))
 
 
 def compare_folder(folder: Path) -> AgainstBatch:
-    """A run folder beside its batch optimum; see `compare`. The folder must be that of a finished run of this version."""
+    """Compares a run with its batch optimum; see `compare`. The folder must be that of a finished run of this version."""
     record = RunFolder.open(folder)
     return compare(record.estimate, record.measurements)
 
 
 def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = None) -> AgainstBatch:
-    """A filter's path and map, T poses, beside the batch optimum of the same T measurements.
+    """Compares a filter's path and map, T poses, with the batch optimum of the same T measurements.
 
-    Where it is not known it is solved for with all errors Gaussian, as the filter takes them. An InputError says that path
-    and measurements are not of one run, or that the batch cannot be solved.
+    If it is not given, it is solved for with Gaussian errors, as in the filter. Raises InputError: path
+    and measurements are not of one run, or the batch cannot be solved.
     """
     name, stamps = problem.name if isinstance(problem, FeatureLog) else problem.recording, problem.stamps_ns
     if len(stamps) != len(filtered.stamps_ns) or (stamps != filtered.stamps_ns).any():
@@ -135,7 +135,7 @@ def compare(filtered: PathAndMap, problem: Problem, optimum: Optimum | None = No
 
 
 def solve_run(record: RunFolder, most: int | None = None, on_iteration: OnIteration | None = None) -> Optimum:
-    """The batch optimum of a run's measurements: with Huber's loss for matches in images, which hold false ones.
+    """The batch optimum of a run's measurements: with Huber's loss for matches in images, which include false ones.
 
     `most`, `on_iteration` and errors as of `solve_problem`.
     """
@@ -144,7 +144,7 @@ def solve_run(record: RunFolder, most: int | None = None, on_iteration: OnIterat
 
 
 def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tuple[Comparison, AgainstBatch]:
-    """A run beside the batch posterior of the same measurements, from `solve_run` where it is known; errors as that."""
+    """Comparison with the batch posterior of the same measurements, from `solve_run` if not given; errors as of that."""
     problem = record.measurements
     found = compare(record.estimate, problem, optimum=optimum or solve_run(record))
     figures: dict[str, Any] = {
@@ -159,7 +159,7 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
     if not isinstance(problem, FeatureLog):
         residuals = problem.z.size - found.optimum.estimate.landmarks.mean.size
         figures["batch_error_right"] = 0.5 * residuals
-        # Squares of what the run takes for outliers say nothing about the noise of the rest.
+        # Outliers of the run are not informative about the noise of the rest.
         likelihood = record.config.get("likelihood")
         if residuals > 0 and not (isinstance(likelihood, dict) and likelihood.get("kind") == "outliers"):
             value = 2.0 * found.optimum.error / residuals

@@ -1,10 +1,10 @@
-"""A run against the ground truth of its recording: errors, and whether they are as large as the filter says.
+"""A run against the ground truth of its recording: errors, and their consistency with the filter's covariances.
 
-Gauge. A run that lives in the truth's world is compared with it as it is. Otherwise the truth is brought into the run's
-world, where the filter's covariances are given: by the rigid motion (after the scale that fits the positions, where the
-recording's is arbitrary) under which the truth is most likely by these covariances. The error that is left can contradict the
-filter, and supports it only if it would also do so without the degrees of freedom that were fitted. Where the scale is
-arbitrary, errors are counted across the line from the first pose, which a change of scale does not move.
+Gauge. A run in the truth's world is compared without alignment. Otherwise the truth is transformed to the run's world, in
+which the filter's covariances are given: by the rigid motion (after the scale that fits the positions, if the recording's is
+arbitrary) of maximum likelihood under these covariances. The remaining error can contradict the filter, and supports it only
+if it would also do so without the fitted degrees of freedom. If the scale is arbitrary, errors are measured perpendicular to
+the line from the first pose, which are invariant to scale.
 """
 
 from dataclasses import dataclass, replace
@@ -37,23 +37,23 @@ _HOW = {
 
 @dataclass(frozen=True)
 class TruthErrors:
-    """A run beside the truth."""
+    """Errors of a run relative to the truth."""
 
     positions: AbsoluteError  #: errors of the aligned positions.
-    whitened: statistic.WhitenedErrors  #: errors of the poses in units of the filter's own.
-    fitted: int  #: parameters of the motion that brought the truth into the run's world; 0 where it is there.
-    landmarks: "LandmarkErrors | None"  #: the map's points whose true places are known; None without any.
-    stated: Precision  #: the truth's own.
-    claimed: float  #: fraction of the expected squared errors of the poses that is the filter's own, not the truth's.
+    whitened: statistic.WhitenedErrors  #: errors of the poses, whitened by the filter's covariances.
+    fitted: int  #: parameters of the alignment of the truth to the run's world; 0 without one.
+    landmarks: "LandmarkErrors | None"  #: the map's points with known true positions; or None.
+    stated: Precision  #: precision of the truth itself.
+    claimed: float  #: fraction of the expected squared errors of the poses that is due to the filter, not the truth.
 
 
 @dataclass(frozen=True)
 class LandmarkErrors:
-    """M landmarks beside their true places."""
+    """M landmarks and their true positions."""
 
-    map: MapEstimate  #: the run's, moved into the truth's world as the path is.
+    map: MapEstimate  #: the run's, aligned to the truth's world as the path.
     truth: np.ndarray  #: (M, D) true places.
-    white: np.ndarray  #: (M, d) errors in units of the filter's own; d is one less than D where the scale is arbitrary.
+    white: np.ndarray  #: (M, d) whitened errors; d is D, or D − 1 if the scale is arbitrary.
 
     @property
     def squares(self) -> np.ndarray:
@@ -62,7 +62,7 @@ class LandmarkErrors:
 
 
 def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
-    """Errors of a run beside a truth whose poses have the stated precision, landmarks are exact.
+    """Errors of a run relative to a truth with poses of the stated precision and exact landmarks.
 
     Raises InputError: the run has no truth, or too little.
     """
@@ -75,14 +75,14 @@ def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
     anonymous, space, across = is_anonymous(record), path.space, truth.alignment == "similarity"
     turns = 1 if space.dim == SE2.dim else 3
     own = np.repeat([stated.std_rad**2, stated.std_m**2], [turns, space.dim - turns])
-    # A truth that was moved so that both begin alike errs everywhere by what its first pose errs.
+    # Aligning the truth to the same first pose spreads that pose's error over the whole path.
     moved_by_first = any(stated) and np.array_equal(truth.poses[0], space.identity())
     if truth.alignment == "none" and not moved_by_first:
         both = cov + np.diag(own)
         whitened = statistic.whitened_errors(space, mean, both, truth.poses)
         landmarks = None if anonymous else _landmark_errors(record, truth, positions.alignment)
         return TruthErrors(positions, whitened, 0, landmarks, stated, _claimed(cov, both))
-    # The truth brought into the run's world.
+    # The truth, transformed to the run's world.
     true, ours = (in_space(path.stamps_ns[truth.rows], poses) for poses in (truth.poses, mean))
     start = align(true.positions, ours.positions, with_scale=across)
     own[turns:] *= start.scale**2
@@ -112,10 +112,10 @@ def truth_errors(record: RunFolder, stated: Precision = EXACT) -> TruthErrors:
 
 
 def pose_statistics(errors: statistic.WhitenedErrors, fitted: int = 0) -> list[statistic.Statistic]:
-    """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact.
+    """NEES of the poses and coverage of their credible regions; none if all poses are exact.
 
-    `fitted` parameters were chosen to make the errors small: the upper end of the interval is raised by what that takes
-    away from errors that are worth so few degrees of freedom.
+    `fitted` parameters were chosen to minimise the errors: the upper end of the interval is raised by their effect on errors
+    with so few degrees of freedom.
     """
     known = errors.ranks > 0
     if not known.any():
@@ -170,7 +170,7 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
     # The batch optimum's positions at the same steps, aligned in the same way, where the run has one.
     if (record.folder / "batch.tum").is_file():
         batch, beside = associate(read_tum(record.folder / "batch.tum"), reference, 0)
-        if 2 * batch.stamps_ns.size >= truth.rows.size:  # a few poses an alignment brings anywhere
+        if 2 * batch.stamps_ns.size >= truth.rows.size:  # an alignment fits a few poses anywhere
             rmse = ate(batch, beside, truth.alignment).rmse
             figures["batch_position_rmse_m"] = rmse
             accuracy += f"; the batch optimum of the same measurements is {_metres(rmse)} from it"
@@ -184,10 +184,10 @@ def _claimed(cov: np.ndarray, both: np.ndarray) -> float:
 
 
 def _of_filter(ratio: statistic.Statistic, claimed: float) -> statistic.Statistic:
-    """A ratio of errors to what filter and truth expect together, without what the truth errs.
+    """The ratio of errors to their expectation by filter and truth together, corrected for the truth's errors.
 
-    The interval has room for a truth whose standard deviations are stated wrong by `STATE_FACTOR`: one that is coarser than
-    the filter's claim neither supports nor contradicts it. One that errs less than half of what is stated may be exact.
+    The interval allows for a truth whose standard deviations are wrong by `STATE_FACTOR`: one that is coarser than the
+    filter's covariances neither supports nor contradicts it. One with errors below half of the stated ones may be exact.
     """
     rest, most = 1.0 - claimed, statistic.STATE_FACTOR**2
     offs = {"value": rest, "low": most * rest, "high": rest / most if ratio.high > rest / most else 0.0}
@@ -196,7 +196,7 @@ def _of_filter(ratio: statistic.Statistic, claimed: float) -> statistic.Statisti
 
 
 def _landmark_errors(record: RunFolder, truth: RunTruth, world: Similarity) -> LandmarkErrors | None:
-    """Landmarks beside a truth in the run's world; none of those that the filter holds to be exact."""
+    """Landmark errors relative to a truth in the run's world, without landmarks that are exact for the filter."""
     found = record.map.points()
     regular = np.linalg.eigvalsh(found.cov)[:, 0] > 0.0
     kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool) & regular

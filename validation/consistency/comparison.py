@@ -1,9 +1,9 @@
-"""Comparisons of a run with something else, in memory and in JSON; what its innovations say; and the verdict from all of it.
+"""Comparisons of a run with a reference, in memory and in JSON; innovation statistics; and the overall verdict.
 
-The verdict is two lights, each with a sentence: how good the path is (`grade_path`), and whether its uncertainty can be
-believed (`judge`), which follows from the statistics of `rbpf.validation.consistency.statistic` alone. They are independent: a
-path as good as the best may claim ten times too little, and a poor one may know how poor it is. What each sentence means, and
-why, docs/how_to/report.md says.
+The verdict has two lights, each with a sentence: the accuracy of the path (`grade_path`), and whether its uncertainty is
+reliable (`judge`), which follows from the statistics of `rbpf.validation.consistency.statistic` alone. They are independent:
+an accurate path may be overconfident by far, and an inaccurate one consistent. The sentences are explained in
+docs/how_to/report.md.
 """
 
 import json
@@ -31,8 +31,8 @@ COMPARISON = "validation_"  #: What the names of their files begin with.
 class Comparison:
     """One comparison of a run."""
 
-    against: str  #: with what.
-    accuracy: str  #: how good the run is by it, half a sentence: "the path is … m from …".
+    against: str  #: name of the reference.
+    accuracy: str  #: accuracy relative to it, a clause: "the path is … m from …".
     figures: dict[str, Any]  #: numbers by name.
     statistics: list[Statistic] = field(default_factory=list)  #: of the filter's consistency.
     pictures: list[str] = field(default_factory=list)  #: files in the run's folder.
@@ -47,7 +47,7 @@ def write_comparison(folder: Path, comparison: Comparison) -> Path:
 
 
 def read_comparisons(folder: Path) -> list[Comparison]:
-    """All comparisons that a folder holds, in order of their names; an InputError names a file that is none."""
+    """All comparisons in a folder, by name. Raises InputError: a file is not one; it is named."""
     found = []
     for path in sorted(folder.glob(f"{COMPARISON}*.json")):
         try:
@@ -66,10 +66,10 @@ def read_comparisons(folder: Path) -> list[Comparison]:
 def innovation_statistics(
     nis: np.ndarray, nis_dof: np.ndarray, correction: np.ndarray, cov_correction: np.ndarray
 ) -> list[Statistic]:
-    """Innovations two-sided, and what they say about the motion.
+    """Two-sided innovation statistics, and those of the motion corrections.
 
-    Without truth they find wrong noise of sensors and of the odometry, its bias, wrong associations and gross errors of
-    a model. They do not find a filter whose particles agree on a wrong path that explains the measurements.
+    Without truth they detect wrong noise of sensors and odometry, odometry bias, wrong associations and gross model errors.
+    They do not detect particles that agree on a wrong path that explains the measurements.
 
     `nis` (T,) with its degrees of freedom; corrections (T, r), (T, r, r) are those of `rbpf.core.diagnostics.Correction`,
     r = 0 where the system does not tell them.
@@ -80,7 +80,7 @@ def innovation_statistics(
 
 
 def compare_with_itself(record: RunFolder) -> Comparison:
-    """A run's `innovation_statistics`, from its diagnostics, as a comparison; its accuracy stays open."""
+    """A run's `innovation_statistics`, from its diagnostics, as a comparison without accuracy."""
     table = record.table("diagnostics.csv")
     if not {"nis", "nis_dof"} <= table.keys():
         raise InputError(f"{record.folder / 'diagnostics.csv'} has no columns nis and nis_dof")
@@ -92,19 +92,18 @@ def compare_with_itself(record: RunFolder) -> Comparison:
     return Comparison("itself", "", figures, statistics)
 
 
-#: Times that noise is larger than somebody states it, at most; what is farther off is something else.
+#: Largest plausible factor of wrongly stated noise; beyond it there is another cause.
 MISSTATED = 5.0
 
 
 def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
-    """One sentence where innovations contradict the stated noise, with the noise that would make them right; else empty.
+    """A suggestion of the noise that would make innovations consistent, if they contradict the stated one; else empty.
 
-    With NIS per degree of freedom r and every measurement's standard deviation σ, innovations would be right at about
-    σ √r (R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", 1970, in its simplest form:
-    the noise of the measurements is taken to dominate what the filter expects). It is a hint for the next run, not an
-    estimate: errors that repeat from step to step, such as a known point that is given a little beside itself, are in
-    no innovation. Nothing is advised that would make a filter claim more which claims too much already, nor a number that
-    is not known to `NOISE_FACTOR`, as after a few steps.
+    With NIS per degree of freedom r and standard deviation σ of every measurement, innovations would be consistent at about σ
+    √r (R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", 1970, in its simplest form:
+    measurement noise is assumed to dominate the predicted covariance). It is a hint for the next run, not an estimate:
+    systematic errors, such as a slightly wrong known point, are not in the innovations. Nothing is suggested that would make
+    an overconfident filter more confident, nor a number that is not known to within `NOISE_FACTOR`, as after a few steps.
     """
     daring = any(s.kind == "ratio" and s.low > s.zone[1] for s in statistics)
     found = [s for s in statistics if s.name == INNOVATIONS and s.outcome == "contradicts"]
@@ -131,7 +130,7 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
 
 
 def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
-    """One sentence where a robot's odometry errs alike in all steps, and the run has not learnt what its wheels get wrong."""
+    """A warning if a robot's odometry has systematic errors and the run has not estimated them; else empty."""
     biased = any(s.name == BIAS_OF_MOTION and s.outcome == "contradicts" for s in statistics)
     more = {"off": "odometry", "sensor": "online"}.get(str(record.config.get("calibrate")))
     able = record.config.get("association") == "known" and record.summary.get("map") == "joint"
@@ -141,7 +140,7 @@ def motion_advice(record: RunFolder, statistics: list[Statistic]) -> str:
 
 
 def calibration_advice(record: RunFolder, statistics: list[Statistic]) -> str:
-    """One sentence where a calibration contradicts the measurements: what finds a better one, if it is not used already."""
+    """A suggestion if the calibration contradicts the measurements and self-calibration is not used; else empty."""
     wrong = [s.name for s in statistics if s.kind == "calibration" and s.outcome == "contradicts"]
     if not wrong or record.config.get("calibrate") in ("sensor", "online"):
         return ""
@@ -175,7 +174,7 @@ _OPENINGS: dict[Trust, str] = {
 
 @dataclass(frozen=True)
 class PathGrade:
-    """How good a path is."""
+    """The accuracy of a path."""
 
     grade: Grade = "not known"  #: the light.
     #: how far it is from what, and how many frames were lost.
@@ -187,8 +186,8 @@ def grade_path(
 ) -> PathGrade:
     """The grade of a path.
 
-    `accuracy` says in one sentence how far it is from what, `error_m` its root mean square, `spread_m` the root mean square
-    distance of what it is compared with from its centre. `lost` is None where the system cannot be lost.
+    `accuracy` describes the distance from the reference, `error_m` is its root mean square, `spread_m` the root mean square
+    distance of the reference from its centre. `lost` is None for systems that cannot be lost.
     """
     gone = 0.0 if lost is None else lost / max(frames, 1)
     by_loss = next((name for name, _, most in GRADES if gone <= most), "poor")
@@ -199,7 +198,7 @@ def grade_path(
         grade = next((name for name, least, most in GRADES if fraction <= least and gone <= most), "poor")
         said.append(f"That is {_number(100 * fraction)} % of its spread about its centre: {grade}.")
     if lost is not None:
-        # What was lost comes first: the error of a path that was lost says little.
+        # Loss comes first: the error of a lost path is hardly meaningful.
         gone_frames = f"{lost or 'None'} of {frames} frames {'was' if lost == 1 else 'were'} lost."
         said.insert(0 if lost else len(said), gone_frames)
     return PathGrade(grade, " ".join(said))
@@ -207,17 +206,17 @@ def grade_path(
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader has to know."""
+    """The verdict on a run."""
 
     path: PathGrade  #: how good the path is.
     trust: Trust  #: whether its uncertainty can be trusted.
-    reason: str  #: why, half a sentence.
-    leaning: Leaning = ""  #: to which side the uncertainty is wrong, where it is not to be trusted and that is known.
+    reason: str  #: why, a clause.
+    leaning: Leaning = ""  #: direction in which an untrusted uncertainty is wrong, if known.
     advice: str = ""  #: what to try next, a sentence; empty where there is nothing to say.
 
     @property
     def said(self) -> list[str]:
-        """What is said of path and uncertainty, and the advice if there is any."""
+        """The sentences on path and uncertainty, and the advice, if any."""
         return [text for text in (*self.sentences, self.advice) if text]
 
     @property
@@ -234,17 +233,17 @@ def judge(
 ) -> Verdict:
     """The verdict from all statistics.
 
-    `independent` names those that compare poses or landmarks with something the filter did not compute itself, `truth` those
-    among them that compare with the truth, which does not have the run's noise as the batch posterior has.
+    `independent` names the statistics that compare poses or landmarks with an external reference, `truth` those of them that
+    use the truth, which unlike the batch posterior does not share the run's noise.
     """
     path = path or PathGrade()
     judging = [s for s in statistics if s.name in independent and s.kind != "calibration"]
     support = [s for s in judging if s.outcome == "supports"]
     told = [s for s in support if s.name in truth and s.kind == "ratio"]
-    # A calibration with which a run is as far from the truth as it says is good enough.
+    # A calibration is good enough if the run's errors relative to the truth are consistent.
     calibration = [s for s in statistics if s.kind == "calibration" and not told]
     against = [s for s in statistics if s.outcome == "contradicts" and (s.kind != "calibration" or s in calibration)]
-    # Those that say that it errs more than it claims; else those that may say that it errs less.
+    # Statistics that show overconfidence; else those that may show underconfidence.
     daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
     witnesses = [s for s in against if s.name in independent]
     if against and (daring or witnesses or not told):
@@ -257,7 +256,7 @@ def judge(
         reason = f"{described(worst)}{more}; the noise is not the stated one, and to which side the poses err "
         return Verdict(path, "do not trust", f"{reason}innovations do not tell")
     doubtful = [s for s in judging if s.kind == "ratio" and s.samples >= 1.0 and not s.zone[0] <= s.value <= s.zone[1]]
-    # The batch posterior has the run's noise and calibration: without the truth no innovation may look larger than these say.
+    # The batch posterior has the run's noise and calibration: without the truth no innovation may be larger than expected.
     noise = [s for s in statistics if s.name in (INNOVATIONS, RESIDUALS)]
     doubtful += [s for s in noise if not told and s.samples >= 1.0 and s.value > s.zone[1]]
     doubtful += calibration
@@ -307,7 +306,7 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
         able = {"lost", "assumed"} & record.table("diagnostics.csv").keys()
         lost, frames = int(lost_frames(record).sum()) if able else None, len(record.trajectory)
     path = grade_path(accuracy, figures.get(key), figures.get("path_spread_m"), lost, frames)
-    # Those that compare poses or landmarks with what the filter did not compute itself.
+    # Statistics that compare poses or landmarks with an external reference.
     independent = [s.name for c in comparisons if c.accuracy for s in c.statistics if s.name != RESIDUALS]
     truth = [s.name for c in comparisons if c.against == "groundtruth" for s in c.statistics]
     verdict = judge(statistics, independent, path, truth)
@@ -316,7 +315,7 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
 
 
 def described(statistic: Statistic) -> str:
-    """A statistic in words: what was found, with its interval, and what would be right."""
+    """A statistic in words: its value, its interval, and the consistent value."""
     value, low, high = statistic.value, statistic.low, statistic.high
     if statistic.kind == "bias":
         return (
@@ -341,7 +340,7 @@ def described(statistic: Statistic) -> str:
 
 
 def _root(ratio: float) -> float:
-    """Of variances to one of standard deviations, which is what a reader thinks in."""
+    """Converts a ratio of variances to one of standard deviations, for readers."""
     return float(np.sqrt(max(ratio, 0.0)))
 
 
@@ -354,7 +353,7 @@ def _distance(statistic: Statistic) -> float:
 
 
 def distance(metres: float) -> str:
-    """In the unit in which it is read at a glance."""
+    """In a readable unit."""
     return f"{1e3 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"
 
 

@@ -1,4 +1,4 @@
-"""Which of two configurations explains the same data better: the difference of their log-evidences, with its error.
+"""Model comparison of two configurations on the same data: difference of log-evidences, with its error.
 
 A particle filter's evidence Ẑ is random. With many particles log Ẑ is nearly N(log Z − σ²/2, σ²) (J. Bérard, P. Del
 Moral, A. Doucet, "A lognormal central limit theorem for particle approximations of normalizing constants", 2014), so
@@ -6,12 +6,12 @@ that from S seeds with mean m and variance s² of log Ẑ
 
     log Z ≈ m + s²/2,   with variance  s²/S + s⁴ / (2 (S − 1))
 
-That distribution is of no use where s is large: then log Z is taken as the logarithm of the mean of Ẑ, which a single seed may
-carry, with s for its error.
+This approximation fails for large s: then log Z is the logarithm of the mean of Ẑ, which a single seed may dominate, with the
+error s.
 
-Where a robot's landmarks are named and its likelihood is Gaussian, the filter's model is the batch's, and Ẑ is that of
-draws from the batch posterior (`rbpf.validation.gtsam.path_sampling`), one part of them for each seed: closer by orders
-of magnitude than by particles, and in one pass.
+If a robot's landmarks are named and its likelihood is Gaussian, the filter's model is the batch's, and Ẑ is from draws of the
+batch posterior (`rbpf.validation.gtsam.path_sampling`), one part of them per seed: more precise by orders of magnitude than
+with particles, and in one pass.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
 NOISY = 3.0  #: Spread s of log Ẑ over the seeds beyond which its distribution is not used.
-CLEAR = 2.0  #: A difference of this many of its errors is one.
+CLEAR = 2.0  #: A difference of this many standard errors is significant.
 Config = RangeBearingConfig | MonoConfig | StereoConfig
 Data = RobotRecording | FeatureLog
 
@@ -55,7 +55,7 @@ class EvidenceDifference:
         return self.log_evidence_a - self.log_evidence_b
 
     def sentence(self, name_a: str, name_b: str) -> str:
-        """What was found, in words."""
+        """The result in words."""
         difference, error = self.difference, self.error
         better, worse = (name_a, name_b) if difference > 0.0 else (name_b, name_a)
         both = f"log-evidence {self.log_evidence_a:.1f} against {self.log_evidence_b:.1f}"
@@ -68,7 +68,7 @@ class EvidenceDifference:
 
 
 def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> EvidenceDifference:
-    """From log-evidences of any filters, one per seed; an InputError for fewer than two, or for one that is no number."""
+    """From log-evidences of any filters, one per seed. Raises InputError: fewer than two, or NaN."""
     pair = np.asarray(logs_a, dtype=float), np.asarray(logs_b, dtype=float)
     for name, logs in zip(("first", "second"), pair, strict=True):
         if logs.size < 2:
@@ -91,8 +91,8 @@ def compare_evidence(
     Their own seeds are not used; `seeds` are two or more. `workers` are processes, −1 for one per core. `on_run` is
     called with the runs done and their number; not in batch.
 
-    Raises InputError: the configurations are of different systems, differ in what is data, do not fit the data, or one
-    has no evidence: its likelihood is not a density, or what it measures is not counted once.
+    Raises InputError: the configurations are of different systems, differ in the data used, do not fit the data, or one
+    has no evidence: its likelihood is not normalised, or measurements are not counted exactly once.
     """
     from joblib import Parallel, delayed
 
@@ -102,7 +102,7 @@ def compare_evidence(
         raise InputError(f"a {type(config_a).__name__} does not filter a {type(data).__name__}")
     if len(seeds) < 2:
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
-    # What is given of landmarks must be the same, and must be counted once.
+    # Landmark names must be given equally to both, and measurements counted once.
     for name, config in (("first", config_a), ("second", config_b)):
         if not isinstance(config, MonoConfig) and not config.likelihood.build().normalised:
             raise InputError(
@@ -120,7 +120,7 @@ def compare_evidence(
             "a filter that is given the landmarks' names and one that is not do not explain the same data: set the "
             "same association in both configurations"
         )
-    # What moves the particles of a stereo filter is given, not explained: both must be given the same.
+    # Stereo odometry is an input, not part of the evidence: it must be equal in both.
     if isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig):
         if config_a.odometry.split != "apart" or config_b.odometry.split != "apart":
             raise InputError(
@@ -181,7 +181,7 @@ def _log_evidence(logs: np.ndarray) -> tuple[float, float]:
 
 
 def _in_batch(config: Config, data: Data, parts: int) -> list[float]:
-    """Log-evidences by parts of the draws from a robot's batch posterior; none where the filter's model is not the batch's."""
+    """Log-evidences by parts of the draws from a robot's batch posterior; none if the filter's model is not the batch's."""
     from rbpf.validation.gtsam.batch_problem import solve_problem
     from rbpf.validation.gtsam.path_sampling import draw_posterior
 
@@ -203,6 +203,6 @@ def _filtered(config: Any, data: Data) -> Run[Any]:
 
 def _evidence(config: Config, data: Data) -> float:
     if isinstance(config, RangeBearingConfig):
-        # A landmark that a further sub-map begins anew would count as new: the evidence is that of one Gaussian of all.
+        # A landmark re-initialised by a sub-map would count as new: use the evidence of one joint Gaussian.
         config = replace(config, submap=None)
     return float(_filtered(config, data).system.filter.log_evidence)

@@ -1,21 +1,20 @@
-"""Statistics that a consistent filter keeps near a known value, and what their intervals say about it.
+"""Consistency statistics: values that are known for a consistent filter, with confidence intervals.
 
 Most of them are a ratio r of squared errors to what the filter expects of them: 1 for a consistent filter, 9 where its
 standard deviations are three times too small. From ν effective degrees of freedom, the 95 % interval of r is
 
     [r ν / χ²_ν(0.975), r ν / χ²_ν(0.025)]
 
-The zone of a statistic says how wrong a standard deviation may be before it matters, the interval whether that can be decided
+The zone of a statistic is the tolerated error of standard deviations, the interval tells whether that can be decided
 (docs/how_to/report.md); no threshold depends on a run.
 
-Errors of a filter are alike from one step to the next, so that T steps say less than T independent ones. For a sum of
-squares of zero-mean Gaussian numbers e_t with covariances C_ts = E[e_t e_sᵀ], the mean and the variance are those of a
-scaled χ² with
+Errors of a filter are correlated in time, so that T steps count for less than T independent ones. For a sum of squares of
+zero-mean Gaussian numbers e_t with covariances C_ts = E[e_t e_sᵀ], mean and variance are those of a scaled χ² with
 
     ν = (Σ_t tr C_tt)² / Σ_ts ‖C_ts‖²
 
 degrees of freedom (F. Satterthwaite, "An approximate distribution of estimates of variance components", 1946). The
-covariances are estimated from the series itself, up to the first lag at which it is not correlated any more
+covariances are estimated from the series itself, up to the first lag without correlation
 (C. Geyer, "Practical Markov chain Monte Carlo", 1992).
 """
 
@@ -28,18 +27,17 @@ from scipy.special import betaincinv, chdtr, ndtri
 from rbpf.core.diagnostics import chi_square_quantile
 from rbpf.lie import LieGroup
 
-LEVEL = 0.95  #: Of all intervals.
-#: The standard deviations of poses and landmarks may be wrong by this: they rest on few independent samples.
+LEVEL = 0.95  #: Confidence level of all intervals.
+#: The standard deviations of poses and landmarks may be wrong by this factor: they rest on few independent samples.
 STATE_FACTOR = 2.0
-#: Those of measurements and motions: they rest on thousands, and an error in them is repeated in every step.
+#: The same for measurements and motions: they rest on thousands, and an error in them recurs in every step.
 NOISE_FACTOR = 1.1
-#: A motion's bias per step may have this many of its standard deviations: over 16 steps it adds up to as much as the
-#: noise does.
+#: Tolerated bias of a motion per step, in its standard deviations: over 16 steps it accumulates to as much as the noise.
 BIAS = 0.25
 BIAS_OF_MOTION = "bias of the motion"
-INFORMED = 0.05  #: A direction of the motion that the observations inform by less than this fraction is left out.
+INFORMED = 0.05  #: Directions of the motion with a smaller fraction of information by observations are left out.
 PROBABILITIES = 0.5, 0.9, 0.95  #: Of credible regions.
-_NOTHING = 1e-12  #: Variances below this fraction of the largest, or of one, are none.
+_NOTHING = 1e-12  #: Variances below this fraction of the largest, or of one, count as zero.
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class Statistic:
     value: float  #: of this run.
     low: float  #: end of its 95 % interval;  high: the other.
     high: float
-    zone: tuple[float, float]  #: where it may lie.
+    zone: tuple[float, float]  #: tolerated range.
     samples: float  #: effective degrees of freedom or number of independent samples behind it.
     #: a ratio of variances, a bias in standard deviations, a fraction of cases, or how many standard deviations a stated
     #: calibration is from what is measured.
@@ -58,7 +56,7 @@ class Statistic:
 
     @property
     def outcome(self) -> Literal["supports", "contradicts", "leaves open"]:
-        """What it says about the filter."""
+        """Its conclusion about the filter."""
         if self.low > self.zone[1] or self.high < self.zone[0]:
             return "contradicts"
         return "supports" if self.zone[0] <= self.low and self.high <= self.zone[1] else "leaves open"
@@ -81,10 +79,10 @@ class Statistic:
 
 @dataclass(frozen=True)
 class WhitenedErrors:
-    """Errors of T poses in units of what the filter believes, e = cov^(−1/2) Log(mean⁻¹ truth)."""
+    """Errors of T poses, whitened by the filter's covariances, e = cov^(−1/2) Log(mean⁻¹ truth)."""
 
-    errors: np.ndarray  #: (T, d); zero along directions that the filter holds to be known exactly.
-    ranks: np.ndarray  #: (T,) how many directions are not.
+    errors: np.ndarray  #: (T, d); zero along directions that are exact for the filter.
+    ranks: np.ndarray  #: (T,) number of the other directions.
 
     @property
     def nees(self) -> np.ndarray:
@@ -112,8 +110,8 @@ def inverse_roots(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def degrees_of_freedom(white: np.ndarray) -> float:
     """Effective degrees of freedom ν of Σ_t |e_t|², of errors (T, d) whitened by their own covariances; 0 without any.
 
-    The mean of a consistent series is known to be zero and is not subtracted: an error that never changes its sign is one
-    sample, however long it lasts.
+    The mean of a consistent series is zero and is not subtracted: an error of constant sign is one sample, however long it
+    lasts.
     """
     total = white.shape[0]
     power = float(np.square(white).sum())
@@ -129,7 +127,7 @@ def degrees_of_freedom(white: np.ndarray) -> float:
 
 
 def correlation_time(series: np.ndarray) -> float:
-    """Integrated autocorrelation time of a series (T,), at least 1: T of its values say as much as T / time independent ones.
+    """Integrated autocorrelation time of a series (T,), at least 1: T values are worth T / time independent ones.
 
     Sums of neighbouring autocorrelations are added up to the first that is not positive (Geyer 1992, §3.3).
     """
@@ -146,9 +144,9 @@ def correlation_time(series: np.ndarray) -> float:
 
 
 def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statistic:
-    """A ratio r of squared errors to what was expected of them, of `dof` effective degrees of freedom ν.
+    """A ratio r of squared errors to their expected value, of `dof` effective degrees of freedom ν.
 
-    Standard deviations may be wrong by the factor, either way.
+    Standard deviations may be wrong by `factor` in either direction.
     """
     tail = 0.5 * (1.0 - LEVEL)
     low, high = (value * dof / bound for bound in chi_square_quantile([1.0 - tail, tail], dof))
@@ -158,15 +156,14 @@ def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statis
 def posterior_ratio(
     name: str, cov: np.ndarray, cov_posterior: np.ndarray, delta: np.ndarray, same_data: bool = False
 ) -> Statistic | None:
-    """The squared errors that a posterior expects of a filter's T estimates, over what the filter claims.
+    """Ratio of a filter's T squared errors expected by a better posterior to those claimed by the filter.
 
-    Where a better posterior N(m_b, P_b) is as good as the truth, an estimate m_f that claims P_f has the expected
-    normalised squared error tr P_f⁻¹ (P_b + δ δᵀ), δ = m_b − m_f: the rank of P_f for a filter that lost nothing. An
-    online estimate knows less than the posterior of all measurements, so that its δ is random, of covariance
-    P_f − P_b; the interval is that of this part. Where both know the same, as of a map, no part is random, and the median
-    over the estimates is reported: a few landmarks of which the filter has a prior and the posterior has none, or that hang on
-    a false match, say nothing of the others. None without any estimate that is uncertain. P_f, P_b (T, d, d) and
-    δ (T, d) are in one chart; with `same_data` both know the same.
+    If a better posterior N(m_b, P_b) replaces the truth, an estimate m_f with covariance P_f has the expected normalised
+    squared error tr P_f⁻¹ (P_b + δ δᵀ), δ = m_b − m_f: the rank of P_f for an optimal filter. An online estimate uses fewer
+    measurements than the posterior, so δ is random, with covariance P_f − P_b; the interval is for this part. If both use the
+    same data (`same_data`), as for a map, nothing is random, and the median over the estimates is reported, which is robust
+    to a few landmarks with a prior only in the filter, or with false matches. None without any uncertain estimate. P_f, P_b
+    (T, d, d) and δ (T, d) are in one chart.
     """
     roots, ranks = inverse_roots(cov)
     total = int(ranks.sum())
@@ -185,11 +182,11 @@ def posterior_ratio(
 
 
 def map_ratio(name: str, positions: np.ndarray, white: np.ndarray) -> Statistic:
-    """Ratio of the squared errors of a map's landmarks (M, D), whitened (M, d), to what was expected of them.
+    """Ratio of the squared errors of a map's landmarks (M, D), whitened (M, d), to their expected value.
 
-    Neighbours err together: a map that is turned by a wrong heading is one error, however many landmarks it has. What an
-    affine field of displacements explains of the errors, k = d (d + 1) parameters, is therefore taken as one block, and
-    the rest as another (Satterthwaite over both).
+    Errors of neighbours are correlated: a map rotated by a heading error has one error, however many landmarks. The part of
+    the errors explained by an affine displacement field, k = d (d + 1) parameters, is therefore one block, and the rest
+    another (Satterthwaite over both).
     """
     value = float(np.square(white).mean())
     design = np.column_stack([np.ones(len(positions)), positions - positions.mean(axis=0)])
@@ -203,7 +200,7 @@ def map_ratio(name: str, positions: np.ndarray, white: np.ndarray) -> Statistic:
 def step_ratio(name: str, squares: np.ndarray, dofs: np.ndarray, factor: float = NOISE_FACTOR) -> Statistic | None:
     """Ratio of squared errors (T,), each χ² of `dofs` (T,) for a consistent filter and independent from step to step.
 
-    Where the steps are correlated, or scatter more than χ² does, they count for less. None without any.
+    Correlated steps, or more scatter than that of χ², reduce the number of samples. None without any.
     """
     used = np.isfinite(squares) & (dofs > 0)
     squares, dofs = squares[used], dofs[used]
@@ -218,7 +215,7 @@ def step_ratio(name: str, squares: np.ndarray, dofs: np.ndarray, factor: float =
 
 
 def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic]:
-    """Size and bias of what the observations say about the motion: corrections (T, r), (T, r, r) of the log.
+    """Size and bias of the observations' corrections of the motion: corrections (T, r), (T, r, r) of the log.
 
     See `rbpf.core.diagnostics.Correction`; rows of NaN are left out.
     """
@@ -229,7 +226,7 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
     turned = np.einsum("tab,ta->tb", vectors, correction)
     squares = np.where(informed, np.square(turned) / np.where(informed, values, 1.0), 0.0).sum(axis=1)
     size = step_ratio("motion against measurements", squares, informed.sum(axis=1).astype(float))
-    # The constant b that explains the corrections best, û = cov b: its clearest component that is informed.
+    # The least-squares bias b of the corrections, û = cov b: its most significant informed component.
     values, vectors = np.linalg.eigh(cov.sum(axis=0))
     informed = values > 1.0
     sizes = [] if size is None else [size]  # no single step need tell anything for all together to do
@@ -246,9 +243,9 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
 
 
 def coverage(nees: np.ndarray, dim: int, samples: float) -> list[Statistic]:
-    """How often the truth lies in the credible region of a probability, for each of `PROBABILITIES`.
+    """Coverage of the credible regions, for each of `PROBABILITIES`.
 
-    From normalised squared errors (T,) of `dim` degrees of freedom each, which are worth so many independent samples.
+    From normalised squared errors (T,) of `dim` degrees of freedom each, worth `samples` independent samples.
     """
     out, tail = [], 0.5 * (1.0 - LEVEL)
     for probability in PROBABILITIES:

@@ -1,4 +1,4 @@
-"""The batch problem of any run: its measurements, from memory or from its folder; the optimum; how likely they are.
+"""The batch problem of any run: its measurements, from memory or from its folder; the optimum; their likelihood.
 
 Range-bearing measurements are those of `rbpf.sensors.readers.measurements`, a camera's are a `FeatureLog`.
 """
@@ -27,17 +27,17 @@ from rbpf.validation.gtsam.solvers import BatchSolution
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
-OnIteration = Callable[[int, float], None]  #: What is called before each, with its number and the error there.
-LEAST = 4  #: Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses.
-#: Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long.
+OnIteration = Callable[[int, float], None]  #: Called before each iteration, with its number and the error.
+LEAST = 4  #: Least landmarks of a frame, known or shared with other frames: three leave several poses.
+#: Exact known points get errors of this fraction of their extent, as constraints take GTSAM far longer.
 SOFTENED = 1e-4
 #: Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work
 #: is counted and not the time, so that a result does not depend on what else the machine does.
 WORK = 30_000_000
-LEAST_ITERATIONS = 100  #: That are allowed however many observations there are.
-#: Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre.
+LEAST_ITERATIONS = 100  #: Iterations allowed for any number of observations.
+#: Tolerance of a stereo batch: far landmarks drift; a tenth of it moves a path of 60 m by less than a millimetre.
 STEREO_TOLERANCE = 1e-6
-AFAR = 300  #: Steps from which on a robot's batch is begun incrementally.
+AFAR = 300  #: Steps from which a robot's batch is initialised incrementally.
 
 
 @final
@@ -45,7 +45,7 @@ AFAR = 300  #: Steps from which on a robot's batch is begun incrementally.
 class Optimum:
     """The batch optimum of a problem."""
 
-    problem: Problem  #: what was solved: the part that hangs together.
+    problem: Problem  #: the solved problem: the connected part.
     #: path and map with marginal covariances; only landmarks that the measurements determine. Where not all are
     #: determined, poses have no covariances and those of landmarks are NaN.
     estimate: PathAndMap
@@ -54,12 +54,12 @@ class Optimum:
 
     @property
     def start(self) -> InitialEstimate:
-        """Where a further solver starts."""
+        """Initial values for a further solver."""
         return InitialEstimate(self.estimate.world_from_body, self.estimate.landmarks.named())
 
 
 def floats_in_scale(problem: Problem) -> bool:
-    """Whether nothing in the measurements tells the scale: one camera and no known points."""
+    """Whether the scale is not measured: one camera without known points."""
     return isinstance(problem, FeatureLog) and problem.known is None and not isinstance(problem.camera, RectifiedStereo)
 
 
@@ -104,7 +104,7 @@ def solve_problem(
 
     tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else FINE
     solve = partial(solve_features, part, robust=robust, on_iteration=watch, tolerance=tolerance)
-    # A start that leads nowhere is passed over, if another one does not.
+    # A start that fails is ignored if another one succeeds.
     solutions, problems = [], []
     first = InitialEstimate(start[frames], {})
     for from_known in [False, True] if twice and log.known is not None else [False]:
@@ -116,7 +116,7 @@ def solve_problem(
         raise problems[-1]
     found = min(solutions, key=lambda solution: solution.error)
     if marginals:
-        with suppress(InputError):  # where not all is determined, there are none
+        with suppress(InputError):  # no covariances if not all is determined
             found = solve(InitialEstimate(found.world_from_body, found.landmarks))
     return _optimum(replace(part, known=log.known), found, frames)
 
@@ -155,7 +155,7 @@ def softened(known: KnownPoints | None) -> KnownPoints | None:
 
 
 def connected_frames(log: FeatureLog) -> NDArray[np.intp]:
-    """Numbers (B,) of the frames that can be adjusted together with the first one, or with most of the others.
+    """Frames (B,) that can be adjusted together with the first one, or with most of the others.
 
     Each sees `LEAST` landmarks that are known or seen in another of them, and they are connected by these.
     """

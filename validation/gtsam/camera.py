@@ -1,16 +1,16 @@
-"""Batch adjustment of camera features by GTSAM: all poses and landmarks that explain the pixels best.
+"""Batch adjustment of camera features by GTSAM: maximum a posteriori poses and landmarks given the pixels.
 
-The same measurements and the same noise as a filter had, without its samples and without its order in time.
+It uses the same measurements and noise as a filter, without sampling and all at once.
 B. Triggs et al., "Bundle adjustment: a modern synthesis" (2000);
 F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017). The factors:
 
     observations:  project(T⁻¹ l) − z ~ N(0, R), Huber's loss on request
     known points:  l ~ N(m, P), exact ones a hard constraint
-    undetermined:  l ~ N(start, (d/4)² I) with d its distance, far wider than the pixels are across it
-    gauge:         without known points the first pose is held where it starts; for one camera, a distance too
+    undetermined:  l ~ N(start, (d/4)² I) with d its distance, far wider than the pixels' constraint across it
+    gauge:         without known points the first pose is fixed at its start; for one camera, also a distance
 
-The distance is that from the first camera to the one farthest from it at the start. The gauge only says which of many
-equal solutions is meant: it costs nothing at the optimum.
+The distance is that from the first camera to the one farthest from it at the start. The gauge only selects one of many
+equivalent solutions: it costs nothing at the optimum.
 
 GTSAM's own projection factors are taken where they are exactly our camera: Cal3DS2 has no k₃. Factors written in
 Python are evaluated all at once and handed out one by one, which makes them nearly as fast as GTSAM's.
@@ -32,20 +32,20 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.validation.gtsam import observations, solvers
 
-LEAST = 3  #: Landmarks that fix a pose, and points that fix a frame.
-LINE = 1e-3  #: Known points whose spread across a line is below this fraction of that along it lie on it.
-POINTS = 4  #: That a frame has to see to be located.
-#: Frames after which a path that is found frame by frame is first adjusted, and its growth until the next time, a factor.
+LEAST = 3  #: Least landmarks to determine a pose, and points to determine a frame.
+LINE = 1e-3  #: Known points are collinear if their spread across a line is below this fraction of that along it.
+POINTS = 4  #: Least points in a frame for resection.
+#: Frames before the first adjustment of an incrementally built path, and growth factor until the next one.
 FIRST, LONGER = 8, 1.2
 SCALE, SOFT_SCALE = 1e-6, 1e-3
-"""Standard deviation of the distance that holds the scale, as a fraction of it, at the end and on the way there.
+"""Relative standard deviation of the distance that fixes the scale, at the end and before.
 
-Nothing else speaks of the scale, but a hard one could only be followed along a curve.
+Nothing else determines the scale, but a hard constraint slows down convergence along its curve.
 """
-#: Standard deviation of the first pose on the way there, rad and m. No solution moves it; from a hard constraint on GTSAM
+#: Standard deviation of the first pose before the end, rad and m. No solution moves it; with a hard constraint GTSAM
 #: eliminates by QR, which takes up to thirty times as long as Cholesky.
 HOLD = 1e-6
-FINE = 1e-9  #: A gain of this fraction of the error is none; landmarks without much parallax would creep on for ever.
+FINE = 1e-9  #: Relative gain that ends the iteration; landmarks with little parallax would otherwise drift on for ever.
 WEAK = 0.25  #: Standard deviation of an undetermined landmark's prior, as a fraction of its distance.
 _ROUNDS = 10
 _FEW = 8
@@ -54,7 +54,7 @@ _FEW = 8
 @final
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """A point in the space of all variables: world_from_camera (T, 7), and the landmarks of the table (L, 3)."""
+    """Values of all variables: world_from_camera (T, 7), and the landmarks of the table (L, 3)."""
 
     path: Array
     points: Array
@@ -79,12 +79,12 @@ class CameraProblem:
 
     @property
     def scaled(self) -> bool:
-        """Whether the scale has to be held."""
+        """Whether the scale has to be fixed."""
         return not self.known and not isinstance(self.table.camera, RectifiedStereo)
 
     @property
     def held_keys(self) -> list[int]:
-        """What is held exactly: known points without errors; without any known points, the first pose."""
+        """Variables fixed by hard constraints: known points without errors; without any known points, the first pose."""
         if not self.known:
             return [self.pose_keys[0]]
         exact = {name for name, (_, cov) in self.known.items() if not cov.any()}
@@ -98,10 +98,10 @@ class CameraProblem:
         scale: float = SOFT_SCALE,
         factors: list[Any] | None = None,
     ) -> Any:
-        """All factors, or others than those of the observations.
+        """All factors, or those other than the observations'.
 
-        Weak priors hold the `loose` landmarks (L,) where they are in `start`; the gauge holds at the path `held` (T, 7), and
-        the scale with a standard deviation as `SCALE` has it.
+        Weak priors hold the `loose` landmarks (L,) at their positions in `start`; the gauge fixes the path `held` (T, 7), and
+        the scale with a standard deviation from `SCALE`.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in self.observation_factors() if factors is None else factors:
@@ -200,14 +200,14 @@ class CameraProblem:
 
 
 class Adjusted(NamedTuple):
-    """An optimum, with the factors there."""
+    """An optimum, with its factors."""
 
-    problem: CameraProblem  #: of which it is one, without the landmarks that had to be left out.
+    problem: CameraProblem  #: its problem, without the landmarks that had to be left out.
     values: Any  #: GTSAM's.
     graph: Any  #: likewise.
     loose: NDArray[np.bool_]  #: (L,) landmarks with a weak prior.
     iterations: int  #: in all.
-    converged: bool  #: whether it is one.
+    converged: bool  #: whether it converged.
 
     @property
     def state(self) -> CameraState:
@@ -220,8 +220,8 @@ def adjust(
 ) -> Adjusted:
     """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
 
-    Those whose distance is open get a weak prior. One that an outlier has drawn into its camera is left out: there
-    it would explain any pixel, and hold up all others. An InputError names a variable that is not determined.
+    Those of undetermined depth get a weak prior. One drawn into its camera by an outlier is left out: there it would explain
+    any pixel, and block convergence. Raises InputError: a variable is not determined; it is named.
     """
 
     def run(graph: Any, state: CameraState, tolerance: float) -> tuple[Any, int, bool]:
@@ -237,7 +237,7 @@ def adjust(
             problem = CameraProblem(problem.name, problem.frames, table, problem.known, problem.robust)
             state, weak = (replace(one, points=one.points[kept]) for one in (state, weak))
         now = problem.free & observations.is_open(problem.table, state.path, state.points)
-        # The first judgement may be the start's fault; later ones only add, so that it comes to an end.
+        # The first classification may be due to the start; later ones only add landmarks, so that it terminates.
         now = now if round_ < 2 else now | loose
         settled = round_ > 0 and kept.all() and bool((now == loose).all())
         if not settled:
@@ -249,7 +249,7 @@ def adjust(
         if settled and converged:
             break
     done = bool(settled and converged)
-    if problem.scaled:  # The same with the scale held as tightly as the covariances need it.
+    if problem.scaled:  # Again with the scale fixed as tightly as the covariances need it.
         graph = problem.graph(weak, loose, start.path, SCALE)
         values, count, converged = run(graph, state, tolerance)
         total, done = total + count, done and converged
@@ -281,9 +281,9 @@ def solve_features(
 ) -> solvers.BatchSolution:
     """Solve for all poses and landmarks at once.
 
-    The points known beforehand that are seen hold the world's frame. Without any, the first pose is held where it
-    starts, and for a single camera, whose pixels do not tell the scale, its distance from the camera that starts
-    farthest from it; the covariances then are relative to these.
+    Known points in view fix the world's frame. Without any, the first pose is fixed at its start, and for a single camera,
+    which does not measure the scale, its distance from the camera that starts farthest from it; the covariances are then
+    relative to these.
 
     Landmarks that the `initial` estimate lacks are triangulated. With `from_known` it begins at the known points, and takes
     of the estimate only motions of frames that see too little, see `grown`. `robust` and `marginals` are as of
@@ -337,10 +337,10 @@ def solve_features(
 
 
 def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
-    """A state near an estimate: its landmarks, known points, and the others triangulated from its poses.
+    """An initial state from an estimate: its landmarks, known points, and the others triangulated from its poses.
 
-    Landmarks that come out behind a camera are placed on their first rays; an InputError names one that has no place
-    there.
+    Landmarks triangulated behind a camera are placed on their first rays. Raises InputError: one cannot be placed; it is
+    named.
     """
     table, path = problem.table, np.asarray(start.world_from_body, dtype=float)
     if path.shape != (problem.frames, 7) or not np.isfinite(path).all():
@@ -365,10 +365,10 @@ def begin(problem: CameraProblem, start: InitialEstimate) -> CameraState:
 def grown(
     problem: CameraProblem, start: InitialEstimate, on_iteration: solvers.OnMisfit | None = None
 ) -> InitialEstimate:
-    """A path that begins at the known points, and is found again frame by frame from the landmarks that have a place so far.
+    """A path that starts at the known points, built frame by frame by resection from the landmarks located so far.
 
-    A frame that sees too few of them goes on by the motion of the path that is given; nothing else of it is taken. Whenever
-    it has become longer by a fraction, landmarks are triangulated and all is adjusted, because errors would grow else.
+    Frames with too few of them use the given path's motion; nothing else of it is used. Each time it has grown by a factor,
+    landmarks are triangulated and all is adjusted, because errors would accumulate.
     """
     table, given, adjusted = problem.table, np.asarray(start.world_from_body, dtype=float), FIRST
     path, placed, points = given.copy(), ~problem.free, np.zeros((len(table.names), 3))
@@ -381,7 +381,7 @@ def grown(
         path[step] = path[step] if found is None else found
         if step + 1 < LONGER * adjusted:
             continue
-        # Landmarks that are seen from places far enough apart, and all frames so far adjusted to them.
+        # Triangulate landmarks with enough baseline, and adjust all frames so far.
         adjusted, so_far = step + 1, table.rows(table.steps <= step)
         places = observations.triangulate(so_far, path)
         good = observations.in_front(so_far, path, places) & ~observations.is_open(so_far, path, places)
@@ -401,7 +401,7 @@ def locate(table: observations.ObservationTable, points: Array) -> Array | None:
 
     if len(points) < POINTS:
         return None
-    # In an image without distortion: the pixels at which a plain camera would have seen the same rays.
+    # In undistorted pixels: those of the same rays in a camera without distortion.
     camera = table.camera.camera if isinstance(table.camera, RectifiedStereo) else table.camera
     rays = table.bearings()
     plain = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[camera.fx, 0.0, 0.0])

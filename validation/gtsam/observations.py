@@ -1,6 +1,6 @@
 """All measurements of a recording in one table, their residuals, and landmarks triangulated from them.
 
-Nothing here needs GTSAM: it is what a batch adjustment starts from, and what tells how well a landmark is determined.
+Nothing here needs GTSAM: initial values of a batch adjustment, and tests of how well landmarks are determined.
 """
 
 from collections.abc import Container
@@ -21,9 +21,9 @@ from rbpf.validation.metrics.gaussian_differences import mahalanobis
 Index = NDArray[np.intp]
 Residuals = tuple[Array, list[Array]]  #: Residuals (K, p), and their Jacobians (K, p, d) by each variable.
 SINGULAR = 1e-12  #: An eigenvalue of a covariance below this fraction of the largest counts as zero.
-HUBER = 1.345  #: Threshold of the loss where outliers must not do harm, in standard deviations.
+HUBER = 1.345  #: Threshold of Huber's loss, in standard deviations.
 LOOSE = 0.25  #: A landmark whose distance is uncertain by more than this fraction counts as undetermined.
-COLLAPSED = 0.02  #: Depth, as a fraction of the usual distance of a landmark, of one that has run into its camera.
+COLLAPSED = 0.02  #: Depth, relative to the usual distance of landmarks, below which one is collapsed into its camera.
 _ROUNDS = 6
 _FAR = 1e4
 _REACHES = np.geomspace(0.2, 50.0, 40)
@@ -38,7 +38,7 @@ class ObservationTable:
 
     camera: Pinhole | RectifiedStereo  #: that took them.
     steps: Index  #: (K,) frame of each.
-    index: Index  #: (K,) its landmark's place in `names`.
+    index: Index  #: (K,) its landmark's index in `names`.
     names: NDArray[np.int64]  #: (L,) names of the landmarks, ascending.
     z: Array  #: (K, p) [px].
     cov_z: Array  #: (K, p, p) [px^2].
@@ -56,7 +56,7 @@ class ObservationTable:
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def determined(self, known: Container[int]) -> "ObservationTable":
-        """Without those of landmarks that a single camera saw in one frame only, which say nothing about its pose."""
+        """Without landmarks that a single camera observed in only one frame, which do not constrain its pose."""
         if isinstance(self.camera, RectifiedStereo):
             return self
         pairs = np.unique(np.stack([self.index, self.steps]), axis=1)
@@ -163,7 +163,7 @@ def triangulate(table: ObservationTable, path: Array) -> Array:
 
 
 def place(table: ObservationTable, path: Array, points: Array, bad: NDArray[np.bool_]) -> Array:
-    """Points (L, 3), of which the bad ones are moved to where they fit best on their first rays.
+    """Points (L, 3), with the bad ones moved to the best depth on their first rays.
 
     The distances tried are those from a fifth to fifty times the median of the others.
     """
@@ -182,10 +182,10 @@ def place(table: ObservationTable, path: Array, points: Array, bad: NDArray[np.b
 
 
 def is_open(table: ObservationTable, path: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether the observations leave each landmark's distance open (L,).
+    """Whether the distance of each landmark is undetermined by its observations (L,).
 
-    Its standard deviation alone does not tell: where the cameras hardly moved, a point a hand's breadth in front of
-    them fits as well as one at infinity, and its distance would seem to be known well.
+    Its standard deviation alone is misleading: with hardly any camera motion, a point close in front of the cameras fits as
+    well as one at infinity, and its distance would seem to be well known.
     """
     along = points - first_centres(table, path)
     square = np.einsum("ki,ki->k", along, along)
@@ -195,7 +195,7 @@ def is_open(table: ObservationTable, path: Array, points: Array) -> NDArray[np.b
 
 
 def collapsed(table: ObservationTable, path: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether each landmark (L,) has run into one of its cameras, where it explains any pixel: an outlier's doing."""
+    """Whether each landmark (L,) has collapsed into one of its cameras, where it explains any pixel, due to an outlier."""
     depth = np.full(len(points), np.inf)
     np.minimum.at(depth, table.index, in_camera(table, path, points)[:, 2])
     usual = np.median(np.linalg.norm(points - first_centres(table, path), axis=1))
@@ -203,7 +203,7 @@ def collapsed(table: ObservationTable, path: Array, points: Array) -> NDArray[np
 
 
 def first_centres(table: ObservationTable, path: Array) -> Array:
-    """Where the camera was at the first observation of each landmark (L, 3)."""
+    """Camera position at the first observation of each landmark (L, 3)."""
     first = np.unique(table.index, return_index=True)[1]
     return SE3.translation(path[table.steps[first]])
 

@@ -1,9 +1,9 @@
 """Whole paths and maps drawn from the batch's posterior, and the evidence of the measurements.
 
-A draw is what the least-squares problem, linearised at the optimum, answers when all of its residuals are noise:
+A draw is the solution of the least-squares problem, linearised at the optimum, with noise as residuals:
 ξ = H⁻¹ Jᵀ η, η ~ N(0, I), with J its whitened Jacobian and H = JᵀJ, so that no root of H⁻¹ is needed (G. Papandreou,
-A. Yuille, "Gaussian sampling by local perturbations", 2010). What a draw weighs, and where it follows the posterior more
-closely than N(0, H⁻¹) does, Mathematics (batch-weight) says.
+A. Yuille, "Gaussian sampling by local perturbations", 2010). The weight of a draw, and where it follows the posterior more
+closely than N(0, H⁻¹), are in Mathematics (batch-weight).
 
 Motions are kept out of H, so that directions without noise need no care: with A their whitened derivatives and D the
 identity, but zero for such directions, and J that of the observations,
@@ -29,7 +29,7 @@ from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.validation.gtsam.robot import RobotProblem
 
 DRAWS = 400
-#: Root mean square over the draws of what is not linear in a motion's whitened noise, from which on it is drawn itself.
+#: Rms nonlinearity of a motion's whitened noise, over the draws, from which on the motion itself is drawn.
 BENT = 0.1
 _BLOCK = 300_000  #: Observations that are predicted at once.
 
@@ -46,7 +46,7 @@ class PosteriorDraws:
 
     @property
     def weights(self) -> Array:
-        """(S,) normalised weights; resample by them for draws that count the same."""
+        """(S,) normalised weights; resample by them for equally weighted draws."""
         ratio = np.exp(self.log_ratio - self.log_ratio.max())
         return np.asarray(ratio / ratio.sum())
 
@@ -62,7 +62,7 @@ class PosteriorDraws:
 
     @property
     def ess(self) -> float:
-        """Effective sample size: as many draws of the posterior itself are as good."""
+        """Effective sample size: the equivalent number of draws from the posterior itself."""
         return float(1.0 / np.square(self.weights).sum())
 
 

@@ -1,7 +1,7 @@
-"""Batch solution of a run's measurements by GTSAM: the trajectory and map that explain all of them best.
+"""Batch solution of a run's measurements by GTSAM: the most probable trajectory and map.
 
-The same measurements, the same models and the same noise as the filter had, without its samples and without its order
-in time: what the filter approximates. F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
+It uses the same measurements, models and noise as the filter, without sampling and all at once: the posterior that the filter
+approximates. F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 
     start:        x₀ = the known pose, a hard constraint
     odometry:     Log(δ_t⁻¹ x_{t−1}⁻¹ x_t) ~ N(0, Q_t)
@@ -79,7 +79,7 @@ def solve(
 
 
 def solve_online(m: Measurements) -> Array:
-    """The last pose of the optimum of what had been measured until then, step after step: what no filter can do better.
+    """The last pose of the optimum given all measurements up to each step: the best possible filter result.
 
     By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
     of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
@@ -124,7 +124,7 @@ def _grown(problem: "RobotProblem", chunk: int, moved: float | None = None) -> I
 
 @final
 class Sensor:
-    """What a robot's sensor measures, written apart from the filter's own model, which the batch is to judge."""
+    """A robot's observation model, implemented independently of the filter's, which the batch validates."""
 
     def __init__(self, m: Measurements) -> None:
         self._space, self._sign, self._mount = m.space, m.pitch_sign, m.robot_from_sensor
@@ -176,7 +176,7 @@ class RobotProblem:
         self.landmark_keys = [int(gtsam.symbol("l", index)) for index in range(len(self.names))]
         self._by_step = np.argsort(m.steps, kind="stable")
         self._bounds = np.searchsorted(m.steps[self._by_step], np.arange(len(m.stamps_ns) + 1))
-        #: (T - 1, d) of the motions along their (T - 1, d, d) axes, and which of them are none.
+        #: (T - 1, d) of the motions along their (T - 1, d, d) axes, and which of them are zero.
         self.variances, self.axes = np.linalg.eigh(m.covs)
         self.null = self.variances <= SINGULAR * self.variances.max(-1, keepdims=True, initial=0.0)
 

@@ -1,4 +1,4 @@
-"""GTSAM's poses in ours, optimisation loops over its factor graphs, and marginal covariances at the optimum.
+"""Conversion of GTSAM's poses, optimisation loops over its factor graphs, and marginal covariances at the optimum.
 
 Pose2 has the tangent [v, ω], Pose3 [ω, v]. In GTSAM 4.3 both retract by the exponential map on the right, so
 only the order differs from ours, and a BetweenFactor's residual is Log(δ⁻¹ x⁻¹ y) with exact derivatives.
@@ -25,13 +25,13 @@ from rbpf.lie import Array
 from rbpf.validation.gtsam.observations import Residuals
 
 ROUGH = 1e-4  #: Fraction of the error that still counts as progress far from the optimum.
-EXACT = 1e-11  #: The same near by.
-ITERATIONS = 200  #: Most of them.
-OnMisfit = Callable[[float], None]  #: What is called before each iteration, with the error there.
+EXACT = 1e-11  #: The same near the optimum.
+ITERATIONS = 200  #: Maximum iterations.
+OnMisfit = Callable[[float], None]  #: Called before each iteration, with the current error.
 _DAMPING = 1e-5
 _MIN_DAMPING = 1e-10
 _MAX_DAMPING = 1e10
-MOST_POSES = 1_500  #: Whose dense reduced system is taken for covariances: 9,000 unknowns, 650 MB.
+MOST_POSES = 1_500  #: Maximum poses for covariances from the dense reduced system: 9,000 unknowns, 650 MB.
 _POSE, _POINT = 6, 3
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 
@@ -42,22 +42,22 @@ class BatchSolution:
     """Most probable trajectory and map, with covariances from the Gauss-Newton Hessian there."""
 
     world_from_body: Array  #: (T, E) poses, of a robot or of a (left) camera.
-    landmarks: dict[int, Array]  #: name of each landmark that took part to its (D,) position [m].
+    landmarks: dict[int, Array]  #: name of each adjusted landmark to its (D,) position [m].
     cov_poses: Array  #: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
     cov_landmarks: dict[int, Array]  #: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
     #: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right about
     #: half the number of measured scalars less half that of the landmarks' coordinates.
     error: float
-    #: of a camera's, ascending: names of the landmarks whose place the measurements do not tell: those seen in one frame by
-    #: a single camera, and those that an outlier has drawn into its camera, which are both left out, and those whose
-    #: distance is open for want of parallax, which have a weak prior.
+    #: for cameras, ascending: names of landmarks that the measurements do not determine: those observed in one frame by a
+    #: single camera, and those drawn into their camera by an outlier, which are both left out, and those of undetermined
+    #: depth for lack of parallax, which have a weak prior.
     undetermined: Sequence[int] = ()
 
 
 @final
 @dataclass(frozen=True)
 class Chart:
-    """How GTSAM holds the poses of a group."""
+    """GTSAM's representation of the poses of a group."""
 
     order: NDArray[np.intp]  #: (d,) GTSAM's tangent is ours[order].
     pose: Callable[[Array], Any]  #: our storage (E,) to GTSAM's object.
@@ -131,8 +131,8 @@ def huber(base: Any, threshold: float | None) -> Any:
 def together(evaluate: Callable[[Any], Residuals]) -> Callable[[int, list[int], Any], Any]:
     """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
 
-    GTSAM hands every factor the same object as long as Python holds it, as the loops below do. An optimiser that changes
-    its values in place, as ISAM2 does, would be shown old residuals.
+    GTSAM passes the same values object to every factor as long as Python holds it, as the loops below do. An optimiser that
+    changes its values in place, such as ISAM2, would get outdated residuals.
     """
     held: Any = None
     found: Residuals = np.empty(0), []
@@ -188,7 +188,7 @@ def levenberg_marquardt(
 
 
 def gauss_newton(graph: Any, values: Any) -> tuple[Any, int, bool]:
-    """Full steps, none refused: on the way to hard constraints the error may rise. See `levenberg_marquardt`."""
+    """Full steps, all accepted: while converging to hard constraints the error may rise. See `levenberg_marquardt`."""
     error = graph.error(values)
     for count in range(1, ITERATIONS + 1):
         before, values = error, _step(graph.linearize(values), values)
@@ -217,16 +217,16 @@ def marginals(graph: Any, values: Any, keys: Iterable[int]) -> list[Array]:
 def marginals_by_schur(
     graph: Any, values: Any, poses: list[int], points: list[int], held: list[int], name: str
 ) -> tuple[Array, Array]:
-    """Covariances (P, 6, 6) of poses and (L, 3, 3) of points from the poses' reduced system; zero for what is held.
+    """Covariances (P, 6, 6) of poses and (L, 3, 3) of points from the poses' reduced system; zero for fixed variables.
 
-    Landmarks see each other only through the poses. With the information matrix in blocks
+    Landmarks are coupled only through the poses. With the information matrix in blocks
 
         H = [ H_pp  H_pl ]      S = H_pp − H_pl H_ll⁻¹ H_lp,     Σ_pp = S⁻¹
             [ H_lp  H_ll ]      Σ_ll = H_ll⁻¹ + H_ll⁻¹ H_lp Σ_pp H_pl H_ll⁻¹
 
-    H_ll is block-diagonal, so that a landmark costs the square of the poses that see it. (B. Triggs et al., "Bundle
-    adjustment: a modern synthesis", 2000, §6.) Information squares the condition of the problem: this is for problems
-    whose scale is measured, well or badly, not for those where a stiff prior holds it.
+    H_ll is block-diagonal, so a landmark costs the square of the number of poses that observe it. (B. Triggs et al., "Bundle
+    adjustment: a modern synthesis", 2000, §6.) The information matrix squares the condition number: this is for problems with
+    a measured scale, not for those in which a stiff prior fixes it.
 
     The graph of a recording has factors between P poses and L points alone; some of them hard constraints hold by themselves.
     An InputError says that the measurements do not determine everything.

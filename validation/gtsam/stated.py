@@ -1,16 +1,16 @@
-"""Whether a run's measurements agree with the calibration that it was given: its batch optimum with the calibration freed.
+"""Tests a run's given calibration against its measurements: the batch optimum with free calibration.
 
 To the whitened Jacobian A and the residuals b of the optimum, as Huber's loss weighs them, come columns C of the calibration's
-own numbers. By what A does not explain of them, C̃ and b̃, they would move by θ = G⁻¹ C̃ᵀ b̃, G = C̃ᵀC̃: a step of Gauss-Newton
-with which poses and landmarks go along. Errors in images have heavy tails and repeat in all sightings of a landmark, so that
+own parameters. By the part that A does not explain, C̃ and b̃, they would move by θ = G⁻¹ C̃ᵀ b̃, G = C̃ᵀC̃: a Gauss-Newton
+step with poses and landmarks free. Errors in images have heavy tails and recur in all observations of a landmark, so that
 θ has not the covariance G⁻¹ but, from what is left, e = b̃ − C̃ θ, by groups g that are independent of each other,
 
     G⁻¹ (Σ_g s_g s_gᵀ) G⁻¹,    s_g = Σ_{rows of g} C̃ᵀ e
 
-(K.-Y. Liang, S. L. Zeger, "Longitudinal data analysis using generalized linear models", 1986). A group is what a camera
-sees of one landmark, or what a robot measures in one step. The larger of both standard deviations counts.
+(K.-Y. Liang, S. L. Zeger, "Longitudinal data analysis using generalized linear models", 1986). A group is a camera's
+observations of one landmark, or a robot's in one step. The larger of both standard deviations is used.
 
-What would not be determined without noise, as the side on which a robot that always turns alike carries its sensor, seems to
+Parameters that are unobservable without noise, such as the lateral sensor offset of a robot that always turns alike, seem to
 be with it. A robot's numbers have at least the standard deviation of G⁻¹ where its odometry has no noise (after G. P. Huang,
 A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", 2010).
 """
@@ -41,13 +41,13 @@ _KEY, _STEP = int(gtsam.symbol("c", 0)), 1e-6
 
 
 class Measured(NamedTuple):
-    """A number of a calibration."""
+    """A calibration parameter and its estimate."""
 
-    name: str  #: which, in few words.
+    name: str  #: its name.
     unit: str  #: of the following.
-    stated: float  #: what the run was given.
-    found: float  #: what its measurements say.
-    std: float  #: standard deviation of that; infinite where they do not tell.
+    stated: float  #: the given value.
+    found: float  #: the estimate from the measurements.
+    std: float  #: its standard deviation; infinite if undetermined.
 
     @property
     def apart(self) -> float:
@@ -63,9 +63,9 @@ class Measured(NamedTuple):
 
 
 def measured_calibration(batch: Optimum) -> list[Measured]:
-    """Of one camera the focal length and k1, of a robot the place of its sensor and the length of what it measures.
+    """For one camera focal length and k1, for a robot the sensor's mounting pose and the scale of its ranges.
 
-    Empty for a pair of cameras, and where something has no place in the measurements.
+    Empty for stereo, and if the measurements do not allow it.
     """
     problem = batch.problem
     try:

@@ -1,4 +1,4 @@
-"""How far an estimate is from the truth: absolute and relative error of trajectories, error of landmarks.
+"""Accuracy metrics: absolute and relative error of trajectories, error of landmarks.
 
 The definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS
 2012.
@@ -23,7 +23,7 @@ class AbsoluteError:
 
     keys: NDArray[np.int64]  #: (N,) the reference stamp of each pose, or the name of each landmark.
     distances: Array  #: (N,) [m].
-    alignment: Similarity  #: what was applied to the estimate first.
+    alignment: Similarity  #: the alignment applied to the estimate.
 
     @property
     def rmse(self) -> float:
@@ -56,7 +56,7 @@ class RelativeError:
 
     @classmethod
     def of(cls, true: Array, estimated: Array) -> Self:
-        """Of motions (S, 7), each as a pose seen from another."""
+        """From motions (S, 7), each a relative pose."""
         error = SE3.between(true, estimated)
         turned = np.linalg.norm(SE3.log(error)[:, :3], axis=-1)
         return cls(np.linalg.norm(SE3.translation(error), axis=-1), np.degrees(turned))
@@ -88,7 +88,7 @@ def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Simi
 def rpe(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none") -> RelativeError:
     """Relative pose error, the difference of the motions from each of T poses to the next, of two poses or more.
 
-    Of an alignment, as for `ate`, only the scale changes anything.
+    Only the scale of an alignment has an effect.
 
     Raises InputError: the lengths differ or are below 2, or the alignment is unknown.
     """

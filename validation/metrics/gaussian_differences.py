@@ -1,4 +1,4 @@
-"""Landmarks and poses of two estimates as Gaussians in one frame, chart and gauge, and how far they are apart.
+"""Differences of two estimates' landmarks and poses, as Gaussians in one frame, chart and gauge.
 
 The difference of the means is given in units of one's standard deviations; S. Kullback and R. Leibler (1951) compare the
 whole densities, in natural units of information.
@@ -16,9 +16,9 @@ from rbpf.runs.plots import moved_map
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.trajectory import Similarity
 
-#: What is reported of each pair of Gaussians.
+#: Reported figures of each pair of Gaussians.
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "sigma_ratio")
-#: A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none.
+#: Lengths below this fraction of the path's, and variances below this fraction of the largest, count as zero.
 _TINY = 1e-9
 
 
@@ -41,12 +41,12 @@ def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Gaussians of the filter beside those of the optimum, K of them."""
+    """K Gaussians of the filter, and those of the optimum."""
 
     keys: NDArray[np.int64]  #: (K,) names of landmarks, or steps of poses.
     distances_m: Array  #: (K,) between the means.
     sigmas: Array  #: (K,) between the means in the filter's standard deviations, √(δᵀ P_f⁻¹ δ).
-    #: (K,) KL(optimum ‖ filter) [nats]: what believing the filter instead of the optimum costs.
+    #: (K,) KL(optimum ‖ filter) [nats], the information loss of using the filter instead of the optimum.
     kullback_leibler: Array
     sigma_ratio: Array  #: (K,) the filter's mean standard deviation over the optimum's; below 1 is over-confident.
     delta: Array  #: (K, n) the filter's means less the optimum's, in the directions that are compared.
@@ -68,9 +68,9 @@ class Differences:
 
 
 def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differences:
-    """The landmarks that both estimates of one world have; those that one of them holds exactly are left out.
+    """The landmarks common to two estimates of one world, without those that are exact in one of them.
 
-    Where the scale is not measured they are compared `across` the line from the first camera only.
+    If the scale is not measured, they are compared only `across` the line from the first camera.
     """
     shared, rows, others = np.intersect1d(ours.landmarks.ids, other.landmarks.ids, return_indices=True)
     known = np.isfinite(other.landmarks.cov[others]).all(axis=(1, 2))
@@ -82,7 +82,7 @@ def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differenc
 
 
 def compare_last_pose(ours: PathAndMap, other: PathAndMap, step: int, across: bool) -> Differences:
-    """The last poses of two estimates, in the chart at the other's, where both have covariances; see `compare_maps`."""
+    """The last poses of two estimates, in the chart at the other's, if both have covariances; see `compare_maps`."""
     if not (len(ours.cov_poses) and len(other.cov_poses)):
         none, no_cov = np.zeros((0, ours.space.dim)), np.zeros((0, ours.space.dim, ours.space.dim))
         return _differences(np.zeros(0, dtype=np.int64), none[:, 0], none, (no_cov, no_cov), None)
@@ -96,13 +96,13 @@ def compare_last_pose(ours: PathAndMap, other: PathAndMap, step: int, across: bo
 
 
 def away_from_first(poses: Array) -> Array:
-    """(T, 6) how a change of scale about the first of poses (T, 7) moves each, in the chart there."""
+    """Derivative (T, 6) of poses (T, 7) by the logarithm of a scale about the first one, in the chart at each."""
     along = SE3.rotation(poses).mT @ (poses[:, 4:] - poses[0, 4:])[..., None]
     return np.concatenate([np.zeros((len(poses), 3)), along[..., 0]], axis=1)
 
 
 def scaled_onto(estimate: PathAndMap, rows: NDArray[np.intp], other: PathAndMap, name: str) -> tuple[PathAndMap, float]:
-    """Path and map of SE(3), multiplied about the first pose so that some positions come closest to another's; the factor.
+    """Scales a path and map of SE(3) about the first pose to fit another's positions best; also returns the factor.
 
     Raises InputError: the path does not move.
     """
@@ -138,7 +138,7 @@ def _differences(
 
 
 def across_of(moved: Array) -> Array:
-    """Orthonormal bases (K, n, n-1) of what is perpendicular to vectors (K, n)."""
+    """Orthonormal bases (K, n, n-1) of the complement of vectors (K, n)."""
     return np.linalg.svd(moved[:, None, :])[2][:, 1:].mT
 
 

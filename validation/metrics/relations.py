@@ -1,15 +1,15 @@
-"""Error of a path by relations between pairs of its poses that people have checked, where no other truth is to be had.
+"""Error of a path by manually verified relations between pairs of its poses, for recordings without other truth.
 
 R. Kümmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27, 2009: the error of a relation is
-relation⁻¹ · (pose at t1)⁻¹ (pose at t2), of which the length of the translation and the angle of the rotation count. No
-alignment is needed, and a bend of the path counts where it is, once.
+relation⁻¹ · (pose at t1)⁻¹ (pose at t2), reported as translation length and rotation angle. No
+alignment is needed, and a local deformation of the path counts only once.
 
 A file of relations is a table, blank-separated, `#` starting a comment:
 
     t1 t2 x y z roll pitch yaw
 
-with the pose at t2 seen from that at t1 (Unix seconds, metres, radians). A path has a pose at every time within it: between
-two, the position follows the line and the rotation the shortest turn.
+with the pose at t2 relative to that at t1 (Unix seconds, metres, radians). Paths are interpolated: between
+two poses, linearly in position and along the shortest rotation.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ from rbpf.sensors.readers.text import parse_time, read_columns
 from rbpf.validation.metrics.accuracy import RelativeError
 from rbpf.validation.metrics.scores import ODOMETRY
 
-#: Times (R, 2) of both ends, and poses (R, 7) at the second time, seen from that at the first.
+#: Times (R, 2) of both ends, and poses (R, 7) at the second time, relative to that at the first.
 Relations = tuple[NDArray[np.int64], Array]
 _COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
 #: Files of a run's paths, by prefix: "" of the filter, "final_" of its last particles, "odometry_" without it.
@@ -43,7 +43,7 @@ def entries(errors: RelativeError) -> dict[str, float]:
 
 
 def sentence(errors: RelativeError, total: int) -> str:
-    """What was found, of so many relations in the file."""
+    """The result in words, given the number of relations in the file."""
     count, *figures = entries(errors).values()
     part = "" if count == total else f" of {total} (the others end outside of its time)"
     misses = "{:.3f} ± {:.3f} m and {:.1f} ± {:.1f} degrees".format(*figures)
@@ -60,7 +60,7 @@ def read_relations(path: Path) -> Relations:
 
 
 def relation_errors(estimate: Trajectory, relations: Relations) -> RelativeError:
-    """Errors of a path by the relations that have both ends within it, of which there must be one."""
+    """Errors of a path by the relations with both ends within it; at least one is required."""
     if not len(estimate):
         raise InputError("Expected a path with poses to score by relations, found an empty one.")
     first, last = estimate.stamps_ns[[0, -1]] + [-MAX_DIFFERENCE_NS, MAX_DIFFERENCE_NS]

@@ -1,8 +1,8 @@
 """The score table of a run of any system, from its folder: errors against the truth, and distance from the batch.
 
-Every frame counts, also those in which the system was lost. All errors are in the world in which the run is reported
-beside its truth (`rbpf.runs.truth`): without alignment where both are expressed in one world, after a rigid or a similarity
-alignment otherwise. A further figure of merit of all runs is one function from a path to entries, entered into `MERITS`.
+Every frame counts, including those in which the system was lost. All errors are in the world of the run's report, together
+with its truth (`rbpf.runs.truth`): without alignment if both are in one world, else after a rigid or a similarity
+alignment. A further figure of merit of all runs is one function from a path to entries, entered into `MERITS`.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
 BATCH, ODOMETRY = "batch.tum", "odometry.tum"
-#: How the figures of the odometry alone begin, by system; otherwise with `odometry_`.
+#: Prefix of the odometry's figures, by system; by default `odometry_`.
 ODOMETRY_PREFIX = {"stereo": "vo_"}
 
 
@@ -36,7 +36,7 @@ def absolute_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth
 
 
 def relative_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
-    """Motion from one scored frame to the next; after the similarity alignment where the scale is not measured."""
+    """Motion from one scored frame to the next; after the similarity alignment if the scale is not measured."""
     relative = rpe(estimate, reference, alignment="similarity" if truth.alignment == "similarity" else "rigid")
     return {
         "rpe_translation_rmse_m": relative.translation_rmse,
@@ -45,7 +45,7 @@ def relative_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth
     }
 
 
-#: Figures of merit of a path: the estimate and the truth at the same frames, and how they are brought together.
+#: Figures of merit of a path: functions of estimate and truth at the same frames, and the alignment.
 Merit = Callable[[Trajectory, Trajectory, RunTruth], Mapping[str, float]]
 MERITS: tuple[Merit, ...] = (absolute_errors, relative_errors)
 
@@ -74,7 +74,7 @@ def score_estimate(
 ) -> dict[str, float]:
     """Errors of a path with a pose for every frame, and of its map; `anonymous` landmarks have no names.
 
-    `others` are further paths of the run, by what the names of their errors begin with.
+    `others` are further paths of the run, by the prefix of their errors' names.
     """
     reference = in_space(estimate.stamps_ns[truth.rows], truth.poses)
     ours = estimate.at(truth.rows).trajectory
@@ -85,7 +85,7 @@ def score_estimate(
 
 
 def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth, prefix: str = "") -> dict[str, float]:
-    """All figures of merit of a path whose frames are among those of a run; none where too few have a true pose."""
+    """All figures of merit of a path whose frames are among those of a run; none with too few true poses."""
     try:
         estimate, reference = associate(path, reference, 0)
     except InputError:
@@ -99,10 +99,10 @@ def _merits(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dic
 
 
 def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
-    """Mean errors of landmarks whose true places are known, moved as the path is, and with an alignment of their own.
+    """Mean errors of landmarks with known true positions, with the path's alignment, and with their own.
 
-    The estimate has a pose for every frame of the run. Landmarks to which the filter gave no names (`anonymous`) are each
-    scored as the true one nearest to it, one to one.
+    The estimate has a pose for every frame of the run. Landmarks without the recording's names (`anonymous`) are matched
+    one-to-one with the nearest true ones.
     """
     names, points = estimate.landmarks.named(), estimate.landmarks.mean
     if not truth.landmarks or not names:
@@ -110,8 +110,8 @@ def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = Fal
     ours, dim = estimate.at(truth.rows).trajectory, points.shape[1]
     reference = in_space(ours.stamps_ns, truth.poses)
     if anonymous:
-        # One to one, nearest in sum after a rigid alignment. The alignment, at first the path's, and the matching are repeated
-        # in turn, as in iterated closest points.
+        # One-to-one assignment of least total distance. The alignment, at first the path's, and the matching alternate, as in
+        # iterated closest points.
         true_names = list(truth.landmarks)
         true = np.array([truth.landmarks[name][:dim] for name in true_names])
         placed = ate(ours, reference, "rigid").alignment.in_dimension(dim).transform(points)

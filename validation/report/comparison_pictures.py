@@ -1,4 +1,4 @@
-"""Pictures of a run beside the truth, its batch optimum and COLMAP's reconstruction, and the figures that they share."""
+"""Plots comparing a run with the truth, its batch optimum and COLMAP's reconstruction."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -48,7 +48,7 @@ def draw_beside(runs: Sequence[RunFolder], out: Path, formats: Sequence[str]) ->
 
 
 def plot_against_batch(found: "AgainstBatch", out: Path, world: World | None = None) -> list[str]:
-    """Expected NEES, landmarks and map beside the batch posterior, drawn in a world, by default the filter's own.
+    """Expected NEES, landmarks and map compared with the batch posterior, in a world, by default the filter's own.
 
     Writes PNG files into the folder and returns their names.
     """
@@ -84,7 +84,7 @@ def plot_against_colmap(found: "ColmapComparison", reference: PathAndMap, out: P
     move = found.reference_from_colmap
     cloud, centres = (move.transform(found.reconstruction.points), move.transform(found.reconstruction.path.positions))
     at, points = reference.trajectory.positions, reference.landmarks.mean
-    # What is shown: the map and the path, and a tenth more; COLMAP's far points would make it small.
+    # Limits: the map and the path, and a tenth more, without COLMAP's far points.
     everything = np.concatenate([points, at])
     margin = 0.1 * np.ptp(everything, axis=0)
     low, high = everything.min(axis=0) - margin, everything.max(axis=0) + margin
@@ -107,7 +107,7 @@ def plot_against_colmap(found: "ColmapComparison", reference: PathAndMap, out: P
 
 
 def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
-    """Whether the uncertainty of one or several runs can be believed, frame by frame: NEES of the pose, see `truth_errors`.
+    """Consistency of one or several runs, frame by frame: NEES of the pose, see `truth_errors`.
 
     Without ground truth it is NIS of the measurements per degree of freedom. Returns the figure; draws into the axes `ax`, if
     they are given.
@@ -137,7 +137,7 @@ def _nees(run: RunFolder, errors: TruthErrors) -> tuple[np.ndarray, np.ndarray]:
 def consistency_figure(
     title: str, words: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], dim: int, banded: bool, ax: Any = None
 ) -> Any:
-    """Normalised squared errors (R,) over the steps (R,) by name, their mean, and where a consistent filter's would lie."""
+    """Normalised squared errors (R,) over the steps (R,) by name, their mean, and the band of a consistent filter."""
     (figure, axes), band = new_axes(title, words, "step", ax=ax), chi_square_band(dim)
     low = band.low if banded else 0.1
     if banded:
@@ -155,7 +155,7 @@ def consistency_figure(
 
 
 def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
-    """Distances of landmarks (M,) in σ, in order, beside those that a consistent filter's would have."""
+    """Sorted distances of landmarks (M,) in σ, with those of a consistent filter."""
     figure, axes = new_axes(title, "distance [σ of the filter]", "landmark")
     places = np.arange(1, squares.size + 1)
     right = np.sqrt(chi_square_quantile((places - 0.5) / squares.size, dim))

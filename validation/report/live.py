@@ -1,14 +1,14 @@
-"""A run in the Rerun viewer (https://rerun.io), while it is made or from a file that is written without a screen.
+"""A run in the Rerun viewer (https://rerun.io), live or from a file that is written without a display.
 
 world/camera                   the camera's pose; of a robot world/body
-world/camera/image             the frames, with what was looked for and seen in them
+world/camera/image             the frames, with searched and matched features
 world/uncertainty              3σ ellipsoid of the position
-world/seen                     points that were seen in the frame
+world/seen                     points observed in the frame
 world/path, world/odometry     the path, and that of the odometry alone; in the end the truth beside it
 world/map                      the map: points with 3σ ellipsoids, rays as lines, walls; known points
 plots/…                        figures over the frames
 
-A further system is one function that logs what a frame showed, entered into `DRAWN`; others have path, map and figures.
+A new system needs a function that logs a frame's features, entered into `DRAWN`; others have path, map and figures.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -34,9 +34,9 @@ from rbpf.validation.report.video import FEATURES, FOUND, MISSED, RAY, STARTED
 
 JPEG_QUALITY = 75  #: Of the JPEG images in the recording, in per cent.
 AXIS_M = 0.1  #: Length of the camera's drawn image plane from its centre.
-NEAREST = 0.02  #: Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m.
+NEAREST = 0.02  #: Homogeneous weight below which an observed point counts as at infinity and is left out, 1/m.
 PATH, ODOMETRY, TRUE = (31, 119, 180), (127, 127, 127), (255, 255, 255)
-#: Path and map are logged again once the run is longer by this fraction and so many frames.
+#: Path and map are logged again once the run is longer by this fraction and this many frames.
 GROWTH, LEAST_FRAMES = 0.05, 10
 
 
@@ -67,7 +67,7 @@ class RunView:
             self.map(run)
 
     def show(self, run: Run, t: int, tracked: Tracked, image: np.ndarray | None) -> None:
-        """Frame t of a run, what the system said of it, and its image, if there is one."""
+        """Logs frame t of a run, the system's result, and its image, if there is one."""
         rr, stream, system = self.rr, self.stream, run.system
         camera, (drawn, plotted) = _lens(system), DRAWN.get(system.name, (None, {}))
         if not self._next:
@@ -108,7 +108,7 @@ class RunView:
             stream.log(f"plots/{name}", rr.Scalars(float(value)))
 
     def map(self, run: Run, static: bool = False) -> None:
-        """Path and map as they are now; `static` for all frames."""
+        """Logs the current path and map; `static` for all frames."""
         rr, stream, log = self.rr, self.stream, run.log
         stamps = log.stamps_ns
         paths = {"path": (log.poses, PATH)} | ({"odometry": (log["odometry"], ODOMETRY)} if "odometry" in log else {})
@@ -138,10 +138,10 @@ class RunView:
 
 
 def blueprint(run: Run) -> Any:
-    """What the viewer shows where: the world, beside it the image if there is one, and the figures.
+    """The viewer's layout: the world, next to it the image if there is one, and the figures.
 
-    The world is looked at from behind and above the first pose, so that the path and what of the map is near is seen. By
-    itself the viewer would take in the far ends of rays, beside which all else is a dot.
+    The view is from behind and above the first pose, so that the path and the nearby map are visible. By default the viewer
+    would include the far ends of rays, and all else would be tiny.
     """
     import rerun.blueprint as rrb
 
@@ -275,7 +275,7 @@ def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], po
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
 
 
-#: By the system's name, what logs what a frame showed, and figures that only it has, with the colours of their curves.
+#: By the system's name, the function that logs a frame's features, and system-specific figures with their colours.
 DRAWN: Mapping[str, tuple[Callable[..., None], Mapping[str, tuple[int, int, int]]]] = {
     "mono": (_log_search, {"searched": ODOMETRY, "found": FOUND, "lost": MISSED}),
     "stereo": (_log_pair, {"features": ODOMETRY, "agreeing": PATH, "observed": FOUND}),

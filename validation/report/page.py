@@ -1,9 +1,8 @@
-"""The page of a run, report.html: made from the files in its folder, so that it can be made again without the recording.
+"""The page of a run, report.html, made from the files in its folder, so that it can be rebuilt without the recording.
 
-On top what was run and two lights; then what comes of it: the video, which stays a file beside the page, the map to turn, each
-comparison with its pictures, the run's own figures. The page needs no network: path and map are plotly's traces, and the
-program that turns them (plotly.js, MIT) comes from the Python package of the same name. It is 4.8 MB, packed 2 MB into the
-page, which unpacks it by itself.
+At the top the run and two lights; then the results: the video, which is a file beside the page, the rotatable 3D map, each
+comparison with its plots, the run's own figures. The page needs no network: path and map are plotly traces, and plotly.js
+(MIT) is embedded from the Python package, 4.8 MB, compressed to 2 MB, which the page unpacks.
 """
 
 import gzip
@@ -38,7 +37,7 @@ _TITLES = {
     "groundtruth": "Against the ground truth", "gtsam": "Against the batch optimum", "colmap": "Against COLMAP",
     "itself": "Innovations", "relations": "Against known relations", "path": "Against another path",
 }  # fmt: skip
-#: What a picture shows, by its name without its comparison's; those of a run itself say it in their docstrings.
+#: Captions of plots, by name without the comparison's; those of the run itself are from their docstrings.
 _CAPTIONS = {
     "nees": "Normalised squared error of the pose: inside the band in 95 of 100 steps of a consistent filter.",
     "landmarks": "Distances of the landmarks in σ, beside those of independent ones of a consistent filter.",
@@ -46,7 +45,7 @@ _CAPTIONS = {
     "cloud": "Distances of the landmarks from the surface of COLMAP's points.",
     "ess": "Effective sample size and innovations, frame by frame.",
 }
-#: Paths beside the filter's own that figures of summary.json are of, by the beginning of their names.
+#: Other paths with figures in summary.json, by the prefix of their names.
 _OTHERS = {"odometry_": "odometry", "vo_": "odometry", "batch_": "batch", "final_": "final"}
 _WORDS = {
     "position_rmse_m": "error of the positions, rms",
@@ -57,7 +56,7 @@ _WORDS = {
     "rpe_rotation_rmse_deg": "error of the rotation per frame",
     "ms_per_frame": "time per frame",
 }
-#: Entries of summary.json that stand elsewhere on the page, or twice in the file.
+#: Entries of summary.json that are elsewhere on the page, or redundant.
 _ELSEWHERE = {"system", "recording", "finished", "alignment", "path_rmse_m", "remarks", "problems", "failure"}
 _UNITS = {"m": "m", "deg": "°", "px": "px", "mb": "MB", "ms": "ms", "s": "s", "rad": "rad", "frame": "ms"}
 _WIDE = 1.9  #: A picture that is so many times as wide as high takes the width of the page.
@@ -74,9 +73,9 @@ class Picture(NamedTuple):
 
 
 def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
-    """Builds `report.html` of a run from the files in its folder; returns the verdict that stands on top.
+    """Builds `report.html` of a run from the files in its folder; returns the verdict shown at the top.
 
-    `problems` are what else has to be said, one sentence each.
+    `problems` are further warnings, one sentence each.
     """
     from jinja2 import Environment, PackageLoader, select_autoescape
 
@@ -103,7 +102,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         turned = scene(record, world)
     except InputError:
         turned = ""  # path or map are damaged
-    # What a sentence on top says of a comparison is not said again.
+    # Do not repeat the sentence at the top.
     sections = [
         {
             "title": _TITLES.get(comparison.against, f"Against {comparison.against}"),
@@ -127,7 +126,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         "verdict": verdict,
         "world": world,
         "facts": ", ".join([record.system, *counted, *([day] if day else []), f"rbpf {record.config.get('rbpf', '')}"]),
-        # That repeats it; nothing of a system that is not on the command line.
+        # The command that repeats the run; none for a system that is not on the command line.
         "command": "" if kind is None else shlex.join(command_of(record.config, *usual)),
         "remarks": [*record.summary.get("remarks", ()), *problems],
         "on_frames": record.summary.get("problems", ()),
@@ -141,7 +140,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
 
 
 def _images(folder: Path, names: list[str]) -> list[Picture]:
-    # A link may show what its maker must not see of the disk of whoever opens the run.
+    # Links are not followed: they could disclose other files of the machine.
     inside = folder.resolve()
     found = []
     for name in names:
@@ -159,7 +158,7 @@ def _images(folder: Path, names: list[str]) -> list[Picture]:
 
 
 def _beside(summary: Mapping[str, Any]) -> tuple[dict[str, list[str]], dict[str, str]]:
-    """Figures that other paths have too, a row each with a head, and all others."""
+    """Figures that other paths also have, as a table with a header, and all others."""
     columns = ["filter", *dict.fromkeys(_OTHERS.values())]
     rows: dict[str, dict[str, str]] = {}
     taken = set(_ELSEWHERE)
@@ -211,7 +210,7 @@ def digits(value: Any, name: str = "") -> str:
     return f"{text}{'' if unit == '°' else ' ' if unit else ''}{unit}"
 
 
-#: Most of each that are drawn: a page is to be sent and turned on a telephone.
+#: Maximum elements drawn of each kind, so that the page is small enough to send and to view on a telephone.
 PATH_POINTS, FRUSTUMS, LANDMARKS, ELLIPSOIDS, CELLS = 4000, 60, 20_000, 400, 40_000
 #: Half the width and height of a frustum, and its depth, of its size; its size as a fraction of the scene's.
 _CORNERS = np.array([[-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])

@@ -1,6 +1,6 @@
-"""What was looked for and seen in each frame of a run over images, as an annotated video.
+"""Annotated video of a run over images, with the searched and matched features of each frame.
 
-A further system is one function from a run and the number of a frame to a picture, entered into `PICTURES`.
+A new system needs a function from a run and a frame's number to a picture, entered into `PICTURES`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ from rbpf.systems.stereo.landmarks import FeatureKind
 Colour = tuple[int, int, int]
 Place = Callable[[np.ndarray], list[tuple[float, float]]]  #: Pixels (…, 2) of the image to points of the picture.
 FOUND, MISSED, STARTED, TEXT = (60, 220, 60), (240, 60, 50), (90, 170, 255), (255, 255, 255)
-_SMALL_PX = 800  #: Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing.
+_SMALL_PX = 800  #: Narrower images are drawn at twice their size, as an ellipse of three pixels would be invisible.
 _ARM, _BAND = 4, 24
 #: Height of letters as a fraction of the drawn width, and its bounds, px.
 _LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
@@ -45,10 +45,10 @@ def annotate(
     legend: Sequence[tuple[str, Colour]],
     paint: Callable[[Any, Place], None],
 ) -> np.ndarray:
-    """The frame (H, W, 3) uint8 as it is shown, under a caption (figures, warning) and a legend of names and colours.
+    """The frame (H, W, 3) uint8 as shown, under a caption (figures, warning) and a legend of names and colours.
 
     The image is (height, width) uint8 of a size (width, height), or None where it could not be read. `paint` is called with
-    PIL's drawing of the picture, and with what tells where a pixel lies in it.
+    PIL's drawing of the picture, and with the function from pixels to its points.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -103,7 +103,7 @@ def picture_of_search(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
 def draw_search(
     image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: tuple[str, str], size: tuple[int, int]
 ) -> np.ndarray:
-    """The frame (H, W, 3) uint8 of a size (width, height), with what was looked for in it, see `MonoSlam.observed`."""
+    """The frame (H, W, 3) uint8 of a size (width, height), with the searched features, see `MonoSlam.observed`."""
     found, stroke = np.isfinite(seen["px"]).all(axis=1), drawn_scale(size[0])
 
     def paint(draw: Any, place: Place) -> None:
@@ -119,7 +119,7 @@ def draw_search(
 
 
 def _clipped(line: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A line (2, 2) without what lies more than an image's size outside: far ends may project to anywhere."""
+    """A line (2, 2) clipped to one image size around the image: far ends may project anywhere."""
     start, step = line[0], line[1] - line[0]
     low, high = -np.asarray(size, dtype=float), 2.0 * np.asarray(size, dtype=float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -129,7 +129,7 @@ def _clipped(line: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return start + np.array([[enter], [max(enter, leave)]]) * step
 
 
-#: Names and colours of what a feature of a pair is to the map, in the order in which they are drawn.
+#: Names and colours of the roles of a pair's features, in drawing order.
 FEATURES: Mapping[FeatureKind, tuple[str, Colour]] = {
     FeatureKind.FEATURE: ("feature", (150, 150, 150)),
     FeatureKind.CANDIDATE: ("candidate", (255, 190, 40)),
@@ -139,9 +139,9 @@ FEATURES: Mapping[FeatureKind, tuple[str, Colour]] = {
 
 
 def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
-    """A frame of a stereo run (H, W, 3): the left image, with what each of its features was to the map.
+    """A frame of a stereo run (H, W, 3): the left image, with the role of each feature in the map.
 
-    A line leads from each to where the right camera has it.
+    A line from each shows its position in the right image.
     """
     log = run.log
     held = f"{log['observed'][t]} landmarks" if log["updated"][t] else "no update"
@@ -174,7 +174,7 @@ def annotated_frames(run: Run) -> Iterator[np.ndarray]:
         yield draw(run, t, frame)
 
 
-#: Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps.
+#: Bounds of the time per image, for sequences without useful stamps: photos, equal stamps.
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
 #: H.264 of constant quality: a rate factor of 18 is nearly without loss, 28 poor; the same pictures, the same bytes.
 ENCODING = "-an -vcodec libx264 -pix_fmt yuv420p -crf 23 -preset veryfast -fflags +bitexact -flags:v +bitexact"

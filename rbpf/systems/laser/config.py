@@ -11,17 +11,17 @@ from rbpf.systems.filtering import RunConfig
 
 @dataclass(frozen=True)
 class MotionConfig(Ranged):
-    """How uncertain the motion between two scans is before the scanner is asked; standard deviations, those of GMapping."""
+    """Motion noise between two scans before scan matching; standard deviations, defaults of GMapping."""
 
-    shift_per_m: NotNegative = 0.1  #: of the shift, m per metre driven.
-    shift_per_rad: NotNegative = 0.2  #: of the shift, m per radian turned.
-    turn_per_m: NotNegative = 0.1  #: of the turn, rad per metre driven.
-    turn_per_rad: NotNegative = 0.2  #: of the turn, rad per radian turned.
-    shift_m: Positive = 0.01  #: of the shift, at rest too.
-    turn_rad: Positive = 0.01  #: of the turn, at rest too.
-    speed_m_s: Positive = 0.5  #: of the change of speed, m/s, where without odometry the motion goes on as before.
-    speed_rad_s: Positive = 0.5  #: of the change of turning rate, rad/s, likewise.
-    #: odometry that says more than this, m/s or rad/s, jumps: it is taken for none.
+    shift_per_m: NotNegative = 0.1  #: of the translation, m per metre driven.
+    shift_per_rad: NotNegative = 0.2  #: of the translation, m per radian turned.
+    turn_per_m: NotNegative = 0.1  #: of the rotation, rad per metre driven.
+    turn_per_rad: NotNegative = 0.2  #: of the rotation, rad per radian turned.
+    shift_m: Positive = 0.01  #: of the translation, also at rest.
+    turn_rad: Positive = 0.01  #: of the rotation, also at rest.
+    speed_m_s: Positive = 0.5  #: of the change of speed, m/s, without odometry (constant velocity).
+    speed_rad_s: Positive = 0.5  #: of the change of the turn rate, rad/s, likewise.
+    #: faster odometry, m/s or rad/s, is a jump and ignored.
     fastest: Positive = 10.0
 
     def cov(self, way_m: float, turned_rad: float) -> np.ndarray:
@@ -31,7 +31,7 @@ class MotionConfig(Ranged):
         return np.diag(np.square([turn, shift, shift]) + np.square([self.turn_rad, self.shift_m, self.shift_m]))
 
     def cov_without(self, seconds: float) -> np.ndarray:
-        """The same of a motion that nothing measured."""
+        """The same for a motion without odometry."""
         turn, shift = self.speed_rad_s * seconds + self.turn_rad, self.speed_m_s * seconds + self.shift_m
         return np.diag(np.square([turn, shift, shift]))
 
@@ -41,11 +41,11 @@ class LaserConfig(RunConfig):
     """A run of grid SLAM with a laser scanner."""
 
     particles: Count = 30  #: number of particles.
-    #: a scan is matched and written when the robot has moved so far since the last one that was (0: every scan); in
-    #: between the odometry says where it is.
+    #: a scan is matched and inserted once the robot has moved this far since the last one (0: every scan); in between the
+    #: pose follows the odometry.
     distance_m: NotNegative = 0.5
-    angle_rad: NotNegative = 0.25  #: or when it has turned so far.
-    seconds: Positive = 10.0  #: or when so much time has gone.
+    angle_rad: NotNegative = 0.25  #: or has turned by this.
+    seconds: Positive = 10.0  #: or after this time.
     #: length of wall that counts as one measurement, see `rbpf.sensors.laser.Scanner.beams`.
     correlation_m: Positive = 0.25
     least_beams: Count = 10  #: a scan with fewer returns is not used.

@@ -6,9 +6,9 @@ G. Grisetti, C. Stachniss, W. Burgard, "Improved techniques for grid mapping wit
     for scan in log.frames:
         frame = slam.track(scan.ranges, scan.odometry, scan.stamp_ns)
 
-Each particle searches its own grid for the pose that explains the scan best, and is sampled from the Gaussian about it; then
-the filter corrects by the exact ratio w₂ = p(z|x) p(x|x⁻) / (q(x) w₁). A scan is used when the robot has moved since the last
-one that was; the pose of every other one is that of the odometry from there on.
+Each particle searches its own grid for the pose that explains the scan best, and is sampled from the Gaussian about it; the
+filter then corrects by the exact ratio w₂ = p(z|x) p(x|x⁻) / (q(x) w₁). A scan is used once the robot has moved since the
+last one used; the poses of the others follow from the odometry.
 """
 
 from typing import Any, ClassVar, final
@@ -28,16 +28,16 @@ from rbpf.systems.laser.config import LaserConfig
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import DIAGNOSTICS, FILTER_COLUMNS, Column, FrameLog, System, Tracked, TrackingState
 
-BARELY = 0.1  #: A scan that fits its map less than this, of 1, says nothing of where the robot is.
+BARELY = 0.1  #: Fit (0 to 1) below which a scan does not localise the robot.
 
 
 @final
 class ScanMatching(Proposal):
-    """The Gaussian about the pose at which a scan's beams (K, 5) fit each particle's own grid best, see `GridMap.match`."""
+    """The Gaussian about the best match of a scan's beams (K, 5) in each particle's grid, see `GridMap.match`."""
 
     def __init__(self, grid: GridMap, beams: np.ndarray) -> None:
         self.grid, self.beams = grid, beams
-        self.fit = 0.0  #: How well the scan fits there, of 1, a mean over the particles.
+        self.fit = 0.0  #: Fit of the scan (0 to 1), a mean over the particles.
 
     def propose(self, prior: Prior, linearise: LineariseAt, rng: np.random.Generator) -> Proposed:
         proposed, fit = self.grid.match(prior, self.beams)
@@ -50,7 +50,7 @@ class LaserSlam(Kept, System):
     """Grid SLAM.
 
     Args:
-        scanner: where its beams point, and where it sits on the robot.
+        scanner: directions of its beams, and mounting pose.
         config: all settings.
     """
 
@@ -81,24 +81,24 @@ class LaserSlam(Kept, System):
             Column("beams", "readings that came back", kind=int, table=DIAGNOSTICS),
             Column("odometry", "world_from_robot by odometry alone", shape=(3,)),
         )
-        # The last step's pose, and what has moved since: by odometry, how far, how much it turned, how long without any.
+        # The last step's pose, and since then: motion by odometry, distance, rotation, time without odometry.
         self._pose, self._cov = SE2.identity(), np.zeros((3, 3))
         self._since, self._moved = SE2.identity(), np.zeros(3)
-        # Odometry composed, its last reading (NaN where there is none), the speed between the last two steps.
+        # Composed odometry, its last reading (NaN without one), the velocity between the last two steps.
         self._odometry, self._measured = SE2.identity(), np.full(3, np.nan)
         self._twist = np.zeros(3)
         self._stamp_ns = -1  # of the last scan, −1 before the first
         self._ess = float(config.particles)  # of the last step
 
     def track(self, ranges: np.ndarray, odometry: np.ndarray | None = None, stamp_ns: int | None = None) -> Tracked:
-        """A scan, and what it says of where the robot is.
+        """Processes a scan.
 
         Args:
-            ranges: (B,) [m]; inf where nothing came back, NaN where a reading is not valid.
-            odometry: (E,) world_from_robot by odometry; None where there is none: the motion then goes on as before.
+            ranges: (B,) [m]; inf for no return, NaN for an invalid reading.
+            odometry: (E,) world_from_robot by odometry; None without one: constant velocity is assumed.
             stamp_ns: time; by default a second after the last scan.
 
-        Raises InputError: time runs backwards, there are not as many readings as beams, or the map outgrows the memory.
+        Raises InputError: time runs backwards, the numbers of readings and beams differ, or the map outgrows the memory.
         """
         previous, last_ns = self._stamp_ns, self.filter.stamp_ns
         stamp_ns = previous + 1_000_000_000 if stamp_ns is None else int(stamp_ns)
@@ -109,7 +109,7 @@ class LaserSlam(Kept, System):
         self._move(odometry, (stamp_ns - previous) * 1e-9 if begun else 0.0, messages)
         self._stamp_ns = stamp_ns
 
-        # Use the scan if there is something in it, and if the robot has moved.
+        # Use the scan if it has enough returns and the robot has moved.
         state, fit, resampled = TrackingState.PREDICTED, float("nan"), False
         way, turned, without = self._moved.tolist()
         far = way >= self.config.distance_m or turned >= self.config.angle_rad
@@ -122,9 +122,9 @@ class LaserSlam(Kept, System):
                 fit = proposal.fit
             if fit < BARELY:
                 state = TrackingState.LOST
-                messages.append(f"the scan hardly fits the map ({100 * fit:.0f} %): where the robot is, is not known")
-        # Between two steps the pose is where the odometry has come to from the last one.
-        now = Odometry(self._pose, self._cov).then(self._moved_since(), SE2)
+                messages.append(f"the scan hardly fits the map ({100 * fit:.0f} %): the robot is not localised")
+        # Between two steps the pose is the last one moved by the odometry.
+        now = Odometry(self._pose, self._cov).then(self._motion_since_step(), SE2)
         nothing = {"log_evidence": float("nan"), "nis": float("nan"), "nis_dof": 0.0}
         own = {"fit": fit, "beams": len(beams), "odometry": self._odometry}
         values = {"ess": self._ess, "resampled": resampled, **nothing, **own}
@@ -142,7 +142,7 @@ class LaserSlam(Kept, System):
         return self.grid.picture(int(np.argmax(self.filter.particles.log_weights)))
 
     def measurements(self, name: str, log: FrameLog) -> None:
-        """Scans are not measurements of landmarks: there is no batch problem of them."""
+        """None, as scans are not measurements of landmarks."""
 
     def particle_poses(self) -> np.ndarray:
         return SE2.compose(self.filter.particles.state, self._since)
@@ -159,12 +159,12 @@ class LaserSlam(Kept, System):
         }
 
     def files(self, log: FrameLog) -> dict[str, dict[str, np.ndarray]]:
-        """The grid; and the particles' paths at every scan since their first kept step, by odometry between steps."""
+        """The grid; and the particles' paths at all scans since their first stored step, by odometry between steps."""
         picture, history, odometry = self.picture(), self.filter.history, log["odometry"]
         grid = {"log_odds": picture.log_odds, "cell_m": np.array(picture.cell_m), "corner": picture.corner}
         step = np.searchsorted(history.stamps_ns, log.stamps_ns, side="right") - 1
         scans = step >= 0
-        if not scans.any():  # none came back with anything in it
+        if not scans.any():  # no scan had returns
             return {"grid.npz": grid}
         at_step = odometry[np.searchsorted(log.stamps_ns, history.stamps_ns)]
         since = SE2.between(at_step[step[scans]], odometry[scans])
@@ -176,7 +176,7 @@ class LaserSlam(Kept, System):
         return {"posterior.npz": paths, "grid.npz": grid}
 
     def _move(self, odometry: np.ndarray | None, seconds: float, messages: list[str]) -> None:
-        """Takes in the motion since the last scan, as the odometry says it, or as it was between the last two steps."""
+        """Adds the motion since the last scan, by odometry, or by the velocity between the last two steps."""
         fastest = self.config.motion.fastest
         now = np.full(3, np.nan) if odometry is None else np.asarray(odometry, dtype=float)
         if now.shape != (3,):
@@ -194,13 +194,13 @@ class LaserSlam(Kept, System):
                 messages.append(f"the odometry jumps by {jump}: the motion is assumed to go on as before")
         if has_delta:
             self._moved += [way, turned, 0.0]
-        elif self.filter.steps:  # before, the world begins where the first scan is taken
+        elif self.filter.steps:  # before the first step the world's origin is at the current scan
             delta = SE2.exp(self._twist * seconds)
             self._moved[2] += seconds
         self._measured = now
         self._since, self._odometry = SE2.compose(self._since, delta), SE2.compose(self._odometry, delta)
 
-    def _moved_since(self) -> Odometry:
+    def _motion_since_step(self) -> Odometry:
         """The motion since the last step."""
         way, turned, without = self._moved.tolist()
         if not self._moved.any():
@@ -209,10 +209,10 @@ class LaserSlam(Kept, System):
         return Odometry(self._since, motion.cov(way, turned) + (motion.cov_without(without) if without else 0.0))
 
     def _step(self, beams: np.ndarray, stamp_ns: int, proposal: Proposal | None) -> bool:
-        """A step of the filter; whether it resampled."""
+        """A step of the filter; returns whether it resampled."""
         last_ns, before = self.filter.stamp_ns, self._pose
-        moved = None if last_ns is None and not self._moved.any() else self._moved_since()
-        if proposal is None or not self._moved.any():  # nothing has moved: nothing is to be found
+        moved = None if last_ns is None and not self._moved.any() else self._motion_since_step()
+        if proposal is None or not self._moved.any():  # no motion, nothing to match
             proposal = PriorProposal()
         report = self.filter.step(beams, moved, stamp_ns, proposal)
         self._pose, self._cov, self._ess = report.estimate.mean, report.estimate.cov, report.ess

@@ -1,7 +1,7 @@
-"""Active search (E06 §4.1): which features are worth looking for, where they should be, and what is there.
+"""Active search (E06 §4.1): selection of features, their predicted positions, and matching.
 
-A false match inside its search ellipse is not seen to be false before the pose is known, and then it is too late. So
-an `OutlierGate` says which matches agree with one motion of the camera; the others take no part in the filter's step.
+A false match inside its search ellipse cannot be recognised as false before the pose is known, and then it is too late. So an
+`OutlierGate` selects the matches that agree with one motion of the camera; the others are not used in the filter's step.
 """
 
 import time
@@ -20,19 +20,19 @@ from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import FeatureTable, parallax, patch_affines, tilted
 
-CELLS = 6  #: The image is divided into so many columns and rows, from which features are chosen in turn.
-AMBIGUOUS = 0.9  #: Of two places one may be mistaken for the other when their scores differ by less than this fraction.
-MIN_AGREEING = 4  #: Matches that must agree on a motion for it to say where the others are.
-WIDEST = 2.0  #: An ellipse larger than so many times what is searched of it is hardly searched at all.
-#: From so far around a feature how its patch lies in space is learnt; what is half as far counts half.
+CELLS = 6  #: Columns and rows of the image grid, from whose cells features are selected in turn.
+AMBIGUOUS = 0.9  #: Two positions are ambiguous if the lower score is at least this fraction of the higher one.
+MIN_AGREEING = 4  #: Least inliers of a motion for it to predict the other features.
+WIDEST = 2.0  #: Ratio of an ellipse to the searched part of it beyond which it does not count as searched.
+#: Half-width of the window from which a patch's orientation is learnt; weights halve at half of it.
 PLANE_HALF_PX = 7
-#: It is learnt as long as what is not known of it moves the patch's border by more, in standard deviations.
+#: Learning ends once the remaining uncertainty moves the patch's border by less than this, in standard deviations.
 SHOWN_PX = 0.1
 ROUNDING = 1.0 / 6.0  #: Variance of the difference of two grey levels that were rounded.
 _OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-PLANE_HALF_PX, PLANE_HALF_PX + 1.0)]), axis=-1)
 _WEIGHTS = 0.5 ** (np.square(2.0 * _OFFSETS / PLANE_HALF_PX).sum(axis=-1)).ravel()
-ROUNDS = 10  #: Of the robust fit: reweightings.
-CAUCHY_SCALE = 2.0  #: Likewise: standard deviations at which a match keeps half of its weight.
+ROUNDS = 10  #: Reweightings of the robust fit.
+CAUCHY_SCALE = 2.0  #: Residual of the robust fit, in standard deviations, at which a match has half weight.
 
 
 class MotionFit(NamedTuple):
@@ -44,20 +44,20 @@ class MotionFit(NamedTuple):
 
 
 class OutlierGate(ABC):
-    """Finds the motion that most matches of a frame agree on."""
+    """Estimates the motion that most matches of a frame agree on."""
 
     @abstractmethod
     def fit(
         self, nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, trusted: np.ndarray
     ) -> MotionFit:
-        """The motion that the trusted ones of K matches agree on, and how far all of them are from it.
+        """The motion that most trusted ones of K matches agree on, and the distances of all matches from it.
 
         Args:
             nu: (K, p) innovations at the predicted pose.
             jac: (K, p, d) by the pose, H.
             cov: (K, p, p) of the innovations given the pose, S = J P Jᵀ + R.
             factor: (d, r) of the prior's covariance, Q = L Lᵀ.
-            trusted: (K,) which determine the motion; the others are only judged by it.
+            trusted: (K,) which determine the motion; the others are only tested against it.
         """
 
 
@@ -65,14 +65,14 @@ class OutlierGate(ABC):
 class RobustMotionGate(OutlierGate):
     """Maximum a posteriori of ε ~ N(0, Q) with a Cauchy loss on the Mahalanobis distances of the matches.
 
-    Iteratively reweighted least squares. The fit also says where what was not found should be seen: among things that
-    look alike (the corners of a chessboard, a row of windows) the right one is then nearest.
+    Iteratively reweighted least squares. The fit also predicts features that were not matched: among similar ones (the
+    corners of a chessboard, a row of windows) the right one is then nearest.
     """
 
     def fit(
         self, nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, trusted: np.ndarray
     ) -> MotionFit:
-        # u ~ N(0, I) with ε = L u, of whitened measurements; the weights are those of the misfit before.
+        # u ~ N(0, I) with ε = L u, for whitened measurements; the weights are from the previous residuals.
         rows = np.concatenate([nu[trusted, :, None], jac[trusted] @ factor], axis=2)
         rows = np.linalg.solve(gaussian.cholesky(cov[trusted]), rows)
         white, slope = np.ascontiguousarray(rows[..., 0]), np.ascontiguousarray(rows[..., 1:])
@@ -94,25 +94,25 @@ _EMPTY_PX = partial(np.zeros, (0, 2))
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What was looked for in a frame, K features."""
+    """The result of the search in a frame, K features."""
 
     features: np.ndarray = field(default_factory=partial(np.zeros, 0, np.int64))  #: (K,) their rows in the table.
-    mean: np.ndarray = field(default_factory=_EMPTY_PX)  #: (K, 2) predicted places, px.
-    #: (K, 2, 2) with the noise of the measurement, px².
+    mean: np.ndarray = field(default_factory=_EMPTY_PX)  #: (K, 2) predicted pixels.
+    #: (K, 2, 2) covariance of the prediction, with measurement noise, px².
     cov: np.ndarray = field(default_factory=partial(np.zeros, (0, 2, 2)))
     px: np.ndarray = field(default_factory=_EMPTY_PX)  #: (K, 2) best match of each; NaN where nothing was compared.
     score: np.ndarray = field(default_factory=partial(np.zeros, 0))  #: (K,) its normalised cross-correlation.
     found: np.ndarray = field(default_factory=partial(np.zeros, 0, np.bool_))  #: (K,) whether it was accepted.
-    #: (K,) whether another place in the ellipse looks about as much like it.
+    #: (K,) whether another position in the ellipse matches about as well.
     ambiguous: np.ndarray = field(default_factory=partial(np.zeros, 0, np.bool_))
-    #: (V, 2) predicted places of all features that were worth looking for, chosen or not, px.
+    #: (V, 2) predicted pixels of all features in view, selected or not.
     in_view: np.ndarray = field(default_factory=_EMPTY_PX)
-    seconds_choosing: float = 0.0  #: time of the choice of what to look for: all that grows with the map.
+    seconds_choosing: float = 0.0  #: time of the selection, the only part that grows with the map.
 
 
 @final
 class ActiveSearch:
-    """Looks for the features of a table, under whose rows the belief has them; by default with a `RobustMotionGate`."""
+    """Searches the features of a table, whose rows are their names; by default with a `RobustMotionGate`."""
 
     def __init__(
         self, features: FeatureSensor, table: FeatureTable, config: SearchConfig, gate: OutlierGate | None = None
@@ -120,19 +120,18 @@ class ActiveSearch:
         self.features = features
         self.table, self.config = table, config
         self.gate = gate or RobustMotionGate()
-        #: Whether a frame of the start had matches of which most had a depth too uncertain to be placed.
+        #: Whether in a frame of the start most matches had too uncertain depths to be predicted.
         self.is_fast = False
 
     @property
     def noise(self) -> np.ndarray:
-        """Covariance (2, 2) of a found place, px²; as learnt, but never less than stated: nothing is missed."""
+        """Covariance (2, 2) of a match, px²; as learnt, but at least as stated, so that no ellipse is too small."""
         return max(self.features.noise_factor, 1.0) * self.config.noise_px**2 * np.eye(2)
 
     def run(self, image: np.ndarray, belief: Belief, starting: bool = False) -> SearchResult:
-        """Looks for features in an image (H, W) uint8; what is found agrees with one motion of the camera.
+        """Searches features in an image (H, W) uint8; accepted matches agree with one motion of the camera.
 
-        While the first frames of a fast camera are adjusted (`starting`), a feature of any depth counts that looks like one
-        place alone.
+        During the start of a fast camera (`starting`) features of any depth count if their match is unambiguous.
         """
         pose = self.features.pose(belief)
         started = time.perf_counter()
@@ -141,7 +140,7 @@ class ActiveSearch:
         if not rows.size:
             return SearchResult(in_view=in_view, seconds_choosing=seconds_choosing)
 
-        # Each is looked for in the ellipse where all particles together expect it, as it looked at first.
+        # Each is searched in the ellipse predicted by all particles together, with its first appearance.
         which, mean, cov = self.features.project(belief, rows)
         rows, cov = rows[which], cov + self.noise
         affines = self.first_affines(rows, pose)
@@ -149,8 +148,8 @@ class ActiveSearch:
         matches = self.match(image, templates, mean, cov)
         result = SearchResult(rows, mean, cov, *matches, in_view, seconds_choosing)
 
-        # What was not found is looked for as it looked last. As long as it is not known how a patch lies in space it is taken
-        # to face the first camera, and known again up to about 25° from there.
+        # Unmatched features are searched again with their last appearance. As long as a patch's orientation is unknown, it is
+        # assumed to face the first camera, and is recognised up to about 25° from there.
         changed = (self.table.last_pose[rows] != self.table.first_pose[rows]).any(axis=1)
         missed = np.flatnonzero(~result.found & changed)
         if missed.size:
@@ -170,11 +169,11 @@ class ActiveSearch:
         return result
 
     def choose(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (K,) of features worth looking for from a pose, spread over the image; places (V, 2) of all in view."""
+        """Selects features (K,) to search from a pose, spread over the image; and pixels (V, 2) of all in view."""
         table, camera, config = self.table, self.features.camera, self.config
         rows, px = self.in_view(pose, table.alive)
 
-        # From each cell of the image the best one, then from each the second best, and so on.
+        # The best feature of each image cell, then the second best of each, and so on.
         size = np.array([camera.width, camera.height])
         column, line = np.clip(px * CELLS / size, 0, CELLS - 1).astype(np.int64).T
         cell = column + CELLS * line
@@ -186,7 +185,7 @@ class ActiveSearch:
         return np.asarray(rows[best_first[: config.measurements]]), px
 
     def in_view(self, pose: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (V,) of features `among` (F,) bool that should be seen from a pose, not too differently; places (V, 2)."""
+        """Rows (V,) of features `among` (F,) bool in view of a pose under similar conditions; and their pixels (V, 2)."""
         from rbpf.sensors.camera.kernels import in_view
 
         table, camera, config = self.table, self.features.camera, self.config
@@ -209,7 +208,7 @@ class ActiveSearch:
     def match(
         self, image: np.ndarray, templates: np.ndarray, mean: np.ndarray, cov: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Place (K, 2), score (K,), whether that is a match (K,), and whether another place is much alike (K,)."""
+        """Position (K, 2), score (K,), whether it is a match (K,), and whether it is ambiguous (K,)."""
         config = self.config
         matches = search(image, templates, mean, cov, sigmas=config.ellipse_sigmas, most_px=config.max_radius_px)
         accepted = (matches.score >= config.min_correlation) & self.features.camera.inside(matches.px)
@@ -218,7 +217,7 @@ class ActiveSearch:
     def _agreeing(
         self, image: np.ndarray, belief: Belief, templates: np.ndarray, result: SearchResult, starting: bool
     ) -> SearchResult:
-        """Only matches that agree with one motion; what was mistaken is looked for again where the motion puts it."""
+        """Keeps matches that agree with one motion; others are searched again where the motion predicts them."""
         hits = np.flatnonzero(result.found)
         which, nu, jac, cov = self._innovations(belief, result.features[hits], result.px[hits])
         factor = belief.prior.spread(belief.prior.mean)
@@ -226,7 +225,7 @@ class ActiveSearch:
         voting = self.table.voting(result.features[hits[which]], self.config.trusted_fraction)
         fit = self.gate.fit(nu, jac, cov, factor, voting)
         found, hits = np.zeros_like(result.found), hits[which]
-        agree, placed = fit.squared <= self.config.gate_chi2, self._placed(cov)
+        agree, placed = fit.squared <= self.config.gate_chi2, self._well_predicted(cov)
         self.is_fast |= starting and 2 * int((agree & placed).sum()) < int(agree.sum())
         if starting and self.is_fast:
             placed |= ~result.ambiguous[hits]
@@ -237,7 +236,7 @@ class ActiveSearch:
             return result
 
         which, nu, jac, cov = self._innovations(belief, result.features[missed], result.mean[missed])
-        placed = self._placed(cov)
+        placed = self._well_predicted(cov)
         missed, nu, jac, cov = missed[which[placed]], nu[placed], jac[placed], cov[placed]
         if missed.size:
             mean = result.mean[missed] - nu + jac @ fit.increment
@@ -247,9 +246,9 @@ class ActiveSearch:
         return result
 
     def _learn_planes(self, image: np.ndarray, pose: np.ndarray, rows: np.ndarray, px: np.ndarray) -> None:
-        """How the patches of features (K,) that were found at px (K, 2) lie in space, from how they look there.
+        """Learns the orientation of the patches of features (K,) matched at px (K, 2) from their appearance.
 
-        A step of Gauss and Newton for the plane's slope, with place, gain and offset of the patch, which are not kept
+        A Gauss-Newton step for the plane's slope, with nuisance parameters position, gain and offset of the patch
         (N. Molton, A. Davison and I. Reid, Locally planar patch features, 2004).
         """
         table, focal = self.table, self.features.camera.params[:2]
@@ -275,7 +274,7 @@ class ActiveSearch:
         rows, by_all, error, squared, slopes = (part[usable] for part in (rows, by_all, error, squared, slopes))
         weighted = np.swapaxes(_WEIGHTS[:, None] * by_all, 1, 2)
         normal, right = weighted @ by_all, weighted @ error[..., None]
-        # Where grey levels change along one line only, the place along it is not told.
+        # Where grey levels vary in one direction only, the position across it is undetermined.
         normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
         left = (error[..., None] - by_all @ np.linalg.solve(normal, right))[..., 0]
         variance = np.square(left) @ _WEIGHTS / _WEIGHTS.sum() + ROUNDING
@@ -289,15 +288,15 @@ class ActiveSearch:
     def _innovations(
         self, belief: Belief, rows: np.ndarray, px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Which of the features, ν, H, and S of them in the heaviest particle; see `FeatureSensor.innovations`."""
+        """Rows of the features used, and their ν, H and S in the heaviest particle; see `FeatureSensor.innovations`."""
         which, nu, jac, cov = self.features.innovations(belief, rows, px)
         return which, nu, jac, cov + self.noise
 
-    def _placed(self, cov: np.ndarray) -> np.ndarray:
-        """Which features (K,) are where the camera's motion puts them, up to what is searched.
+    def _well_predicted(self, cov: np.ndarray) -> np.ndarray:
+        """Mask of features (K,) whose prediction given the camera's motion is precise relative to the search range.
 
-        One with a depth more uncertain than that, cov (K, 2, 2) where the camera is known, agrees with every motion:
-        which of several places that look alike is the right one cannot be told.
+        A feature of more uncertain depth, cov (K, 2, 2) given the camera, agrees with every motion: several similar positions
+        cannot be disambiguated.
         """
         # The larger eigenvalue of each.
         middle, apart = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1]), 0.5 * (cov[:, 0, 0] - cov[:, 1, 1])

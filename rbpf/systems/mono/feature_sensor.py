@@ -1,7 +1,7 @@
-"""From features that were found to observations of landmarks, and from the map to where features should be found.
+"""Turns matched features into observations of landmarks, and predicts features from the map.
 
-A feature is in the map as a world point once its depth is known; before, as an `UnknownDepth` says: a ray with an
-inverse depth, unless the system is given something else. Known points may be members of one landmark, a constellation.
+A feature is stored as a world point once its depth is known; before, as defined by an `UnknownDepth`, by default a ray with
+an inverse depth. Known points may be members of one landmark, a constellation.
 """
 
 from abc import ABC, abstractmethod
@@ -28,52 +28,52 @@ from rbpf.systems.learnt_noise import LearntNoise
 from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.feature_table import directions
 
-MIN_DEPTHS = 4  #: Depths that must be known in view for new features to start at them.
-MIN_SCALED = 3  #: Points that must be seen for the scale to be theirs: so many determine the camera's pose.
-#: Times the standard deviation that the prior of depth has, which a young ray that moves in the image is given along
-#: its line on top: the same prior comes again in every frame, so that in a frame it counts a tenth.
+MIN_DEPTHS = 4  #: Known depths in view required to initialise new features at their median.
+MIN_SCALED = 3  #: Points that must be observed to fix the scale: the number that determines the camera's pose.
+#: Factor on the depth prior's standard deviation that is added along the epipolar line for a young ray that moves in the
+#: image: the same prior recurs in every frame, so in one frame it counts a tenth.
 WIDENED = 3.0
-#: Squared displacement in the image over the noise of both places, up to which a ray is seen where it was started.
+#: Squared image displacement, over the noise of both positions, up to which a ray counts as not having moved.
 STILL_CHI2 = 4.0
-#: Times the greatest standard deviation at which something is looked for: so far off a measurement is taken as linear.
+#: Range in which measurements are treated as linear, relative to the greatest standard deviation searched.
 LINEAR = 3.0
 
 
 class UnknownDepth(ABC):
-    """How features are kept and used as long as their depth is not known well enough for a world point."""
+    """Storage and use of features whose depth is not known well enough for a world point."""
 
     landmark: Landmark  #: their parametrisation in the map; of one component.
-    model: CameraModel  #: how a camera measures them.
+    model: CameraModel  #: their observation model.
 
     def tune(self, camera: Pinhole, about: np.ndarray) -> None:
-        """As `FeatureSensor.tune`; to be overridden where there is a joint map."""
-        raise InputError(f"{type(self).__name__} has no camera that calibrates itself")
+        """As `FeatureSensor.tune`; must be overridden for a joint map."""
+        raise InputError(f"{type(self).__name__} does not support self-calibration")
 
     @abstractmethod
     def starting(self, depths: np.ndarray) -> CameraModel:
-        """The model whose `initialise` starts features, where points (D,) of these depths [m] are in view."""
+        """The model whose `initialise` is used for new features, given the depths (D,) [m] of points in view."""
 
     @abstractmethod
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
     ) -> list[Observations]:
-        """What features (K,) of this parametrisation at z (K, 2) px, cov (K, 2, 2) px², say of the pose and of themselves.
+        """Observations of features (K,) of this parametrisation at z (K, 2) px, with cov (K, 2, 2) px².
 
-        `scaled` is whether points are seen that hold the scale, which else the prior of depth does; `held` whether known ones
-        are among them.
+        `scaled` tells whether observed points fix the scale, otherwise the depth prior does; `held` whether known points are
+        among them.
         """
 
     @abstractmethod
     def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
-        """Ids (P,) of what was observed and is known well enough now to be turned into world points."""
+        """Ids (P,) of observed features that can now be promoted to world points."""
 
     @abstractmethod
     def depth_std_ratio(self, records: Records) -> np.ndarray:
-        """Standard deviation of the depth as a fraction of it (N, K); infinite where the depth is not known at all."""
+        """Standard deviation of the depth as a fraction of it (N, K); infinite for unknown depth."""
 
     @abstractmethod
     def extent(self, records: Records, sigmas: float, min_weight: float = 0.0) -> np.ndarray:
-        """Nearest and farthest homogeneous point (N, K, 2, 4), so many standard deviations from the mean.
+        """Nearest and farthest homogeneous point (N, K, 2, 4), at `sigmas` standard deviations from the mean.
 
         Their last entry is not below `min_weight`; 0 is at infinity.
         """
@@ -85,7 +85,7 @@ class UnknownDepth(ABC):
 
 
 class InverseDepthRays(UnknownDepth):
-    """Rays with an inverse depth from where a feature was seen first, E06 §5."""
+    """Rays with an inverse depth, anchored at the first observation, E06 §5."""
 
     landmark: InverseDepth
     model: CameraRay
@@ -102,14 +102,14 @@ class InverseDepthRays(UnknownDepth):
         self.camera, self.model = camera, CameraRay(camera, self.model.rho, about=about)
 
     def starting(self, depths: np.ndarray) -> CameraModel:
-        """At the median inverse depth of the points in view, where there are enough of them."""
+        """At the median inverse depth of the points in view, if there are enough."""
         return CameraRay(self.camera, self.prior(depths), about=self.model.about)
 
     def prior(self, depths: np.ndarray) -> tuple[float, float]:
-        """Mean and standard deviation of inverse depths, 1/m, where points are at these depths (K,).
+        """Mean and standard deviation of inverse depths, 1/m, given points at these depths (K,).
 
-        Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
-        independent, the scene's depth is common to them.
+        Rays that all start too near or too far consistently support a wrong scale: the prior treats them as independent,
+        whereas the scene's depth is common to them.
         """
         mean, std = self.config.mean_per_m, self.config.std_per_m
         if not self.config.from_scene_depth or depths.size < MIN_DEPTHS:
@@ -121,17 +121,17 @@ class InverseDepthRays(UnknownDepth):
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
     ) -> list[Observations]:
-        """Epipolar constraint, 2-D marginal, or an update of depth alone, as `InverseDepthConfig.pose_update` says.
+        """Epipolar constraint, 2-D marginal, or an update of depth alone, by `InverseDepthConfig.pose_update`.
 
-        Which of them is decided for a feature, not for a particle: the density of what was measured is one in all
-        particles, continuous in the pose. Decided by each particle's own parallax, it rewards motion that did not happen.
+        The choice is made per feature, not per particle: the likelihood has the same form in all particles and is continuous
+        in the pose. A choice by each particle's own parallax would reward motion that did not happen.
         """
-        # Depth is measured where it moves the image in the particle of highest weight, E06 §5.1, last paragraph.
+        # Depth counts as measured if it moves the image in the particle of highest weight, E06 §5.1, last paragraph.
         state, mode = belief.state[belief.mode], belief.mode
         _, jac, records = belief.map.innovations(self.model, z, ids, state, mode)
         assert jac.landmark is not None
-        # What is still seen where it was started has no line: that its image stays says that the camera does. But the prior
-        # of depth then comes anew in every frame, which only known points outweigh.
+        # A ray that has not moved in the image has no epipolar line: that its image stays shows that the camera does. But
+        # this uses the depth prior anew in every frame, which is harmless only with known points.
         displacement = z - self.camera.project(np.insert(records.mean[0, :, :2], 2, 1.0, axis=1))
         still = held & (squared_mahalanobis(displacement, 2.0 * cov) < STILL_CHI2)
         by_depth = self.config.std_per_m * jac.landmark[..., 2]
@@ -159,7 +159,7 @@ class InverseDepthRays(UnknownDepth):
         return depth + group(self.model, young, STATE, widened) + group(self.epipolar, has_line, STATE)
 
     def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
-        """Whose inverse depth is known to `promote_std_ratio` in `promote_weight` of the particles' weight."""
+        """Those with an inverse depth known to `promote_std_ratio` in `promote_weight` of the particles' weight."""
         updated = [group.ids for group in observed if group.model is self.model and group.updates != STATE]
         if not updated:
             return np.zeros(0, dtype=np.int64)
@@ -184,10 +184,10 @@ class InverseDepthRays(UnknownDepth):
 
 @final
 class FeatureSensor(Sensor):
-    """Takes features with names (`FeatureFrame`), and says where the map has features.
+    """Sensor of named features (`FeatureFrame`), which also predicts features from the map.
 
-    A feature's name is its landmark's id. Members of a constellation, the known points of `group`, have none of their own;
-    its id is the first one's name. The points of a `fixed` map say where the camera is, and are not changed by what is seen.
+    A feature's name is its landmark's id. Members of a constellation, the known points of `group`, are not landmarks
+    themselves; its id is the first one's name. Points of a `fixed` map localise the camera, and are not updated.
     """
 
     def __init__(
@@ -208,21 +208,20 @@ class FeatureSensor(Sensor):
         self.group = group
 
     def become_joint(self, unknown_depth: UnknownDepth, reach_px: float, noise: LearntNoise | None = None) -> None:
-        """From now on the map is a joint one, which holds the known points one by one.
+        """Switches to a joint map, in which known points are separate landmarks.
 
-        What is expected with a greater standard deviation than `reach_px` cannot be looked for. Without `noise`, what is
-        measured is as exact as it says.
+        Predictions with a standard deviation above `reach_px` cannot be searched. Without `noise` the stated noise is used.
         """
         self.unknown_depth, self._reach_px, self.noise, self.group = unknown_depth, reach_px, noise, None
 
     def tune(self, camera: Pinhole, about: np.ndarray) -> None:
-        """The camera of a joint map that it is estimated in, at the substate `about` (m,)."""
+        """Sets the camera of a joint map with self-calibration, at the substate `about` (m,)."""
         self.camera, self.point = camera, CameraPoint(camera, about=about)
         self.unknown_depth.tune(camera, about)
 
     @property
     def noise_factor(self) -> float:
-        """Of the variance that what is measured says, for all features."""
+        """Common factor of the stated measurement variance."""
         return 1.0 if self.noise is None else self.noise.mean
 
     def noisy(self, names: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -234,7 +233,7 @@ class FeatureSensor(Sensor):
         groups, inside = list[Observations](), self.camera.inside(frame.z)
         cov_z = self.noisy(frame.landmarks, frame.cov_z)
 
-        # All members of the constellation that are seen are one measurement of it.
+        # All observed members of the constellation form one measurement of it.
         members = self.members(frame.landmarks)
         ids = self._ids(belief, frame.landmarks, members)
         rows = np.flatnonzero((members >= 0) & inside)
@@ -260,13 +259,13 @@ class FeatureSensor(Sensor):
     def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """As `start`; a joint map that is full puts features away, and brings those back whose names are seen."""
+        """As `start`; a full joint map puts features away, and brings back those whose names are observed."""
         started = self.start(frame, belief, observed)
         self.make_room(belief, frame.landmarks)
         return started
 
     def make_room(self, belief: Belief, seen: np.ndarray) -> np.ndarray:
-        """Names (K,) that a full joint map lets go: what is out of view, the farthest from where the camera looks first."""
+        """Names (K,) that a full joint map removes: features out of view, those farthest from the viewing direction first."""
         joint = belief.map
         if not isinstance(joint, JointMap) or not joint.is_full:
             return np.zeros(0, dtype=np.int64)
@@ -278,7 +277,7 @@ class FeatureSensor(Sensor):
         return joint.make_room(others[order])
 
     def is_unsure(self, joint: JointMap) -> bool:
-        """Whether a joint map is so unsure of its frame's place that what was seen at first cannot be looked for."""
+        """Whether a joint map's frame is so uncertain that the first landmarks cannot be searched."""
         points = joint.held.by_kind()[0] if joint.ids.size else None
         if joint.old.frame is None or points is None or points.landmark.anchored:
             return False
@@ -287,13 +286,13 @@ class FeatureSensor(Sensor):
         return bool(self.camera.fx * np.sqrt(turn + shift / depth**2) > self._reach_px)
 
     def expected(self, joint: JointMap, names: np.ndarray) -> np.ndarray:
-        """Which old landmarks (K,) can be looked for, as far as the map is sure of their places."""
+        """Mask of the old landmarks (K,) whose predictions are precise enough to be searched."""
         if not self.is_unsure(joint):
             return np.ones(names.size, dtype=bool)
         return np.isin(names, joint.old.surely_near(self._reach_px / self.camera.fx))
 
     def amiss(self, belief: Belief, frame: FeatureFrame) -> np.ndarray:
-        """Which of a frame's features (K,) are of old sub-maps, and seen too far from where an unsure map has them."""
+        """Mask of a frame's features (K,) of old sub-maps that are observed too far from an uncertain map's prediction."""
         joint, amiss = belief.map, np.zeros(frame.landmarks.size, dtype=bool)
         assert isinstance(joint, JointMap)
         if not self.is_unsure(joint):
@@ -305,9 +304,9 @@ class FeatureSensor(Sensor):
         return amiss
 
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
-        """Turns features whose depth is known by now into points; starts one for every new name."""
+        """Promotes features of known depth to points; initialises one for every new name."""
         if self.noise is not None:
-            # Of points alone: a young ray is off by more than its covariance says, which is to first order.
+            # Of points alone: a young ray's error exceeds its covariance, which is of first order.
             for group in observed:
                 if group.model is self.point:
                     self.noise.learn_from(group, partial(belief.project, self.point))
@@ -328,7 +327,7 @@ class FeatureSensor(Sensor):
         return [NewLandmarks(z, cov, model, self.unknown_depth.landmark, ids=ids)]
 
     def project(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where features (K,) should be seen under all particles: which of them, means (k, 2), covariances (k, 2, 2)."""
+        """Predictions of features (K,) over all particles: rows of those in the map, means (k, 2), covariances (k, 2, 2)."""
         parts = []
         for model, chosen, ids in self.by_model(belief, names):
             mean, cov = belief.project(model, ids)
@@ -339,7 +338,7 @@ class FeatureSensor(Sensor):
     def innovations(
         self, belief: Belief, names: np.ndarray, px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of features (K,) found at px (K, 2), in the heaviest particle: which, ν (k, 2), H (k, 2, d), J P Jᵀ (k, 2, 2)."""
+        """For features (K,) matched at px (K, 2), in the heaviest particle: rows, ν (k, 2), H (k, 2, d), J P Jᵀ (k, 2, 2)."""
         parts = []
         for model, chosen, ids in self.by_model(belief, names):
             z = px[chosen].reshape(1, -1) if isinstance(model, MembersView) else px[chosen]
@@ -355,12 +354,12 @@ class FeatureSensor(Sensor):
         return belief.map.world(belief.state[mode, :7], mode)[0]
 
     def positions(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where features (K,) are in the heaviest particle's world: which of them, homogeneous points (k, 4)."""
+        """Positions of features (K,) in the heaviest particle's world: rows of those in the map, homogeneous points (k, 4)."""
         which, places = self.positions_in(belief, names, slice(belief.mode, belief.mode + 1))
         return which, places[0]
 
     def positions_in(self, belief: Belief, names: np.ndarray, particles: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Likewise in the worlds of some particles: which features, homogeneous points (n, k, 4)."""
+        """Likewise in the worlds of some particles: rows, homogeneous points (n, k, 4)."""
         n = belief.log_weights[particles].size
         which, out = [np.zeros(0, dtype=np.int64)], [np.zeros((n, 0, 4))]
         for model, chosen, ids in self.by_model(belief, names):
@@ -386,7 +385,7 @@ class FeatureSensor(Sensor):
     def extents(
         self, belief: Belief, names: np.ndarray, sigmas: float, min_weight: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of those features (K,) whose depth is not known: which, and where they may be (k, 2, 4): `UnknownDepth.extent`."""
+        """Of features (K,) of unknown depth: rows, and their extents (k, 2, 4), see `UnknownDepth.extent`."""
         ids = self._ids(belief, names, self.members(names))
         held = np.flatnonzero(ids >= 0)
         unknown = held[belief.map.are(ids[held], self.unknown_depth.landmark)]
@@ -405,7 +404,7 @@ class FeatureSensor(Sensor):
                 self.noise.remove(names)
 
     def _in_world(self, belief: Belief, position: np.ndarray, particles: slice) -> np.ndarray:
-        """Homogeneous points (n, k, 4) of some particles' frames, where states are, in their worlds."""
+        """Transforms homogeneous points (n, k, 4) from some particles' state frames to their worlds."""
         identity = SE3.identity((len(position),))
         world = belief.map.world(identity, particles)
         if world is identity:
@@ -415,20 +414,20 @@ class FeatureSensor(Sensor):
         return np.concatenate([SE3.transform(world[:, None], x) + (w - 1.0) * origin, w], axis=-1)
 
     def members(self, names: np.ndarray) -> np.ndarray:
-        """Number of features (K,) among the points of the constellation, −1 of others."""
+        """Indices of features (K,) in the constellation, −1 for others."""
         if self.group is None or not self.group.names.size:
             return np.full(names.size, -1)
         same = names[:, None] == self.group.names
         return np.where(same.any(axis=1), same.argmax(axis=1), -1)
 
     def _ids(self, belief: Belief, names: np.ndarray, members: np.ndarray) -> np.ndarray:
-        """Landmarks (K,) of features (K,), −1 where the map has none of their own; `members` are theirs."""
+        """Landmark ids (K,) of features (K,), −1 for those not in the map; `members` are their constellation indices."""
         return np.where((members < 0) & belief.map.holds(names), names, -1)
 
     def by_model(
         self, belief: Belief, names: np.ndarray
     ) -> list[tuple[CameraModel | MembersView, np.ndarray, np.ndarray]]:
-        """Features (K,) by how they are measured: the model, which of them, and the landmarks' ids."""
+        """Features (K,) grouped by observation model: the model, their rows, and the landmarks' ids."""
         member = self.members(names)
         ids = self._ids(belief, names, member)
         own = np.flatnonzero(ids >= 0)
@@ -449,7 +448,7 @@ class FeatureSensor(Sensor):
         return self.group.names[:1], MembersView(self.camera, members)
 
     def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
-        """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
+        """Depths of the points just observed, and of the known points in view, in the heaviest particle."""
         pose = belief.state[belief.mode][:7]
         seen = [np.zeros((0, 3))]
         for group in observed:

@@ -1,6 +1,6 @@
-"""The table of features: how each looks and from where it was seen, where it is now, and how often it was found.
+"""The table of features: appearance and viewpoint, current position, and search statistics of each.
 
-These facts do not differ between particles. A feature's number is its row here, in everything that a run reports.
+These are common to all particles. A feature's number is its row here, in all reports of a run.
 """
 
 from typing import final
@@ -13,12 +13,12 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import SearchConfig
 
-#: The patch that is kept of an appearance reaches this far from its centre: enough to be turned and shrunk.
+#: Half-width of a stored patch: large enough to be rotated and shrunk.
 PATCH_HALF_PX = 15
 PATCH_PX = 2 * PATCH_HALF_PX + 1
-#: Least inverse-depth weight of a homogeneous point for its patch to be placed in space: beyond, it is at infinity.
+#: Lower bound of a homogeneous point's weight for its patch; smaller ones are raised to it.
 MIN_WEIGHT = 1e-3
-ENOUGH_TRUSTED = 6  #: Trusted matches that determine the motion alone: three do, and half of them may be wrong.
+ENOUGH_TRUSTED = 6  #: Trusted matches that suffice to determine the motion: three do, and half of them may be wrong.
 _OFFSETS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 _COLUMNS = {
     "first_patch": grey("features", PATCH_PX, PATCH_PX),
@@ -39,22 +39,22 @@ _COLUMNS = {
 
 @final
 class FeatureTable:
-    """One row per feature ever started. Columns are views of the F rows in use."""
+    """One row per feature ever initialised. Columns are views of the F rows in use."""
 
-    first_patch: np.ndarray  #: (F, S, S) uint8 of its first appearance.
-    last_patch: np.ndarray  #: (F, S, S) uint8 of a later one, from where it looked different; else the first.
-    first_px: np.ndarray  #: (F, 2) where the first one was.
+    first_patch: np.ndarray  #: (F, S, S) uint8 first appearance.
+    last_patch: np.ndarray  #: (F, S, S) uint8 a later appearance under different viewing conditions; else the first.
+    first_px: np.ndarray  #: (F, 2) pixel of the first one.
     first_pose: np.ndarray  #: (F, 7) world_from_camera of the first one, in the heaviest particle's world.
     last_pose: np.ndarray  #: (F, 7) likewise of the later one.
     position: np.ndarray  #: (F, 4) homogeneous point in the heaviest particle's world, when it was last observed.
-    #: (F, 2, 3) what views say of its first patch's `slopes`: the sums of their information, and of that times the slope.
+    #: (F, 2, 3) information about its first patch's `slopes`: sums of information, and of information times slope.
     plane_information: np.ndarray
-    squared_parallax: np.ndarray  #: (F, 2) of these views: sum, and the greatest, see `parallax`.
-    attempts: np.ndarray  #: (F,) times looked for.
-    found: np.ndarray  #: (F,) times found.
-    missed: np.ndarray  #: (F,) times not found in a row.
-    alive: np.ndarray  #: (F,) whether the map still holds it.
-    member: np.ndarray  #: (F,) its number among the points of a known constellation, or −1.
+    squared_parallax: np.ndarray  #: (F, 2) sum and maximum over these views, see `parallax`.
+    attempts: np.ndarray  #: (F,) number of searches, the initialisation included.
+    found: np.ndarray  #: (F,) number of matches, the initialisation included.
+    missed: np.ndarray  #: (F,) consecutive misses.
+    alive: np.ndarray  #: (F,) whether it is still in the map.
+    member: np.ndarray  #: (F,) its index in a known constellation, or −1.
 
     def __init__(self) -> None:
         self._room: dict[str, np.ndarray] = {name: entry.empty() for name, entry in _COLUMNS.items()}
@@ -64,7 +64,7 @@ class FeatureTable:
         return len(self.alive)
 
     def add(self, patches: np.ndarray, px: np.ndarray, pose: np.ndarray, member: np.ndarray | int = -1) -> np.ndarray:
-        """Starts k features seen at px (k, 2) from poses (7,) or (k, 7), with patches (k, S, S); returns their rows."""
+        """Adds k features observed at px (k, 2) from poses (7,) or (k, 7), with patches (k, S, S); returns their rows."""
         first, count = len(self), len(self) + px.shape[0]
         room = len(self._room["alive"])
         if count > room:
@@ -81,27 +81,27 @@ class FeatureTable:
         return rows
 
     def count_search(self, rows: np.ndarray, found: np.ndarray) -> None:
-        """Counts an attempt to find features (k,), which were found or not (k,) bool."""
+        """Counts a search of features (k,), matched or not (k,) bool."""
         self.attempts[rows] += 1
         self.found[rows] += found
         self.missed[rows] = np.where(found, 0, self.missed[rows] + 1)
 
     def failing(self, rows: np.ndarray, config: SearchConfig) -> np.ndarray:
-        """Which features (k,) are not found too often."""
+        """Mask of the features (k,) that are missed too often."""
         missed_often = 1.0 - self.found[rows] / self.attempts[rows] > config.max_failure_ratio
         return np.asarray(missed_often & (self.attempts[rows] >= config.min_attempts))
 
     def found_fraction(self, rows: np.ndarray) -> np.ndarray:
-        """Fraction (k,) of attempts that find features (k,), as expected after those so far (P. Laplace)."""
+        """Success rate (k,) of searches of features (k,), by Laplace's rule of succession."""
         return np.asarray((self.found[rows] + 1.0) / (self.attempts[rows] + 2.0))
 
     def trusted(self, rows: np.ndarray, min_fraction: float) -> np.ndarray:
-        """Which features (k,) may say where the camera is, by their records; all of them where those are too few."""
+        """Mask of the features (k,) with a sufficient success rate to localise the camera; all if these are too few."""
         trusted = (self.member[rows] >= 0) | (self.found_fraction(rows) >= min_fraction)
         return trusted if trusted.sum() >= ENOUGH_TRUSTED else np.ones(rows.size, dtype=bool)
 
     def voting(self, rows: np.ndarray, min_fraction: float) -> np.ndarray:
-        """The trusted (k,) that were looked for since they began: they say how the camera moved. All, if these are few."""
+        """Mask of the trusted features (k,) searched since initialisation, to determine the motion; all trusted if few."""
         trusted = self.trusted(rows, min_fraction)
         known = trusted & ((self.member[rows] >= 0) | (self.attempts[rows] > 1))
         return known if known.sum() >= ENOUGH_TRUSTED else trusted
@@ -109,7 +109,7 @@ class FeatureTable:
     def nearest_appearance(
         self, rows: np.ndarray, position: np.ndarray, world_from_camera: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Patches (k, S, S) of features at points (k, 4) kept from nearest to a pose's direction, and from where (k, 7)."""
+        """Patches (k, S, S) stored closest to a pose's viewing direction of points (k, 4), and their poses (k, 7)."""
         first, last = self.first_pose[rows], self.last_pose[rows]
         of_first, of_last = (view_change(position, pose, world_from_camera)[0] for pose in (first, last))
         later = of_last > of_first
@@ -117,25 +117,25 @@ class FeatureTable:
         return patches, np.where(later[:, None], last, first)
 
     def slopes(self, rows: np.ndarray) -> np.ndarray:
-        """How the first patches of features (k,) lie in space, beside ones that face their camera: slopes (k, 2).
+        """Slopes (k, 2) of the first patches of features (k,), relative to patches that face their camera.
 
-        Of the logarithm of the inverse depth by normalised coordinates, which is linear in a plane; 1 is a plane at 45°,
-        and the prior's standard deviation. Of the noise that views compare half is the first patch's, the same in all of
-        them: n views say 2 n / (1 + n) times what one does.
+        A slope is the derivative of the logarithm of the inverse depth by normalised coordinates, constant in a plane; 1 is a
+        plane at 45°, and the prior's standard deviation. Half of the noise of a comparison is the first patch's, common to
+        all views: n views have the information of 2 n / (1 + n).
         """
         info, (total, greatest) = self.plane_information[rows], self.squared_parallax[rows].T
         info = 2.0 / (1.0 + total / np.maximum(greatest, np.finfo(float).tiny))[:, None, None] * info
         return np.asarray(np.linalg.solve(info[:, :, :2] + np.eye(2), info[:, :, 2:])[..., 0])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         return {f"features/{name}": getattr(self, name) for name in _COLUMNS}
 
     def restore(self, arrays: dict[str, np.ndarray], members: int) -> None:
         """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.checkpoint.read`."""
         self._room = read(arrays, _COLUMNS, "features/", members=members)
         if (np.linalg.eigvalsh(self._room["plane_information"][:, :, :2]) < -0.1).any():
-            raise InputError("features/plane_information: expected information that is not less than none")
+            raise InputError("features/plane_information: expected positive semi-definite information")
         self._use(len(self._room["alive"]))
 
     def _use(self, count: int) -> None:
@@ -152,14 +152,14 @@ def directions(position: np.ndarray, world_from_camera: np.ndarray) -> np.ndarra
 def patch_affines(
     camera: Pinhole, position: np.ndarray, first_pose: np.ndarray, world_from_camera: np.ndarray
 ) -> np.ndarray:
-    """∂(pixel in the patch's image)/∂(pixel now) (K, 2, 2) of patches that face the camera that saw them (E06 §4.1).
+    """∂(pixel in the patch's image)/∂(pixel now) (K, 2, 2) of patches that face their camera (E06 §4.1).
 
-    They are at homogeneous world points (K, 4), and were seen from poses (K, 7); now the camera is at (7,). `tilted` has
-    those of others.
+    Patches are at homogeneous world points (K, 4), observed from poses (K, 7); the current camera is at (7,). See `tilted`
+    for other orientations.
     """
     point = position[:, :3] / np.maximum(position[:, 3:], MIN_WEIGHT)
     normal = SE3.translation(first_pose) - point
-    # Four pixels around the feature are cast onto its patch's plane, and seen from the first camera.
+    # Four pixels around the feature are projected onto its patch's plane, and from there into the first camera.
     now = camera.project(directions(position, world_from_camera))
     uv = camera.unproject(now[:, None] + _OFFSETS)
     rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
@@ -184,8 +184,8 @@ def parallax(
 def tilted(affines: np.ndarray, along: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """`patch_affines` (K, 2, 2) of patches with slopes (K, 2), by the pixel of their images, whose parallax is (K, 2).
 
-    Of two planes through a point that is seen from two places one shifts the other's picture by the parallax times how
-    their inverse depths differ: A⁻¹ = A₀⁻¹ + e gᵀ, inverted by Sherman and Morrison.
+    Changing the plane through a point shifts the other view's image by the parallax times the change of inverse depth: A⁻¹ =
+    A₀⁻¹ + e gᵀ, inverted by Sherman and Morrison.
     """
     back, ahead = affines @ along[..., None], slope[:, None] @ affines
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,7 +193,7 @@ def tilted(affines: np.ndarray, along: np.ndarray, slope: np.ndarray) -> np.ndar
 
 
 def view_change(position: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """From two poses, (7,) or (K, 7), to points (K, 4): cosine (K,) of the lines of sight, ratio (K,) of distances."""
+    """Change of view between two poses, (7,) or (K, 7), of points (K, 4): cosine (K,) of the rays, ratio (K,) of distances."""
     one, other = (position[:, :3] - position[:, 3:] * SE3.translation(pose) for pose in (one_pose, other_pose))
     far, near = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Measures a frame: is its image usable; finds the map's features in it, judges them, and starts new ones at corners."""
+"""Measures a frame: checks the image, searches the map's features, manages them, and initialises new ones at corners."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -22,11 +22,11 @@ from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, FeatureTable, view_change
 
-#: Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped.
+#: Points of a known map that determine the pose; with fewer in view the camera has left the map, and nothing new is mapped.
 MIN_FIXED = 4
-MIN_CONTRAST = 10  #: Grey levels that are all nearer to each other are those of a lens cap.
-UNIFORM = 12  #: Grey levels between which all of a row or column of a bar are, whatever the compression left.
-MAX_REPEATS = 5  #: Times that an image may come again: drivers repeat single images when the camera is late.
+MIN_CONTRAST = 10  #: Range of grey levels below which the image is that of a lens cap.
+UNIFORM = 12  #: Range of grey levels of a row or column up to which it counts as uniform, despite compression.
+MAX_REPEATS = 5  #: Allowed repetitions of an image: drivers repeat single images when the camera is late.
 
 
 def no_features(stamp_ns: int = 0) -> FeatureFrame:
@@ -35,7 +35,7 @@ def no_features(stamp_ns: int = 0) -> FeatureFrame:
 
 
 def inside_bars(image: np.ndarray, border_px: int, within: np.ndarray | None) -> np.ndarray | None:
-    """What of a mask (H, W), or of everywhere, is so far from uniform bars at an image's edges (H, W), as of a letterbox."""
+    """A mask (H, W), or None for everywhere, reduced to pixels away from uniform bars (letterbox) at the image's edges."""
     if all(np.ptp(line) > UNIFORM for line in (image[0], image[-1], image[:, 0], image[:, -1])):
         return within
     inside = np.ones(image.shape, dtype=bool) if within is None else within.copy()
@@ -50,41 +50,41 @@ def inside_bars(image: np.ndarray, border_px: int, within: np.ndarray | None) ->
 
 @dataclass
 class Measurement:
-    """One image on its way through the filter's step: what the sensor is given, and what it has found."""
+    """One image in the filter's step: the sensor's input and its results."""
 
     stamp_ns: int  #: time of the image.
-    image: np.ndarray | None  #: (H, W) uint8; None where it cannot be used.
-    #: (M, 2) where the image shows the known points, in the run's first image; None in all others.
+    image: np.ndarray | None  #: (H, W) uint8; None if it is not usable.
+    #: (M, 2) pixels of the known points in the run's first image; None in all others.
     known_px: np.ndarray | None = None
-    #: the prior of the pose is a place that was recognised beyond doubt: less has to be found to confirm it.
+    #: the pose prior is from a certain relocalisation, which needs fewer matches to be confirmed.
     recognised: bool = False
-    starting: bool = False  #: the first frames are adjusted still, as depths are not known.
-    search: SearchResult = field(default_factory=SearchResult)  #: what was looked for.
-    #: features that the filter was given; none where too little agreed to be trusted.
+    starting: bool = False  #: the first frames are still being adjusted, as depths are unknown.
+    search: SearchResult = field(default_factory=SearchResult)  #: result of the search.
+    #: features used by the filter; none if too few agreed.
     used: FeatureFrame = field(default_factory=no_features)
-    started: FeatureFrame = field(default_factory=no_features)  #: features that were started after the step.
+    started: FeatureFrame = field(default_factory=no_features)  #: features initialised after the step.
     seconds_search: float = 0.0  #: time that the search took.
-    seconds_new_landmarks: float = 0.0  #: time of judging what was looked for and starting features.
+    seconds_new_landmarks: float = 0.0  #: time of feature management.
 
     @property
     def features(self) -> FeatureFrame:
-        """What was used, and what was started."""
+        """Features used, and features initialised."""
         pairs = ((getattr(self.used, name), getattr(self.started, name)) for name in ("landmarks", "z", "cov_z"))
         return FeatureFrame(self.stamp_ns, *map(np.concatenate, pairs))
 
 
-NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)  #: What a checkpoint holds where there was none.
+NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)  #: Placeholder in checkpoints for no image.
 
 
 def require_image(array: np.ndarray, camera: Pinhole) -> None:
-    """Refuses, by an InputError, an image of a checkpoint that is another camera's."""
+    """Raises InputError: an image of a checkpoint has another size than the camera's."""
     if array.size and array.shape != (camera.height, camera.width):
         raise InputError(f"an image has shape {array.shape}, the camera's is {camera.height, camera.width}")
 
 
 @final
 class ImageScreen(Kept):
-    """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen."""
+    """Rejects unusable images: wrong size or type, a lens cap, a frozen camera."""
 
     kept: ClassVar = {"_last": grey("", ""), "_repeats": integers(least=0), "_was_unusable": truths()}
     prefix = "screen/"
@@ -96,7 +96,7 @@ class ImageScreen(Kept):
         self._was_unusable = False
 
     def usable(self, image: np.ndarray | None) -> tuple[np.ndarray | None, str | None]:
-        """The next image, None where it cannot be used; and the reason, which is said of the first such image in a row."""
+        """The next image, or None if unusable; and the reason, only for the first such image in a row."""
         if image is None:
             return None, None
         wanted, found = (self.camera.height, self.camera.width), type(image).__name__
@@ -127,10 +127,10 @@ class ImageScreen(Kept):
 
 @final
 class ImageSensor(Sensor):
-    """Finds the features of the map in images, and new ones. It takes a `Measurement` and fills it in.
+    """Searches the map's features in images, and detects new ones. It takes a `Measurement` and completes it.
 
-    A feature's name is its row in `table`. The detector finds the corners that become features, and those by which a lost
-    camera is found; these the descriptor tells apart.
+    A feature's name is its row in `table`. The detector finds corners for new features and for relocalisation; the descriptor
+    distinguishes the latter.
     """
 
     def __init__(
@@ -147,22 +147,22 @@ class ImageSensor(Sensor):
         self.search = ActiveSearch(features, self.table, config, gate)
         self.detector = detector or CornerDetector()
         self.descriptor = descriptor or Sift(SiftConfig(working_scale=1.0, length=128))
-        self.bad_frames = 0  #: Frames in a row in which too little was found.
+        self.bad_frames = 0  #: Consecutive frames with too few matches.
         self._within = self.camera.field_of_view_mask(PATCH_HALF_PX + 1.0)
 
     @property
     def camera(self) -> Pinhole:
-        """Of the images, as far as it is known."""
+        """The camera, with its current self-calibration."""
         return self.features.camera
 
     @property
     def lost(self) -> bool:
-        """Whether the camera is not where the filter believes."""
+        """Whether tracking is lost."""
         return self.bad_frames >= self.config.lost_frames
 
     def begin(self, image: np.ndarray, known_px: np.ndarray, is_group: bool) -> None:
-        """Takes the known points from the first image, where they are at known_px (M, 2); is_group: as a constellation."""
-        padded = np.pad(image, PATCH_HALF_PX + 1, mode="edge")  # a known point may lie at the border
+        """Adds the known points from the first image, at known_px (M, 2); is_group: as a constellation."""
+        padded = np.pad(image, PATCH_HALF_PX + 1, mode="edge")  # known points may be at the border
         patches = [cut(padded, px + PATCH_HALF_PX + 1.0, PATCH_HALF_PX) for px in known_px]
         member = np.arange(known_px.shape[0]) if is_group else -1
         self.table.add(np.array(patches), known_px, SE3.identity(), member)
@@ -170,16 +170,16 @@ class ImageSensor(Sensor):
     def begin_lost(
         self, patches: np.ndarray, first_px: np.ndarray, first_pose: np.ndarray, positions: np.ndarray
     ) -> None:
-        """Takes the points (K, 3) of a known map; where in it the camera is has to be found out.
+        """Adds the points (K, 3) of a known map, in which the camera has to be localised.
 
-        They appeared first in patches (K, S, S) uint8 at first_px (K, 2), from first_pose (K, 7) world_from_camera.
+        Their first appearances are patches (K, S, S) uint8 at first_px (K, 2), from first_pose (K, 7) world_from_camera.
         """
         rows = self.table.add(patches, first_px, first_pose)
         self.table.position[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
         self.bad_frames = self.config.lost_frames
 
     def observe(self, frame: Measurement, belief: Belief) -> Sequence[Observations]:
-        """What is found of the features that should be seen."""
+        """Matches of the features in view."""
         started = time.perf_counter()
         if isinstance(belief.map, JointMap):
             self._follow_sub_maps(belief.map, self.features.pose(belief))
@@ -195,12 +195,12 @@ class ImageSensor(Sensor):
         else:
             self.bad_frames = 0 if frame.image is not None else self.bad_frames + 1
         frame.seconds_search = time.perf_counter() - started
-        # The constellation has been placed by the first image already.
+        # The constellation has already been initialised by the first image.
         is_placed = frame.known_px is not None and self.features.group is not None
         return [] if is_placed else self.observations(frame.used, belief)
 
     def observations(self, used: FeatureFrame, belief: Belief) -> list[Observations]:
-        """Of what was found; features that are not trusted only update the map, and a joint map not at all."""
+        """Observations of matches; untrusted features only update the map, and a joint map not at all."""
         trusted = self.table.trusted(used.landmarks, self.config.trusted_fraction)
         if trusted.all():
             return list(self.features.observe(used, belief))
@@ -213,7 +213,7 @@ class ImageSensor(Sensor):
     def new_landmarks(
         self, frame: Measurement, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Counts what was found, drops what fails, and starts features at corners where there is room."""
+        """Counts matches, drops failing features, and initialises features at corners where there is room."""
         started = time.perf_counter()
         rows, table, config = frame.search.features, self.table, self.config
         failing = np.zeros(0, dtype=np.int64)
@@ -240,7 +240,7 @@ class ImageSensor(Sensor):
         return new_landmarks
 
     def _follow_sub_maps(self, joint: JointMap, pose: np.ndarray) -> None:
-        """Looks for what a joint map holds; asks it for old points that should be in view from a pose (7,)."""
+        """Follows the features of a joint map; requests old points that should be in view from a pose (7,)."""
         table, held, most = self.table, joint.ids, joint.submap or 0
         table.alive[:] = False
         table.alive[held] = True
@@ -256,17 +256,17 @@ class ImageSensor(Sensor):
         joint.bring_back(rows[: max(min(most // 4, 2 * most - held.size), 0)])
 
     def resampled(self, belief: Belief, names: np.ndarray, first_pose: np.ndarray) -> None:
-        """Remembers where all features are, and from where (F, 7) on a new path those of names (F,) were seen first."""
+        """Stores the positions of all features, and the poses (F, 7) of first observation of names (F,) on a new path."""
         table = self.table
         if self.features.group is None:
             table.member[:] = -1
-        table.alive &= belief.map.holds(np.arange(len(table)))  # not those started in a frame that did not take part
+        table.alive &= belief.map.holds(np.arange(len(table)))  # not those initialised in a frame that was not adjusted
         table.first_pose[names] = table.last_pose[names] = first_pose
         table.last_patch[names] = table.first_patch[names]  # later appearances are from the old path
         self.place(belief, np.flatnonzero(table.alive))
 
     def move(self, new_from_old: np.ndarray) -> None:
-        """The world is another one (7,), or (F, 7) for each feature: where features are and were seen from."""
+        """Transforms positions and viewpoints of features to a new world (7,), or (F, 7) per feature."""
         table = self.table
         table.first_pose[:], table.last_pose[:] = (
             SE3.compose(new_from_old, poses) for poses in (table.first_pose, table.last_pose)
@@ -275,13 +275,13 @@ class ImageSensor(Sensor):
         table.position[:, :3] = SE3.transform(new_from_old, x) + (w - 1.0) * SE3.translation(new_from_old)
 
     def place(self, belief: Belief, rows: np.ndarray) -> None:
-        """Remembers where in the heaviest particle's world features are now."""
+        """Stores the current positions of features in the heaviest particle's world."""
         if rows.size:
             which, position = self.features.positions(belief, rows)
             self.table.position[rows[which]] = position
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         return self.table.arrays() | {
             "search/bad_frames": np.array(self.bad_frames),
             "search/is_fast": np.array(self.search.is_fast),
@@ -295,11 +295,11 @@ class ImageSensor(Sensor):
         self.search.is_fast = bool(read_one(arrays, "search/is_fast", truths()))
 
     def _too_little(self, search: SearchResult, recognised: bool) -> bool:
-        """Whether so little agrees that it may be chance. Once lost, more has to agree: the pose prior is wide.
+        """Whether the matches may be by chance. Once lost, more have to agree, as the pose prior is wide.
 
-        Only features whose whole ellipse was searched tell something then: in a larger one something alike is found by
-        chance, or what is there is missed. Of a place that was recognised beyond doubt it is enough that it can be
-        tracked: patches look different from there.
+        Then only features whose whole ellipse was searched are evidence: in a larger one similar features match by chance, or
+        the right one is missed. After a certain relocalisation it suffices that tracking continues, as patches look different
+        from there.
         """
         found, config = search.found, self.config
         if not found.size or (self.features.fixed and found.sum() < MIN_FIXED):
@@ -313,10 +313,10 @@ class ImageSensor(Sensor):
         return bool(found.sum() < max(least, fraction * found.size))
 
     def _keep_appearances(self, image: np.ndarray, used: FeatureFrame, pose: np.ndarray) -> None:
-        """Renews the last appearance of the features that look different by now.
+        """Renews the last appearance of features under changed viewing conditions.
 
-        How a patch lies in space is not known. One that is taken to face the camera that saw it first is alike to about
-        25° from there; a camera that was lost and comes from another side would not know it again.
+        A patch's orientation is unknown. If it is assumed to face the first camera, it is similar up to about 25° from there;
+        a lost camera that returns from another side would not recognise it.
         """
         rows, px = used.landmarks, used.z
         if not rows.size:
@@ -331,7 +331,7 @@ class ImageSensor(Sensor):
                 table.last_patch[rows[k]], table.last_pose[rows[k]] = patch, pose
 
     def _started(self, frame: Measurement, image: np.ndarray, pose: np.ndarray) -> FeatureFrame:
-        """New features at corners, where there is room in the image and in the number that is looked for."""
+        """New features at corners, if there is room in the image and in the number searched."""
         config, used, in_view = self.config, frame.used, frame.search.in_view
         room = config.measurements - used.landmarks.size
         if len(self.table) > used.landmarks.size:

@@ -1,10 +1,10 @@
-"""One camera on a joint map: the particles' own maps begin, and one Gaussian of map, pose and velocity goes on.
+"""One camera on a joint map: starts with per-particle maps, and continues with one Gaussian of map, pose and velocity.
 
-As long as the baseline is hardly known, what is seen depends on the product of baseline and depth, which is far from
-Gaussian: particles with maps of their own hold it. Once depths are known, all frames so far are adjusted in batch, with the
-camera if it calibrates itself, and the Gaussian about the optimum is the joint map: landmarks, pose, velocity and camera
-with what they have in common. It is begun anew as long as later frames tell much more. No particle of it forgets, for none
-has a past.
+While the baseline is uncertain, measurements depend on the product of baseline and depth, which is far from Gaussian:
+per-particle maps represent it. Once depths are known, all frames so far are adjusted in batch, with the camera for
+self-calibration, and the Gaussian at the optimum is the joint map: landmarks, pose, velocity and camera with their
+correlations. It is initialised again as long as later frames add much information. Its particles lose no information by
+resampling, as none has a past.
 """
 
 from collections.abc import Sequence
@@ -49,20 +49,20 @@ from rbpf.systems.mono.start.adjustment import (
 from rbpf.systems.mono.start.known import KnownStart
 from rbpf.systems.system import Revision
 
-LINEARISATIONS = 3  #: Of the proposal: moments of the samples hand on what a few weights cannot mend.
-#: Standard deviations: a linearisation after one that moved a mean by so much moves it by a hundredth of that.
+LINEARISATIONS = 3  #: Of the proposal: errors that a few weights cannot correct would persist in the moments.
+#: Standard deviations: after a linearisation that moved a mean by this, the next one moves it by a hundredth of it.
 SETTLED = 0.2
-JOINT = "joint/mean"  #: In the checkpoint of a filter on a joint map.
-#: Of the first frames, that take part in the hand-over's adjustment at most: it takes what they told from nothing else.
+JOINT = "joint/mean"  #: An array in every checkpoint of a filter on a joint map.
+#: Maximum number of first frames in the adjustment that starts the joint map, its only source of information.
 MAX_FRAMES = 150
-#: Of a camera that calibrates itself: constants beside the velocity (J. Civera et al. 2009).
+#: Number of self-calibration constants, added to the velocity in the substate (J. Civera et al. 2009).
 NUMBERS = "fx", "fy", "k1", "k2"
-KNOWN_FRACTION = 0.5  #: Of the features in view: so many depths are known when the map becomes a joint one.
+KNOWN_FRACTION = 0.5  #: Fraction of the features in view with known depth at which the joint map starts.
 
 
 @final
 class JointRays(InverseDepthRays):
-    """Rays with an inverse depth in a joint map, which holds where they were seen first: each is observed as it is."""
+    """Rays with an inverse depth in a joint map, which has their anchors: all use the full measurement."""
 
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool, held: bool
@@ -79,17 +79,17 @@ class JointRays(InverseDepthRays):
 
 @final
 class HandOver:
-    """Whether and when the map becomes a joint one, and the filter that goes on with it.
+    """Decides when the joint map starts, and creates its filter.
 
     Args:
         config: all settings.
-        camera: as it is given.
-        known: the known points, where there are some.
-        rays: how features are kept as long as their depth is not known.
-        fixed: whether the map was made before and is not changed; it is then never joint.
-        first: the frames so far, which are kept until the hand-over.
+        camera: the given camera.
+        known: the known points, or None.
+        rays: storage of features of unknown depth.
+        fixed: whether the map is a fixed known one, which is never joint.
+        first: the frames so far, kept until the joint map starts.
 
-    Raises InputError: a joint map is asked for that cannot be.
+    Raises InputError: a requested joint map is not possible.
     """
 
     def __init__(
@@ -107,19 +107,19 @@ class HandOver:
         if wanted and velocity != "marginal":
             raise InputError(f"a joint map holds the velocity: set velocity.mode=marginal, not {velocity}")
         self.config, self.camera, self.known, self.first = config, camera, known, first
-        self.joint: JointMap | None = None  #: The joint map; None as long as every particle has a map of its own.
+        self.joint: JointMap | None = None  #: The joint map; None while every particle has its own map.
         self._rays: JointRays | None = None
         self.noise: LearntNoise | None = None
         if wanted and config.noise != "stated":
-            # What a camera that is not known yet leaves of all innovations is not noise.
+            # With an uncertain calibration, common residuals are not noise.
             level = 0.0 if config.noise == "learnt" else RIGHT**2
             self.noise = LearntNoise(shared=True, right=np.inf if config.calibrate == "online" else level)
         if wanted:
             if not isinstance(rays, InverseDepthRays):
-                raise InputError(f"a joint map keeps features as rays with inverse depth, not as {type(rays).__name__}")
+                raise InputError(f"a joint map needs features as rays with inverse depth, not {type(rays).__name__}")
             self._rays = JointRays(rays.camera, rays.config)
-        self._settled = 0  # frames in a row in which depths were known
-        self._numbers = NUMBERS if config.calibrate == "online" else ()  # of the camera, that are estimated
+        self._settled = 0  # consecutive frames with known depths
+        self._numbers = NUMBERS if config.calibrate == "online" else ()  # of estimated camera constants
         if self._numbers and (self._rays is None or config.known != "frame"):
             raise InputError(
                 "calibrate=online holds the camera in a joint map that a run makes itself: leave out map=particles, lag, a "
@@ -128,15 +128,15 @@ class HandOver:
 
     @property
     def is_ahead(self) -> bool:
-        """Whether the map will become a joint one, or be begun anew: not what has left the frame for an old sub-map."""
+        """Whether the joint map will still start or restart; not once landmarks have moved to an old sub-map."""
         has_left = self.joint is not None and len(self.joint.old.maps) > 0
         return self._rays is not None and self._settled < self.config.settled_frames and not has_left
 
     def after_frame(self, filter_: Filter, sensor: ImageSensor, seen: FeatureFrame) -> Adjusted | None:
-        """Takes note of what a frame has shown that was tracked; the filter on the joint map, when it is time for it.
+        """To be called after a tracked frame; returns the filter on the joint map when it is due.
 
-        It is when depths are known. Where known points tell the baseline a first one begins before: each image alone leaves
-        two motions that look alike, and a few particles may all take the wrong one.
+        It is due once depths are known. If known points determine the baseline, a first one starts earlier: each image alone
+        leaves two similar motions, and a few particles may all take the wrong one.
         """
         if not self.is_ahead:
             return None
@@ -155,10 +155,10 @@ class HandOver:
     def become(
         self, sensor: ImageSensor, filter_: Filter, reverse: bool = False, if_known: bool = False
     ) -> Adjusted | None:
-        """The filter on a joint map, from an adjustment of the frames so far; None where they do not yet determine one.
+        """The filter on a joint map, from an adjustment of the frames so far; None if they do not determine one yet.
 
-        With `reverse` near and far exchanged are tried, too (`minima`). With `if_known`, half of the depths in view must be
-        known there; if not, the next adjustment starts from this one.
+        With `reverse` the depth-reversed solution is tried, too (`minima`). With `if_known`, half of the depths in view must
+        be known after it; if not, the next adjustment starts from this one.
         """
         assert self._rays is not None
         found = self._adjusted(filter_, sensor.features, reverse)
@@ -184,14 +184,14 @@ class HandOver:
     def _adjusted(
         self, filter_: Filter, features: FeatureSensor, reverse: bool = False
     ) -> tuple[np.ndarray, Window, Optimum] | None:
-        """Names (F,), what was seen of them, and the optimum downhill from the particles; None where there is none."""
+        """Names (F,), their observations, and the optimum reached from the particles; None if there is none."""
         belief, config, given = filter_.belief(), self.config, self.known
         found = gathered(self.first, features, belief, MAX_FRAMES, min_views=1)
         if found is None:
             return None
         _, names, seen, start = found
         if self.joint is not None and not seen.is_connected():
-            self._settled = config.settled_frames + 1  # what tied the frames to one another has left the map: it stays
+            self._settled = config.settled_frames + 1  # features that connect the frames have left the map: no restart
             return None
         if self._numbers:
             seen = replace(seen, camera=self.camera, tuning=np.linalg.inv(config.self_calibration.cov()))
@@ -202,31 +202,31 @@ class HandOver:
             seen = replace(seen, known=Known(at, given.positions[row], whitener))
             world_from_first = KnownStart.from_frame(self.camera, given, self.first.seen[0]).world_from_camera
             start = replace(start, frame=SE3.inverse(world_from_first))
-            # As the rays of the particles: the scene is about as far away as the known points.
+            # As for the particles' rays: the scene has about the depth of the known points.
             assert self._rays is not None
             away = np.linalg.norm(SE3.inverse_transform(world_from_first, given.positions[row]), axis=1)
             mean, std = self._rays.prior(away)
             config = replace(config, inverse_depth=replace(config.inverse_depth, mean_per_m=mean, std_per_m=std))
         best = min(minima(seen, config, start, reverse), key=lambda each: each.cost, default=None)
         if best is not None and self.noise is not None:
-            # That noise is less than stated the first frames do not tell: errors grow as the view changes.
+            # The first frames cannot show that the noise is smaller than stated, as errors grow with the change of view.
             noise_px = residual_px(seen, config, best)
             is_noisier = (noise_px / seen.noise_px) ** 2 > max(RIGHT**2, self.noise.right)
-            # What an attempt before this one found, from which nothing began, is forgotten: no checkpoint has it.
+            # The result of an earlier unsuccessful attempt is discarded, as checkpoints do not have it.
             self.noise.expect((noise_px / seen.noise_px) ** 2 if is_noisier else 1.0)
             if is_noisier:
                 best = optimum(replace(seen, noise_px=noise_px), config, best.structure)
         return None if best is None else (names, seen, best)
 
     def tune(self, filter_: Filter, sensor: ImageSensor) -> None:
-        """The camera is taken to be what it is on the average of the particles; nothing is done to one that is given."""
+        """Sets the camera to the particles' mean calibration; without self-calibration it is unchanged."""
         substate = None if self.joint is None else self.joint.driving()
         if self._numbers and substate is not None:
             about = filter_.particles.weights @ substate
             sensor.features.tune(self.camera.tuned(about[6:]), about)
 
     def calibration(self, filter_: Filter) -> tuple[Pinhole, np.ndarray] | None:
-        """The camera as it is estimated, and standard deviations (4,) of log fx, log fy, k1 and k2; None: it is given."""
+        """The estimated camera, and standard deviations (4,) of log fx, log fy, k1 and k2; None without self-calibration."""
         if not self._numbers or self.joint is None:
             return None
         mean, cov = self.joint.moments(filter_.particles, Part.SUBSTATE)
@@ -234,19 +234,19 @@ class HandOver:
         return (self.camera.tuned(mean[6:]), std) if std.all() else None
 
     def taken_up(self, checkpoint: Path, sensor: ImageSensor, rng: np.random.Generator) -> Filter | None:
-        """The filter that a checkpoint is of, if it was saved on a joint map; errors as `load_arrays`."""
+        """The filter for a checkpoint that was saved with a joint map, else None; errors as of `load_arrays`."""
         if self._rays is None or self.joint is not None or not load_arrays(checkpoint, JOINT):
             return None
         return self._use(self._new_filter(self._rays, sensor, rng), self._rays, sensor)
 
     def hold(self, filter_: Filter, lost: bool) -> None:
-        """The joint map's frame stays where it is while the camera is lost."""
+        """Keeps the joint map's frame fixed while the camera is lost."""
         due = filter_.consolidation
         if due is not None and due.held != lost:
             filter_.consolidation = replace(due, held=lost)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         learnt = {} if self.noise is None or self.joint is None else self.noise.arrays()
         return {} if self._rays is None else {"mono/settled": np.array(self._settled), **learnt}
 
@@ -258,7 +258,7 @@ class HandOver:
             self.noise.restore(arrays)
 
     def _new_filter(self, rays: JointRays, sensor: ImageSensor, rng: np.random.Generator) -> Filter:
-        """On a joint map that holds nothing yet; the parametrisations are named in it."""
+        """A filter on an empty joint map with registered parametrisations."""
         config = self.config
         constants = len(self._numbers)
         variances = np.pad(config.velocity.start_std() ** 2, (0, constants))
@@ -281,9 +281,9 @@ class HandOver:
         return filter_
 
     def _begin(self, new: Filter, names: np.ndarray, seen: Window, best: Optimum) -> Revision:
-        """Gives a filter on an empty joint map the Gaussian about an optimum of features (F,); the path of all frames there.
+        """Initialises a filter's joint map with the Gaussian at an optimum of features (F,); returns the revised path.
 
-        The frame is the last camera. What is known well enough is a point in it, all else a ray from there.
+        The map's frame is the last camera. Features of known depth become points in it, others rays from there.
         """
         joint, config = self.joint, self.config
         assert joint is not None and self._rays is not None
@@ -292,20 +292,20 @@ class HandOver:
         size, end = len(cov), free + 3 * count
         of_pose = [np.eye(6, size, 6 * (t - 1)) if t else np.zeros((6, size)) for t in range(len(at.path))]
 
-        # The poses in the world, which the known points' frame is or the first camera.
+        # The poses in the world: the known points' frame, or the first camera.
         world, by_world = at.path, np.array(of_pose)
         if at.frame is not None:
             world = SE3.between(at.frame, at.path)
             by_world[:, :, -6:] -= SE3.adjoint(SE3.inverse(world))
 
-        # The velocity: the mean one between the last two frames, and its walk since.
+        # The velocity: the mean between the last two frames, and its random walk since.
         seconds = 1e-9 * float(times[-1] - times[-2])
         relative = SE3.between(at.path[-2], at.path[-1])
         moved = SE3.log(relative)
         apart = of_pose[-1] - SE3.adjoint(SE3.inverse(relative)) @ of_pose[-2]
         by_velocity = SE3.right_jacobian_inverse(moved) @ apart / seconds
 
-        # Rays (u, v, q) from the last camera, and points: of directions c = Rᵀ(d − q t).
+        # Rays (u, v, q) from the last camera, and points, from directions c = Rᵀ(d − q t).
         pose, q = at.path[-1], at.inverse
         back = SE3.rotation(pose).T
         c = SE3.inverse_transform(pose, at.direction + (1.0 - q[:, None]) * SE3.translation(pose))

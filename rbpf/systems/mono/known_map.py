@@ -1,4 +1,4 @@
-"""The map of a run: as Gaussians, for reports; and as a place in which later runs find their camera, with its file."""
+"""The map of a run: as Gaussians, for reports; and as a file in which later runs localise their camera."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -25,12 +25,12 @@ from rbpf.systems.system import Gauge
 
 NAME = "known_map.npz"
 VERSION = 1
-LEAST = 8  #: Points that a map must hold for a camera to be found in it.
+LEAST = 8  #: Least number of points of a map for localisation.
 MOST_BYTES = 1 << 30
-MAX_VIEWS = 16  #: Poses that are kept, to look from at a camera of which nothing is known.
-#: The part of a ray that is drawn: this far to either side of its mean inverse depth, in standard deviations.
+MAX_VIEWS = 16  #: Maximum number of stored viewpoints for localisation without a prior.
+#: Extent of a drawn ray around its mean inverse depth, in standard deviations.
 RAY_SIGMAS = 2.0
-#: How far the focal lengths of two cameras may differ for one to recognise what the other has seen.
+#: Tolerance of the focal length for localisation in another camera's map.
 FOCAL_FRACTION = 0.02
 _SCHEMA = {
     "camera": numbers(10),
@@ -51,19 +51,19 @@ _GAUGES: dict[str, Gauge] = {"none": "none", "rigid": "rigid", "similarity": "si
 class KnownMap:
     """K points of a finished run, in its world."""
 
-    camera: Pinhole  #: that saw them.
-    alignment: Gauge  #: what the world has in common with the ground truth's.
+    camera: Pinhole  #: that observed them.
+    alignment: Gauge  #: relation of its world to that of the ground truth.
     names: np.ndarray  #: (K,) int64.
     positions: np.ndarray  #: (K, 3).
     cov: np.ndarray  #: (K, 3, 3) of them, within + between particles.
     windows: np.ndarray  #: (K, S, S) uint8 around the first observations.
-    first_px: np.ndarray  #: (K, 2) where those were.
+    first_px: np.ndarray  #: (K, 2) pixels of those.
     first_pose: np.ndarray  #: (K, 7) world_from_camera then.
-    views: np.ndarray  #: (V, 7) world_from_camera of the run, far from each other.
+    views: np.ndarray  #: (V, 7) world_from_camera of the run, distant from each other.
 
     @property
     def points(self) -> KnownPoints:
-        """The points under the numbers of their rows, which are their names in a run that is localised."""
+        """The points named by their rows, as in a localised run."""
         return KnownPoints(np.arange(self.names.size), self.positions, self.cov)
 
     @property
@@ -73,7 +73,7 @@ class KnownMap:
         return 0.5 * float(np.linalg.norm(np.ptp(places, axis=0)))
 
     def require_camera(self, camera: Pinhole) -> None:
-        """Refuses, by an InputError, another camera than the map's: size, focal length or kind of lens differ."""
+        """Raises InputError: the camera's image size, focal length or lens differs from the map's."""
         mine = self.camera
         if mine.distortion_model != camera.distortion_model:
             raise InputError(
@@ -90,11 +90,11 @@ class KnownMap:
 
 
 def known_map_arrays(found: KnownMap) -> dict[str, np.ndarray]:
-    """What the file holds."""
+    """The arrays of the file."""
     named = ("camera", "alignment")
     arrays = {item.name: getattr(found, item.name) for item in fields(KnownMap) if item.name not in named}
     camera = found.camera
-    # The kind of lens is named for a fisheye camera alone: files of others are as they were before there was one.
+    # Only fisheye cameras store their lens, so that files of other cameras keep their format.
     params = camera.params if camera.lens.kind != RadialTangential.kind else camera.params[:-1]
     return {
         "version": np.array(VERSION),
@@ -147,7 +147,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
     """Every landmark of a filter's map, in the order of their names, with the column `ray`.
 
     A ray is linearised at its mean inverse depth; its ends are those in the heaviest particle. `world` is the reported world
-    in each particle's own; None where they are one.
+    in each particle's own; None if they are identical.
     """
     belief = filter_.belief()
     held, n = belief.map, belief.weights.size
@@ -180,7 +180,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
 
 
 def distant_views(positions: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (V, 7) of (T, 7) that are far from each other: a turn by a radian is as far as the depth of points (K, 3)."""
+    """Poses (V, 7) of (T, 7) by farthest-point sampling; a rotation of one radian counts as the depth of points (K, 3)."""
     centre = poses[:, 4:].mean(axis=0)
     depth = float(np.linalg.norm(positions - centre, axis=1).mean()) if len(positions) else 1.0
     ahead = SE3.rotation(poses) @ np.array([0.0, 0.0, 1.0])

@@ -1,12 +1,11 @@
-"""Has the camera been here before? Old sub-maps are recognised by appearance, and judged by evidence.
+"""Place recognition and loop closure: old sub-maps are recognised by appearance, and verified by evidence.
 
-What is expected in view is looked for (`ImageSensor`). A camera that is lost, or so unsure of its place that nothing can
-be expected, asks the old sub-maps: corners of the image vote for those whose landmarks look like them, and the camera is
-looked for in the best ones as in any map (`Relocaliser`). What comes out is a hypothesis: this is the same place, seen
-from a pose that the joint map thinks possible. There are two others: the matches are chance; or another place looks
-alike, which may be anywhere. They are weighed by the likelihood of all matches, Mathematics (same-place), and a loop is
-closed once it is sure. Until then the camera waits for a better view: an old map loses nothing by waiting, and a wrong loop
-cannot be taken back.
+Features predicted in view are searched (`ImageSensor`). A camera that is lost, or too uncertain for predictions, queries the
+old sub-maps: corners of the image vote for those with similar landmarks, and the camera is relocalised in the best ones
+(`Relocaliser`). The result is a hypothesis: this is the same place, seen from a pose that is plausible for the joint map. The
+alternatives are that the matches are chance, or that another, similar place anywhere is seen. The likelihood of all matches
+decides, Mathematics (same-place), and a loop is closed once it is certain. Until then the camera waits for a better view:
+waiting costs nothing, whereas a wrong loop closure cannot be undone.
 """
 
 from typing import NamedTuple, final
@@ -28,29 +27,29 @@ from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.relocalisation import CORNER_PX, MIN_FITTED, SCALES, Attempt, Relocaliser, Sighting
 
-WRONG = 0.5  #: Matches that are wrong by what is expected beforehand, as a fraction, and may be anywhere in the image.
-BEFORE = 1e-3  #: Probability, when it is asked, that an old sub-map is in view; with the rest the matches are chance.
-ALIKE = 0.01  #: Probability that another place looks like it, somewhere in a world as large as the map.
-#: Probability of its being another place at which a loop is closed; of a camera that is lost, which has less to lose.
+WRONG = 0.5  #: Prior fraction of wrong matches, which may be anywhere in the image.
+BEFORE = 1e-3  #: Prior probability that an old sub-map is in view; otherwise matches are by chance.
+ALIKE = 0.01  #: Prior probability that another place looks like it, somewhere in a world as large as the map.
+#: Risk of another place at which a loop is closed; and for a lost camera, which has less to lose.
 RISK, RISK_LOST = 1e-3, 5e-2
-FURTHER = 3.0  #: Times the standard deviation of how far a lost camera has gone: some are thrown.
-ASKED = 2  #: Old sub-maps that are asked in a frame.
-VOTERS = 150  #: Corners of an image that say which ones.
-EXACT = 1e-4  #: Standard deviation [rad, m] of where a lost camera is in a sub-map that begins where it is.
+FURTHER = 3.0  #: Factor on the standard deviation of a lost camera's motion, as it may have been moved quickly.
+ASKED = 2  #: Old sub-maps queried per frame.
+VOTERS = 150  #: Corners of an image that vote for them.
+EXACT = 1e-4  #: Standard deviation [rad, m] of a lost camera's pose in a sub-map that starts there.
 ROUNDS = 8
-#: Standard deviation of the range of what a single image shows, which has none, as a fraction of what is assumed.
+#: Standard deviation of ranges assumed for a single image, as a fraction of them.
 DEPTH_RATIO = 10.0
 
 
 class Place(NamedTuple):
-    """A sub-map of landmarks alone, and where its end is."""
+    """A sub-map's landmarks, and the pose of its end."""
 
     world_from_place: np.ndarray
     held: SubMap
 
     @classmethod
     def of(cls, joint: JointMap, number: int | None = None) -> "Place":
-        """The old one of this number, or the present one, whose end is the frame."""
+        """The old sub-map of this number, or the current one, whose end is the frame."""
         if number is None:
             held, pose = joint.finished(), joint.world(SE3.identity((1,)), slice(1))[0]
         else:
@@ -58,7 +57,7 @@ class Place(NamedTuple):
         return cls(pose, held.of(np.flatnonzero(held.ids >= 0)))
 
     def at(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (M, 3), as seen from the end, and covariances (M, 3, 3) of landmarks (M,)."""
+        """Points (M, 3), relative to the end, and covariances (M, 3, 3) of landmarks (M,)."""
         rows = self.held.rows(names)
         columns = SE3.dim + 3 * rows[:, None] + np.arange(3)
         return self.held.points[rows], self.held.cov[columns[:, :, None], columns[:, None]]
@@ -67,10 +66,10 @@ class Place(NamedTuple):
 def log_likelihood(
     camera: Pinhole, pose: np.ndarray, points: np.ndarray, cov: np.ndarray, px: np.ndarray, prior: Estimate | None
 ) -> tuple[float, np.ndarray]:
-    """Log p(px | place) less that of chance, where px (M, 2) may show points (M, 3) of covariance (M, 3, 3); Laplace's.
+    """Log p(px | place) − log p(px | chance) of matches px (M, 2) with points (M, 3), covariance (M, 3, 3), by Laplace.
 
-    The pose (7,) of the camera among the points is integrated over its prior, from a first guess on; without a prior over a
-    density of 1. Returns the mode (7,), too. Mathematics (same-place).
+    The pose (7,) of the camera relative to the points is integrated over its prior, starting from a first guess; without a
+    prior over a density of 1. Also returns the mode (7,). Mathematics (same-place).
     """
     area = float(camera.width * camera.height)
     known = np.zeros((6, 6)) if prior is None else gaussian.inverse(prior.cov)
@@ -110,13 +109,13 @@ def log_odds(
     prior: Estimate,
     size_m: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """Of being where the points (M, 3) are, against being elsewhere; and the most probable pose (7,) among them if so.
+    """Log-odds of being at the points (M, 3), against being elsewhere; and the most probable pose (7,) if so.
 
-    Arguments as `log_likelihood`. Another place that looks alike may be anywhere in a map of this size (3,), however turned.
+    Arguments as of `log_likelihood`. A similar place may be anywhere in a map of this size (3,), at any orientation.
     """
     same, mode = log_likelihood(camera, pose, points, cov, px, prior)
     alike = log_likelihood(camera, pose, points, cov, px, None)[0]
-    # It is nowhere more probable than this place is at best, as it would be were the camera's pose hardly known.
+    # Its uniform pose density is limited to the peak density of the prior.
     peak = -0.5 * np.linalg.slogdet(2.0 * np.pi * prior.cov)[1]
     alike += min(peak, -np.log(8.0 * np.pi**2 * np.prod(size_m))) + np.log(ALIKE)
     return same - float(np.logaddexp(alike, -np.log(BEFORE))), mode
@@ -124,18 +123,18 @@ def log_odds(
 
 @final
 class PlaceRecognition:
-    """Asks the old sub-maps of a joint map where the camera is."""
+    """Localises the camera in the old sub-maps of a joint map."""
 
     def __init__(self, relocaliser: Relocaliser, config: MonoConfig) -> None:
         self.relocaliser, self.sensor, self.config = relocaliser, relocaliser.sensor, config.relocalisation
         self._std_velocity = config.velocity.start_std()
         self.features = self.sensor.features
-        self._described: dict[int, np.ndarray] = {}  # by row: how a landmark looked at first
+        self._described: dict[int, np.ndarray] = {}  # by row: descriptor of a landmark's first appearance
 
     def come_back(self, filter_: Filter, joint: JointMap, image: np.ndarray | None, seen: FeatureFrame) -> bool:
-        """Closes a loop if a tracked camera that does not know where to look is where it has been.
+        """Closes a loop if a tracked camera of uncertain pose has returned to a known place.
 
-        The image (H, W) is asked every so many frames, or, without one, the names of features that were seen.
+        It uses the image (H, W) every few frames, or without one the names of observed features.
         """
         if not joint.old.maps or not self.features.is_unsure(joint):
             return False
@@ -147,17 +146,17 @@ class PlaceRecognition:
         else:
             found = [
                 (number, self._look(filter_, joint, image, number))
-                for number in self._ask(joint, image)
+                for number in self._vote(joint, image)
                 if np.isin(seen.landmarks, joint.old.maps[number].ids).sum() < MIN_FITTED
             ]
         for number, sighting in found:
-            # Evidence alone is not asked of fewer than what a relocalisation takes: its own errors grow as matches get few.
+            # A minimum number of matches is required besides, as the evidence is unreliable with few.
             if sighting is None or (image is not None and len(sighting.agreeing[0]) < self.config.min_inliers):
                 continue
             filter_.consolidate()
             prior = joint.old.relative(number, joint.finished())
-            # Names are believed.
-            again = self._judged(joint, Place.of(joint, number), sighting, prior, 1.0 if image is None else RISK)
+            # Names are taken as certain.
+            again = self._verified(joint, Place.of(joint, number), sighting, prior, 1.0 if image is None else RISK)
             if again is not None:
                 self._close(joint, again, tied=True)
                 return True
@@ -166,23 +165,25 @@ class PlaceRecognition:
     def relocalise(
         self, filter_: Filter, joint: JointMap, image: np.ndarray, attempt: Attempt, lost: Estimate
     ) -> tuple[bool, PosePrior | None]:
-        """Whether a lost camera is recognised, and its pose where that is in an old sub-map, from which another one begins.
+        """Whether a lost camera is relocalised in an old sub-map, at which a new sub-map then starts; and its pose.
 
-        An attempt was made to find it in the present one; `lost` says where it may be.
+        Relocalisation in the current one has been tried before; `lost` has the pose prior.
         """
         if attempt.prior is not None and attempt.sighting is not None:
             present = Place.of(joint)
             prior = Estimate(SE3.between(present.world_from_place, lost.mean), FURTHER**2 * lost.cov)
             return self._odds(joint, present, attempt.sighting, prior)[0] >= -np.log(RISK_LOST), None
-        # In an old sub-map, perhaps: then another one begins there.
+        # Try old sub-maps; on success a new sub-map starts there.
         y = SE3.between(joint.world(SE3.identity((1,)), slice(1))[0], lost.mean)
-        for number in self._ask(joint, image) if joint.old.maps else []:
+        for number in self._vote(joint, image) if joint.old.maps else []:
             sighting = self._look(filter_, joint, image, number)
             if sighting is None:
                 continue
             frame, turn = joint.old.relative(number, joint.finished()), SE3.adjoint(SE3.inverse(y))
             prior = Estimate(SE3.compose(frame.mean, y), turn @ frame.cov @ turn.T + FURTHER**2 * lost.cov)
-            again = self._judged(joint, Place.of(joint, number), sighting, prior, RISK_LOST, self.config.std_inflation)
+            again = self._verified(
+                joint, Place.of(joint, number), sighting, prior, RISK_LOST, self.config.std_inflation
+            )
             if again is not None:
                 joint.consolidate(Particles(SE3.identity((filter_.n,)), filter_.particles.log_weights))
                 self._close(joint, again, tied=False)
@@ -192,12 +193,12 @@ class PlaceRecognition:
         return False, None
 
     def _close(self, joint: JointMap, again: Given, tied: bool) -> None:
-        """Closes the loop; how features looked from where goes with the sub-map that they are of, or with the frame."""
+        """Closes the loop; viewpoints of features move with their sub-map, or with the frame."""
         old, table = joint.old, self.sensor.table
         before, frame = np.array(old.starts), joint.world(SE3.identity((joint.n,)))[0]
         rows, numbers = old.latest()
         joint.recognise(again, tied)
-        # The sub-map that was the present one ends at the frame.
+        # The previous sub-map ends at the frame.
         moved = SE3.compose(
             np.array(old.starts)[1 : len(before) + 1], SE3.inverse(np.append(before[1:], frame[None], axis=0))
         )
@@ -207,7 +208,7 @@ class PlaceRecognition:
             self.sensor.move(moved[of_row])
 
     def _named(self, filter_: Filter, joint: JointMap, seen: FeatureFrame) -> tuple[int, Sighting | None]:
-        """Features that carry names say where they are seen from: the old sub-map that has most of them."""
+        """Localises by named features in the old sub-map with most of them."""
         number = int(np.argmax([np.isin(seen.landmarks, held.ids).sum() for held in joint.old.maps]))
         place = Place.of(joint, number)
         rows = np.flatnonzero(np.isin(seen.landmarks, place.held.ids))
@@ -224,15 +225,15 @@ class PlaceRecognition:
         return number, Sighting(found.world_from_camera, (names, px), agreeing, std)
 
     def _look(self, filter_: Filter, joint: JointMap, image: np.ndarray, number: int) -> Sighting | None:
-        """Where the image was taken if it shows an old sub-map, seen from where that ended."""
+        """The image's pose relative to the end of an old sub-map, if it shows it."""
         place = Place.of(joint, number)
         among = place.held.ids, SE3.transform(place.world_from_place, place.held.points)
         return self.relocaliser.find(filter_.belief(), image, place.world_from_place, None, among).sighting
 
-    def _ask(self, joint: JointMap, image: np.ndarray) -> np.ndarray:
-        """Numbers of the old sub-maps that an image looks like, the best first.
+    def _vote(self, joint: JointMap, image: np.ndarray) -> np.ndarray:
+        """Numbers of the old sub-maps similar to an image, the best first.
 
-        Each corner votes for the one that has the landmark most like it, by how much more alike that is than any of
+        Each corner votes for the one with the most similar landmark, weighted by the difference to the best landmark of
         another sub-map (local naive Bayes nearest neighbours, CVPR 2012).
         """
         rows, numbers = joint.old.latest()
@@ -251,22 +252,22 @@ class PlaceRecognition:
         return np.argsort(-np.bincount(best, top[1] - top[0], len(alike)), kind="stable")[:ASKED]
 
     def _odds(self, joint: JointMap, place: Place, sighting: Sighting, prior: Estimate) -> tuple[float, np.ndarray]:
-        """`log_odds` of a place where the image was sighted, and the pose (7,) in it."""
+        """`log_odds` of a place given a sighting, and the pose (7,) in it."""
         held = np.isin(sighting.matches[0], place.held.ids)
         names, px = (each[held] for each in sighting.matches)
         pose = SE3.between(place.world_from_place, sighting.world_from_camera)
         every = np.concatenate([joint.old.places()[1], SE3.transform(place.world_from_place, place.held.points)])
         return log_odds(self.features.camera, pose, *place.at(names), px, prior, np.ptp(every, axis=0))
 
-    def _judged(
+    def _verified(
         self, joint: JointMap, place: Place, sighting: Sighting, prior: Estimate, risk: float, wider: float = 1.0
     ) -> Given | None:
-        """What is seen of an old sub-map's landmarks from the camera, if it is that place but for a risk."""
+        """The sighting of an old sub-map's landmarks relative to the camera, if it is that place up to a risk."""
         odds, pose = self._odds(joint, place, sighting, prior)
         names, px = (each[~joint.holds(sighting.agreeing[0])] for each in sighting.agreeing)
         if names.size < MIN_FITTED or (risk < 1.0 and odds < -np.log(risk)):
             return None
-        # As far away as the place says, in the direction in which it is seen: how far a single image does not tell.
+        # Ranges are those of the place, directions those of the image, as a single image has no range.
         seen = SE3.inverse_transform(pose, place.at(names)[0])
         jac = self.features.camera.jacobian(seen) / (wider * sighting.noise_px)
         along = seen / (DEPTH_RATIO * np.square(seen).sum(axis=1, keepdims=True))

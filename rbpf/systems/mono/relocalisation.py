@@ -1,9 +1,9 @@
-"""Tracking loss: the pose prior while the camera is lost, and how it is found in the map again.
+"""Tracking loss: the pose prior while the camera is lost, and relocalisation in the map.
 
-A lost camera stays at its last trusted pose, more uncertain with time. In each image it is looked for in the map, without
-a prediction: corners of the image are matched with the map's features by descriptors, triples of matches give poses
-(P3P), and one is believed when enough features agree with it. The last image before the loss helps: hundreds of its
-corners say how the camera has turned since and in which direction it went.
+A lost camera stays at its last trusted pose, with growing uncertainty. In each image it is relocalised without a prediction:
+corners of the image are matched with the map's features by descriptors, triples of matches give poses (P3P), and one is
+accepted if it has enough inliers. The last image before the loss helps: hundreds of its corners give the rotation since then
+and the direction of the translation.
 """
 
 from collections.abc import Mapping
@@ -36,56 +36,56 @@ from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, patch_affines
 from rbpf.systems.mono.image_sensor import NO_IMAGE, ImageSensor, require_image
 
-VIEWS_PER_FRAME = 2  #: Views of a known map from which a lost camera is looked for in a frame, in turn.
-BORDER_PX = 16.0  #: No corner is nearer to the border.
-#: Sizes at which the lost image is described, times that at which features are seen from the last trusted pose.
+VIEWS_PER_FRAME = 2  #: Viewpoints of a known map tried per frame for a lost camera, in turn.
+BORDER_PX = 16.0  #: Least distance of corners from the border.
+#: Scales at which the lost image is described, relative to features seen from the last trusted pose.
 SCALES = (0.7, 1.0, 1.4)
-MIN_PATCH_SCALE, MAX_PATCH_SCALE = 0.4, 1.2  #: A patch that was kept is described at these sizes.
-#: Of the descriptors of one thing, seen from places that are not too different: half of all others are further.
+MIN_PATCH_SCALE, MAX_PATCH_SCALE = 0.4, 1.2  #: Range of scales at which a stored patch is described.
+#: Largest distance of matching descriptors under similar views: half of all others are farther.
 MAX_DISTANCE = 0.65
-#: Features this near to each other, in distances from the camera, may be one: they are no rivals of each other.
+#: Features this close, relative to their depth, may be identical and are not rivals in the ratio test.
 SAME_POINT = 0.05
-SAME_CORNER = 1.5  #: Corners this near to each other, in least distances of corners, may show one thing.
-#: How well a corner is found again, per axis; the least correlation of a patch that says it better.
+SAME_CORNER = 1.5  #: Corners this close, in units of their least spacing, may show the same point.
+#: Standard deviation of a re-detected corner, per axis; least correlation of a patch that refines it.
 CORNER_PX, MIN_CORRELATION = 2.0, 0.5
-MIN_FITTED = 3  #: Landmarks that determine where another particle's world is.
-MAX_ROUNDS = 10  #: Of a pose's refinement on what is seen around it.
-#: Of corners of the last view: correlation of a patch that says better where it is, and how well.
+MIN_FITTED = 3  #: Landmarks that determine the pose of another particle's world.
+MAX_ROUNDS = 10  #: Maximum rounds of refining a pose on matches around its projections.
+#: For corners of the last view: least correlation of a patch that refines it, and its standard deviation.
 VIEW_CORRELATION, VIEW_PX = 0.8, 0.7
-VIEW_DEPTH_RATIO = 0.5  #: Standard deviation of a corner's depth, as a fraction of that of the features around.
-VIEW_RATIO = 0.8  #: A corner's distance from its best match is below this fraction of that from the next (D. Lowe).
-VIEW_SAME_PX = 9.0  #: Corners of another image this near to each other may show one thing.
-MIN_VIEW_CORNERS = 30  #: Corners that must be found again: in images of different places about ten are, by chance.
-#: Of the corners of the last view that are found again, so many must show the motion that the map shows.
+VIEW_DEPTH_RATIO = 0.5  #: Standard deviation of a corner's assumed depth, as a fraction of it.
+VIEW_RATIO = 0.8  #: Ratio test of corners: best over second distance (D. Lowe).
+VIEW_SAME_PX = 9.0  #: Corners of another image this close may show the same point.
+MIN_VIEW_CORNERS = 30  #: Least matched corners: between images of different places about ten match by chance.
+#: Fraction of the last view's matched corners that must agree with the motion by the map.
 MIN_VIEW_FRACTION = 0.8
 
 
 class Sighting(NamedTuple):
-    """From where an image was taken, by what it shows of landmarks."""
+    """The pose of an image, from its matches with landmarks."""
 
     world_from_camera: np.ndarray  #: (7,).
-    matches: tuple[np.ndarray, np.ndarray]  #: landmarks (M,) by row, and places (M, 2) like them and like nothing else.
-    agreeing: tuple[np.ndarray, np.ndarray]  #: likewise of those that agree with the pose, (A,) and (A, 2).
-    noise_px: float  #: standard deviation of the places that agree, per axis.
+    matches: tuple[np.ndarray, np.ndarray]  #: landmarks (M,) by row, and unambiguous matches (M, 2), px.
+    agreeing: tuple[np.ndarray, np.ndarray]  #: likewise of the inliers, (A,) and (A, 2).
+    noise_px: float  #: standard deviation of the inliers, per axis.
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """How far the recognition of one image came."""
+    """Result of a relocalisation attempt."""
 
-    matches: int = 0  #: of a landmark and a corner that are like each other and like nothing else.
-    agreeing: int = 0  #: matches that a pose explains, after the search around it; 0 where no pose was computed.
-    prior: PosePrior | None = None  #: the pose, for the heaviest particle's world; None where it was not convincing.
-    certain: bool = False  #: whether the image was recognised beyond doubt.
-    sighting: Sighting | None = None  #: the pose, convincing or not; None where none was computed.
+    matches: int = 0  #: unambiguous matches of landmarks and corners.
+    agreeing: int = 0  #: inliers of the pose, after the search around it; 0 without a pose.
+    prior: PosePrior | None = None  #: the pose, for the heaviest particle's world; None if it was not accepted.
+    certain: bool = False  #: whether the relocalisation is certain.
+    sighting: Sighting | None = None  #: the pose, accepted or not; None without one.
 
 
 @final
 class TrackingLoss(Kept):
-    """Remembers where the camera was last trusted, and says where it may be while it is lost.
+    """Stores the last trusted pose, and provides the pose prior while the camera is lost.
 
-    A map that was made before this run has views (V, 7) to look from as well, and a size_m: so far from where it is assumed
-    the camera may be as long as it was never found.
+    A known map has viewpoints (V, 7) to try as well, and `size_m`: the standard deviation of the position until the camera is
+    localised for the first time.
     """
 
     kept: ClassVar = {
@@ -107,9 +107,9 @@ class TrackingLoss(Kept):
         self.relocaliser = Relocaliser(sensor, config.relocalisation)
         self.views = np.zeros((0, 7)) if views is None else views
         self.size_m = size_m
-        #: Whether the camera has not been found yet in a map that was made before.
+        #: Whether the camera has not been localised yet in a known map.
         self.never_found = len(self.views) > 0
-        self.stamp_ns = 0  #: When the pose was trusted last.
+        self.stamp_ns = 0  #: Time of the last trusted pose.
         self._pose, self._cov = self.views[0] if self.never_found else SE3.identity(), np.zeros((6, 6))
         self._particles: Particles | None = None
         self._image = NO_IMAGE
@@ -117,7 +117,7 @@ class TrackingLoss(Kept):
         self._view: LastView | None = None
 
     def trust(self, filter_: Filter, image: np.ndarray | None) -> None:
-        """Takes the particles as they are after a step for the last trusted ones, with the image that they were found in."""
+        """Stores the particles after a step as the last trusted ones, with their image."""
         assert filter_.stamp_ns is not None
         particles = filter_.particles
         state = filter_.belief().map.world(particles.state[:, :7])
@@ -129,7 +129,7 @@ class TrackingLoss(Kept):
     def trusted(self) -> tuple[np.ndarray, np.ndarray]:
         """The last trusted pose world_from_camera (7,) in the particles' world, and its covariance (6, 6)."""
         if self._particles is not None:
-            # Averaged only when it is needed: tracking has no time for it.
+            # Averaged lazily, to save time while tracking.
             poses, log_weights = self._particles.state, self._particles.log_weights
             estimate = mixture_estimate(Prior.exactly(SE3, poses), None, log_weights)
             self._pose, self._cov, self._particles = estimate.mean, estimate.cov, None
@@ -137,13 +137,13 @@ class TrackingLoss(Kept):
         return self._pose, self._cov
 
     def prior(self, filter_: Filter, image: np.ndarray | None) -> tuple[PosePrior, Attempt | None]:
-        """Where a lost camera may be in the next frame: where it is recognised, else near the last trusted pose.
+        """Pose prior of a lost camera in the next frame: relocalised, else around the last trusted pose.
 
-        And how far the last attempt to recognise it came.
+        Also returns the last relocalisation attempt.
 
-        A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
-        turn back. It is looked for from the last trusted pose; then from views of a known map, in the first frame from
-        all of them, later from some in turn.
+        Extrapolating the last velocity for a second would be worse than staying, as hands turn back. Relocalisation starts
+        from the last trusted pose; then from viewpoints of a known map, in the first frame from all of them, later from some
+        in turn.
         """
         pose, cov = self.trusted
         attempt = None
@@ -159,21 +159,21 @@ class TrackingLoss(Kept):
                 attempt = self.relocaliser.find(belief, image, view)
             if attempt.prior is not None:
                 found = attempt.prior
-                # The covariance is in the camera's chart, where a particle's world does not matter.
+                # The covariance is in the camera's chart, independent of the particle's world.
                 poses = self.relocaliser.in_all_worlds(belief, found.mean)
                 return PosePrior(poses, found.cov, self.std_velocity), attempt
         std = np.repeat([self.config.search_std_rad, self.config.search_std_m], 3)
         return PosePrior(pose, cov + np.diag(std**2), self.std_velocity), attempt
 
     def drift(self, stamp_ns: int) -> np.ndarray:
-        """Covariance (6, 6) of how far the camera may have gone since the pose was trusted, [ω, v]."""
+        """Covariance (6, 6) of the camera's motion since the last trusted pose, [ω, v]."""
         if self.never_found:
             return np.diag(np.repeat([np.pi, self.size_m], 3) ** 2)
         seconds = (stamp_ns - self.stamp_ns) * 1e-9
         return np.diag((np.repeat([self.config.drift_rad_s, self.config.drift_m_s], 3) * seconds) ** 2)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         self._pose, self._cov = self.trusted
         return super().arrays()
 
@@ -186,7 +186,7 @@ class TrackingLoss(Kept):
 
 @dataclass(frozen=True)
 class Candidates:
-    """What is matched: an image and its corners (K, 2), and landmarks with their rows (L,) and homogeneous points (L, 4)."""
+    """Inputs of the matching: an image and its corners (K, 2), landmarks by row (L,) and homogeneous points (L, 4)."""
 
     image: np.ndarray
     rows: np.ndarray
@@ -196,7 +196,7 @@ class Candidates:
 
 @final
 class Relocaliser:
-    """Finds the camera in the map by the appearance of its features."""
+    """Relocalises the camera in the map by the appearance of its features."""
 
     def __init__(self, sensor: ImageSensor, config: RelocalisationConfig) -> None:
         self.sensor = sensor
@@ -213,10 +213,10 @@ class Relocaliser:
         last: "LastView | None" = None,
         among: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Attempt:
-        """Where the camera must be, if enough of the map's landmarks with known depth are seen in an image (H, W) uint8.
+        """Relocalises the camera from an image (H, W) uint8, if it shows enough landmarks of known depth.
 
-        Their appearances are predicted from a pose near by (7,), the last trusted one; `last` is the image from there.
-        It is looked for `among` other landmarks, rows (K,) and places in the world (K, 3), where these are given.
+        Appearances are predicted from a nearby pose (7,), the last trusted one; `last` is the image from there. `among`
+        restricts it to given landmarks, rows (K,) and world positions (K, 3).
         """
         config, camera = self.config, self.camera
         rows, points = self.known_landmarks(belief) if among is None else among
@@ -226,7 +226,7 @@ class Relocaliser:
         if px.shape[0] < config.min_inliers:
             return Attempt()
 
-        # Landmarks as they should look from near by are matched with the corners; and so is the last view.
+        # Match the landmarks' predicted appearances, and the last view, with the corners.
         candidates = Candidates(image, rows, np.insert(points, 3, 1.0, axis=1), px)
         products = similarities(self.describe_landmarks(candidates, near), descriptors)
         distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
@@ -237,7 +237,7 @@ class Relocaliser:
         attempt = Attempt(pairs[0].size)
         first = rows[pairs[0]], px[pairs[1]]
 
-        # A pose that most of them agree with, and then all that is seen around it.
+        # A consensus pose, then all matches around its projections.
         rough = self._consensus(points[pairs[0]], self.refine_px(candidates, pairs, near), view, belief.rng)
         if rough is None:
             return attempt
@@ -245,8 +245,8 @@ class Relocaliser:
             view = last.refine_px(image, *again, rough)
         best, places, best_pairs = None, px[:0], pairs[0][:0]
         for _ in range(MAX_ROUNDS):
-            # Few landmarks in one part of the image determine a pose that is right for them alone; from there it has
-            # to reach their neighbours first.
+            # Few landmarks in one part of the image determine a pose that is accurate only locally; it has to be extended to
+            # their neighbours step by step.
             pairs = self._match_near(rough, points, px, distances)
             at = self.refine_px(candidates, pairs, rough)
             found = self._refined(rough, points[pairs[0]], at, view)
@@ -271,7 +271,7 @@ class Relocaliser:
         return replace(attempt, prior=PosePrior(best.world_from_camera, cov), certain=certain)
 
     def corners(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The best corners (K, 2) of an image and their descriptors (S, K, d) at `SCALES`, kept for when it comes again."""
+        """The best corners (K, 2) of an image and their descriptors (S, K, d) at `SCALES`, cached per image."""
         if self._looked_at is None or self._looked_at[0] is not image:
             px = image_corners(self.sensor, image, self.config, BORDER_PX).px
             scales = WINDOW_SCALE_PX * np.repeat(SCALES, px.shape[0])
@@ -280,7 +280,7 @@ class Relocaliser:
         return self._looked_at[1:]
 
     def known_landmarks(self, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (K,) of the living features whose depth is known, and where they are (K, 3)."""
+        """Rows (K,) of the features in the map with known depth, and their positions (K, 3)."""
         features, rows = self.sensor.features, np.flatnonzero(self.sensor.table.alive)
         rows = rows[features.depth_known(belief, rows, self.config.depth_std_ratio)]
         which, position = features.positions(belief, rows)
@@ -289,8 +289,8 @@ class Relocaliser:
     def in_all_worlds(self, belief: Belief, pose: np.ndarray) -> np.ndarray:
         """A pose (7,) of the heaviest particle's world in each particle's own (N, 7).
 
-        It is where the landmarks in view are around the camera as they are in the heaviest one: the closest rigid motion
-        of each particle's, near ones counting more. What a map is bent elsewhere does not matter.
+        It has the same pose relative to the landmarks in view: by the closest rigid motion of each particle, near landmarks
+        weighted more. The map's deformation elsewhere does not matter.
         """
         rows, points = self.known_landmarks(belief)
         seen = SE3.inverse_transform(pose, points)
@@ -309,14 +309,14 @@ class Relocaliser:
         return poses
 
     def describe_landmarks(self, candidates: Candidates, near: np.ndarray) -> np.ndarray:
-        """Descriptors (L, d) of landmarks, turned and scaled as they would be seen from a pose near by."""
+        """Descriptors (L, d) of landmarks, warped to a nearby pose."""
         known, asked = self._described, (candidates.rows, candidates.positions, near)
         if known is not None and all(map(np.array_equal, known, asked)):
             return known[3]
         positions = candidates.positions
         patches, poses = self.sensor.table.nearest_appearance(candidates.rows, positions, near)
         affine = patch_affines(self.camera, positions, poses, near)
-        # Features behind the camera or at a grazing angle are described as they were seen at first.
+        # Features behind the camera or at a grazing angle are described by their first appearance.
         with np.errstate(all="ignore"):
             area = affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]
         scale = np.sqrt(np.abs(area))
@@ -331,9 +331,9 @@ class Relocaliser:
     def refine_px(
         self, candidates: Candidates, pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
     ) -> np.ndarray:
-        """Where in the image the landmarks of pairs are (M, 2): where their patches, seen from a pose, fit best.
+        """Refines the pixels (M, 2) of matched landmarks by correlation with their patches, warped to a pose.
 
-        A corner is found again within a few pixels only. Where the patch is too unlike to say better, it stays.
+        Corners are re-detected only to a few pixels. A match of low correlation keeps its corner's pixel.
         """
         rows, at, config = candidates.rows[pairs[0]], candidates.px[pairs[1]], self.sensor.config
         positions = candidates.positions[pairs[0]]
@@ -348,7 +348,7 @@ class Relocaliser:
     def _match_near(
         self, world_from_camera: np.ndarray, points: np.ndarray, px: np.ndarray, distances: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (M,), (M,) of landmark and the corner most like it near to where it should be seen from a pose."""
+        """Pairs (M,), (M,) of landmarks and the most similar corner near their projections from a pose."""
         seen = SE3.inverse_transform(world_from_camera, points)
         near = np.linalg.norm(self.camera.project(seen)[:, None] - px, axis=-1) <= self.config.match_radius_px
         masked = np.where(near & self.camera.visible(seen)[:, None], distances, np.inf)
@@ -359,7 +359,7 @@ class Relocaliser:
     def _consensus(
         self, points: np.ndarray, places: np.ndarray, view: Sights | None, rng: np.random.Generator
     ) -> np.ndarray | None:
-        """The pose (7,) of three landmarks (M, 3) that most of them agree with, and the corners of the last view."""
+        """The P3P pose (7,) with the best consensus of the landmarks (M, 3), and of the corners of the last view."""
         config, camera = self.config, self.camera
         if points.shape[0] < 3:
             return None
@@ -367,7 +367,7 @@ class Relocaliser:
             poses = three_point_poses(points, camera.unproject(places), config.p3p_samples, rng)
             if poses.shape[0]:
                 both = Sights.known(points, places, config.inlier_px / np.sqrt(GATE)) + view
-                # A landmark says twice as much as a corner of unknown depth, and fixes the scale.
+                # A landmark has twice the information of a corner of unknown depth, and fixes the scale.
                 weights = np.where(np.arange(both.std_px.size) < points.shape[0], 2.0, 1.0)
                 losses = np.minimum(squared_distances(camera, poses, both), 4.0 * GATE) @ weights
                 found = refined_on_all(camera, poses[losses.argmin()], both)
@@ -379,7 +379,7 @@ class Relocaliser:
     def _refined(
         self, rough: np.ndarray, points: np.ndarray, places: np.ndarray, view: Sights | None
     ) -> Resected | None:
-        """A pose refined on landmarks, and on the corners of the last view if these agree; `inliers` of landmarks."""
+        """A pose refined on landmarks, and on the last view's corners if they agree; `inliers` are the landmarks'."""
         inlier_px = self.config.inlier_px
         if view is not None:
             sights = Sights.known(points, places, inlier_px / np.sqrt(GATE)) + view
@@ -391,11 +391,11 @@ class Relocaliser:
 
 @final
 class LastView:
-    """The last image before a loss and where it was taken.
+    """The last image before a loss and its pose.
 
-    The depth of its corners is not known: each says on which line it must be seen. Hundreds of them determine how
-    the camera turned and in which direction it went; how far, the map's landmarks say. `world_from_camera` (7,) is in the
-    world of the map's particle.
+    The depth of its corners is unknown: each constrains the camera by its epipolar line. Hundreds of them determine the
+    rotation and the direction of translation; the map's landmarks fix its length. `world_from_camera` (7,) is in the world of
+    the map's particle.
     """
 
     def __init__(
@@ -413,9 +413,9 @@ class LastView:
         self.descriptors = sensor.descriptor.describe(image, keypoints.take(known))  #: (K, d).
 
     def match(self, descriptors: np.ndarray, px: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, Sights] | None:
-        """Its corners (P,) and where another image shows them, described at px (M, 2) in S sizes; None where too few.
+        """Matches its corners (P,) with another image's, described at px (M, 2) at S scales; None with too few.
 
-        They are taken to be about as far away as the landmarks (L, 3) in view.
+        They are assumed at about the depth of the landmarks (L, 3) in view.
         """
         held = SE3.inverse_transform(self.world_from_camera, landmarks)
         held = held[self.camera.visible(held), 2]
@@ -429,7 +429,7 @@ class LastView:
         return one, Sights(points, spread, px[other], np.full(one.size, CORNER_PX))
 
     def refine_px(self, image: np.ndarray, rows: np.ndarray, sights: Sights, pose: np.ndarray) -> Sights:
-        """The same corners (P,) where their patches, seen from a pose (7,), fit best; as they were where none fits."""
+        """Refines the pixels of corners (P,) by correlation with their patches, warped to a pose (7,), where high enough."""
         position = np.concatenate([sights.points, np.ones((rows.size, 1))], axis=1)
         first = np.broadcast_to(self.world_from_camera, (rows.size, 7))
         templates = warp(self.patches[rows], patch_affines(self.camera, position, first, pose))
@@ -441,7 +441,7 @@ class LastView:
 
 
 def is_convincing(found: Resected, px: np.ndarray, width: int, config: RelocalisationConfig) -> bool:
-    """Enough landmarks agree, a fair fraction of those matched, and they do not lie on a line or in a corner."""
+    """Whether there are enough inliers, a sufficient fraction of the matches, spread in two directions of the image."""
     count = int(found.inliers.sum())
     if count < max(config.min_inliers, config.min_inlier_fraction * found.inliers.size):
         return False
@@ -451,15 +451,15 @@ def is_convincing(found: Resected, px: np.ndarray, width: int, config: Relocalis
 
 
 def is_confirmed(landmarks: int, agreeing: int, matched: int, config: RelocalisationConfig) -> bool:
-    """Some landmarks agree, which fix the scale, and most of the last view's corners: these alone leave no doubt."""
+    """Whether some landmarks, which fix the scale, and most of the last view's corners agree."""
     least = max(MIN_VIEW_CORNERS, MIN_VIEW_FRACTION * matched)
     return landmarks >= config.min_inliers_with_last_view and agreeing >= least
 
 
 def most_agree(agreeing: np.ndarray) -> bool:
-    """Whether nearly all corners (K,) of the last view show the motion that the map shows.
+    """Whether nearly all corners (K,) of the last view agree with the motion by the map.
 
-    Where the map is torn they do not, and it is the map in which the camera has to be found.
+    In an inconsistent map they do not, and the camera must be localised in the map.
     """
     return bool(agreeing.sum() >= max(MIN_VIEW_CORNERS, MIN_VIEW_FRACTION * agreeing.size))
 
@@ -479,9 +479,9 @@ def similarities(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def match_by_ratio(
     distances: np.ndarray, points: np.ndarray, px: np.ndarray, ratio: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (M,), (M,) of landmark and corner that are like each other and like nothing else (D. Lowe's ratio).
+    """Pairs (M,), (M,) of landmarks and corners by D. Lowe's ratio test.
 
-    Landmarks (L, 3) nearer than `SAME_POINT`, corners (K, 2) nearer than `SAME_CORNER` are no rivals.
+    Landmarks (L, 3) closer than `SAME_POINT` and corners (K, 2) closer than `SAME_CORNER` are not rivals.
     """
     best = distances.argmin(axis=1)
     chosen = distances[np.arange(best.size), best]
@@ -493,7 +493,7 @@ def match_by_ratio(
 
 
 def _one_each(best: np.ndarray, chosen: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of several landmarks at one corner only the most alike counts: one is mistaken, or they are the same."""
+    """Of several landmarks at one corner only the most similar is kept: others are wrong, or identical."""
     order = np.flatnonzero(clear)[np.argsort(chosen[clear], kind="stable")]
     _, first = np.unique(best[order], return_index=True)
     kept = np.sort(order[first])
@@ -501,9 +501,9 @@ def _one_each(best: np.ndarray, chosen: np.ndarray, clear: np.ndarray) -> tuple[
 
 
 def mutual_matches(alike: np.ndarray, px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (P,), (P,) that are most alike both ways, by products (K, M), and clearly more than the next place.
+    """Mutual best pairs (P,), (P,) by products (K, M) that pass the ratio test against other positions.
 
-    Places (M, 2) nearer than `VIEW_SAME_PX` to the best are no rivals of it.
+    Positions (M, 2) closer than `VIEW_SAME_PX` to the best are not rivals.
     """
     best = alike.argmax(axis=1)
     rows = np.arange(best.size)

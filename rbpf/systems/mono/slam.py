@@ -4,8 +4,8 @@
     for stamp_ns, image in source:
         frame = slam.track(image, stamp_ns)
 
-`MonoSlam.take` is the life of a frame: is the image usable, where may the camera be, the filter's step with active
-search inside, what is reported, and, as long as depths are not settled, the batch adjustment of the first frames.
+`MonoSlam.take` processes a frame: check of the image, pose prior, the filter's step with active search inside, the report,
+and, until depths have converged, the batch adjustment of the first frames.
 """
 
 import time
@@ -61,7 +61,7 @@ from rbpf.systems.system import (
     timing,
 )
 
-LINE_SIGMAS = 3.0  #: An epipolar line is reported between the inverse depths that lie this far from the mean.
+LINE_SIGMAS = 3.0  #: Epipolar lines are reported between inverse depths this many standard deviations from the mean.
 LOST = "the camera is lost, its pose is held until the map is seen again"
 FOUND_AGAIN = "the camera is found again"
 FOUND_IN_MAP = "the camera is found in the map"
@@ -70,28 +70,27 @@ COME_BACK = "the camera is back where it was, its way and its map are corrected"
 
 @final
 class MonoSlam(System):
-    """A camera that is tracked while its surroundings are mapped.
+    """SLAM with one camera.
 
-    It takes images, or features that carry names, but not both. The world is that of the known points or of the known
-    map; without them that of the first camera, in a scale in which new features are 1 / `inverse_depth.mean_per_m` away
-    on the average. When the map becomes a joint one, the first frames are adjusted in batch, and their poses revised. Memory:
-    the map and its features' appearances, and what `lag` keeps of the particles' paths.
+    It takes images, or named features, but not both. The world is that of the known points or of the known map; without them
+    that of the first camera, in a scale in which new features are on average 1 / `inverse_depth.mean_per_m` away. When the
+    joint map starts, the first frames are adjusted in batch, and their poses revised. Its memory holds the map, its features'
+    appearances, and `lag` frames of the particles' paths.
 
     Args:
         camera: of the images.
         config: all settings.
-        known: points of known position that the first image shows: with their pixels in it, or, for features, under
-            their names. Without them particles are resampled from adjustments of the first frames.
-        known_map: a map that the camera is to be found in, in place of making one; it is not changed.
-        unknown_depth: how features are kept as long as their depth is not known; by default rays with inverse depth.
-        gate: which matches of a frame agree with one motion of the camera; by default a robust fit.
-        detector: where features are started, and what a lost image is matched by; by default FAST corners, scored as Shi
-            and Tomasi do.
-        descriptor: by what a lost image is matched with the map; by default SIFT.
-        wrapped: puts a sensor around the one that takes named features, to change what it observes or starts. An adjustment
-            of the first frames is of what they show, and only a joint map begins with one.
+        known: points of known position in the first image: with their pixels in it, or, for named features, under their
+            names. Without them particles are resampled from adjustments of the first frames.
+        known_map: a map in which the camera is localised instead of mapping; it is not changed.
+        unknown_depth: storage of features of unknown depth; by default rays with inverse depth.
+        gate: selects the matches that agree with one motion of the camera; by default a robust fit.
+        detector: detects corners for new features and for relocalisation; by default FAST corners with the Shi-Tomasi score.
+        descriptor: descriptor for relocalisation; by default SIFT.
+        wrapped: wraps the sensor of named features, to change its observations or new landmarks. Adjustments of the first
+            frames use the original features, and only a joint map starts from one.
 
-    Raises InputError: known points do not determine the camera, or the map was made with another one.
+    Raises InputError: known points do not determine the camera, or the map is of another camera.
     """
 
     name: ClassVar[str] = "mono"
@@ -151,7 +150,7 @@ class MonoSlam(System):
         if known_map is not None:
             known_map.require_camera(camera)
             points = known_map.points
-        #: Points that were known beforehand, under the names that features have; None where there are none.
+        #: Known points, by the names of features; or None.
         self.known_points = points
         group = points if config.known == "frame" and known_map is None else None
 
@@ -183,25 +182,25 @@ class MonoSlam(System):
             self.gauge = "similarity"
         elif isinstance(known, KnownPixels) and known.own_frame:
             self.gauge = "rigid"
-        #: What the sensor made of the last image; None before the first one, and for named features.
+        #: The sensor's results for the last image; None before the first one, and for named features.
         self.measurement: Measurement | None = None
-        #: How far the camera was recognised in the last frame; None where it was not lost before it.
+        #: The relocalisation attempt in the last frame; None if the camera was not lost.
         self.attempt: Attempt | None = None
-        self.report: StepReport | None = None  #: What the filter did in the last frame.
+        self.report: StepReport | None = None  #: The filter's report of the last frame.
 
     def track(self, image: np.ndarray | None, stamp_ns: int) -> Tracked:
-        """Takes an image (H, W) uint8, grey, of the camera's size; None where there is none at this time.
+        """Takes an image (H, W) uint8, grey, of the camera's size; None for a missing image.
 
-        Images that show nothing, or are of another kind, are passed over: the pose is then predicted, and the message
-        says why.
+        Images without texture, or of another kind, are passed over: the pose is then predicted, and the message gives the
+        reason.
 
-        Raises InputError: time runs backwards; the first image does not show the known points; or no particle explains what
-        was found.
+        Raises InputError: time runs backwards; the first image does not show the known points; or no particle explains the
+        matches.
         """
         return self.take(ImageFrame(stamp_ns, image))
 
     def take(self, frame: ImageFrame | FeatureFrame) -> Tracked:
-        """The life of a frame, of images or of named features; errors as `track`."""
+        """Processes a frame, an image or named features; errors as of `track`."""
         before, stamp_ns = self.filter.stamp_ns, int(frame.stamp_ns)
         if before is not None and stamp_ns < before:
             raise InputError(f"time runs backwards: a frame at {stamp_ns} ns after one at {before} ns")
@@ -211,7 +210,7 @@ class MonoSlam(System):
 
         self.hand_over.tune(self.filter, sensor)
 
-        # 1. Is there anything to measure?
+        # 1. Check the input.
         has_images = len(sensor.table) > 0
         is_mapped = self.filter.belief().map.ids.size > 0
         if self.filter.steps and is_mapped and has_images != isinstance(frame, ImageFrame):
@@ -230,12 +229,12 @@ class MonoSlam(System):
             measured, is_empty = Measurement(stamp_ns, image, starting=not self.start.over), image is None
         self.filter.sensors = [sensor if isinstance(measured, Measurement) else self._named]
 
-        # 2. The first frame places the known points.
+        # 2. The first frame initialises the known points.
         prior: PosePrior | None = None
         if not self.filter.steps:
             self.loss.stamp_ns = stamp_ns
             if is_empty and isinstance(self.known, KnownPixels):
-                # Before the first image that can be used the camera is somewhere around the place that they say.
+                # Before the first usable image the camera is around the pose resected from them.
                 assert self._start is not None
                 pose, cov = self._start.world_from_camera, self.config.start_cov()
                 values = {column.name: column.kind(0) for column in self.columns}
@@ -244,7 +243,7 @@ class MonoSlam(System):
                 return Tracked(stamp_ns, pose, cov, *waiting, self._nothing(), tuple(messages))
             measured, prior = self._begin(measured)
 
-        # 3. Where may the camera be? As it moved, unless nothing has been seen yet or it is lost.
+        # 3. Pose prior: by the motion model, unless nothing has been observed yet or the camera is lost.
         self.attempt = None
         if isinstance(measured, Measurement) and prior is None:
             if not len(sensor.table):
@@ -271,14 +270,14 @@ class MonoSlam(System):
             if not sensor.bad_frames:
                 self.loss.trust(self.filter, measured.image)
 
-        # 5. What is reported.
+        # 5. Report.
         world = world_of(self.filter)
         if self.joint is not None:
             estimate = self.joint.estimate(self.filter.particles)
             pose, cov = estimate.mean, estimate.cov
         elif world is None:  # the refined mixture's
             pose, cov = report.estimate.mean[:7], report.estimate.cov[:6, :6]
-        else:  # the samples', each with its own uncertain world: before sampling the pose and its place are correlated
+        else:  # the samples', each in its own uncertain world, with which the pose is correlated before sampling
             particles = self.filter.particles
             estimate = relative_estimate(SE3, world, particles.state[:, :7], particles.log_weights)
             pose, cov = estimate.mean, estimate.cov
@@ -290,11 +289,11 @@ class MonoSlam(System):
 
         seen = measured.features if isinstance(measured, Measurement) else frame
         assert isinstance(seen, FeatureFrame)
-        # 6. As long as depths are unknown: batch adjustment of the frames so far, and particles drawn from it; once they are
-        # known, one Gaussian, if there is to be one. It stays where it is while the camera is lost.
+        # 6. Until depths are known: batch adjustment of the frames so far, and particles drawn from it; then the joint map,
+        # if configured. Its frame is fixed while the camera is lost.
         revision: Revision | None = None
         if not self.start.over or self.hand_over.is_ahead:
-            # From where an adjustment starts: the mixture before sampling, which no noise of a few particles moves.
+            # Initial value of an adjustment: the mixture before sampling, free of the particles' sampling noise.
             is_joint = self.joint is not None
             self.first.note(seen, pose if is_joint else mixture_estimate(*report.mixture).mean[:7])
             is_usable, is_lost = not sensor.bad_frames, sensor.lost and len(sensor.table) > 0
@@ -322,7 +321,7 @@ class MonoSlam(System):
                 estimate = self.joint.estimate(self.filter.particles)
                 pose, cov = estimate.mean, estimate.cov
 
-        # 7. How it stands.
+        # 7. Tracking state.
         if sensor.lost and not was_lost:
             messages.append(LOST)
         is_found = was_lost and not sensor.lost
@@ -339,7 +338,7 @@ class MonoSlam(System):
         return Tracked(stamp_ns, pose, cov, state, values, observed, tuple(messages), revision)
 
     def map(self) -> MapEstimate:
-        """Points, and features of unknown depth as what is known of them, in the reported world.
+        """Points, and features of unknown depth as Gaussians, in the reported world.
 
         Columns: `ray`; `known`, whether it was given; of images, `attempts` and `found`, how often it was looked for.
         """
@@ -352,15 +351,15 @@ class MonoSlam(System):
         return replace(found, columns=columns)
 
     def particle_poses(self) -> np.ndarray:
-        """(N, 7) world_from_camera of the particles as they are now, in the reported world."""
+        """(N, 7) world_from_camera of the current particles, in the reported world."""
         poses, world = super().particle_poses(), world_of(self.filter)
         return poses if world is None else SE3.between(world.mean, poses)
 
     def particle_paths(self) -> np.ndarray:
         """(T, N, 7) world_from_camera of the particles along their ancestors, in the reported world; with a lag, the last.
 
-        Where there are known points, each particle's path is reported from its own mean of their world's place. Particles of
-        a joint map have none: it has them as they are now.
+        With known points, each particle's path is reported relative to its own mean of their frame. Particles of a joint map
+        have no paths, only their current poses.
         """
         if self.joint is not None:
             return self.particle_poses()[None]
@@ -368,9 +367,9 @@ class MonoSlam(System):
         return paths if world is None else SE3.between(world.mean, paths)
 
     def measurements(self, name: str, log: FrameLog) -> FeatureLog:
-        """The features that the filter used, and those that started landmarks, under their numbers, with the noise as learnt.
+        """The features used, and those that initialised landmarks, by their numbers, with the learnt noise.
 
-        Of a frame in which too little agreed to be trusted nothing was used.
+        A frame with too few agreeing matches has none.
         """
         frames = []
         for t, (stamp_ns, used) in enumerate(zip(log.stamps_ns.tolist(), log["found"].tolist(), strict=True)):
@@ -385,11 +384,11 @@ class MonoSlam(System):
         return FeatureLog(name, self.camera if found is None else found[0], frames, self.known_points)
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
-        """Frames that were tracked, landmarks, and how much was found."""
+        """Counts of tracked frames, landmarks and matches."""
         lost, searched, found, landmarks = log.lost(), log["searched"], log["found"], self.map()
         tracked, looked = np.flatnonzero(~lost), searched > 0
         localised = {"localized": True, "found_at_frame": int(tracked[0]) if tracked.size else None}
-        # Of a camera that calibrates itself: px and none, with standard deviations; None as long as nothing is known.
+        # Self-calibration: px or no unit, with standard deviations; None as long as there is no estimate.
         calibration: dict[str, Any] = {} if self.config.calibrate == "off" else {"calibration": None}
         if (calibrated := self.hand_over.calibration(self.filter)) is not None:
             camera, std = calibrated
@@ -413,7 +412,7 @@ class MonoSlam(System):
         }
 
     def files(self, log: FrameLog) -> Mapping[str, dict[str, np.ndarray] | str]:
-        """The particles' paths; of images, the map as a place to be found in, unless the run was localised; the camera.
+        """The particles' paths; for images the known map, unless the run was localised; the self-calibrated camera.
 
         The camera of a run that has calibrated it.
         """
@@ -432,9 +431,9 @@ class MonoSlam(System):
         return files
 
     def export_map(self, poses: np.ndarray) -> KnownMap:
-        """The map as a place in which later runs find their camera, looking from some of the tracked poses (T, 7).
+        """The map for localising later runs, with some of the tracked poses (T, 7) as viewpoints.
 
-        It has the points that are still held and whose depth is known, with how they look.
+        It has the points of known depth still in the map, with their appearances.
         """
         found, table, world = self.map(), self.sensor.table, world_of(self.filter)
         is_lasting = table.alive[found.ids]
@@ -450,14 +449,14 @@ class MonoSlam(System):
         return KnownMap(self.features.camera, self.gauge, rows, positions, found.cov[kept], *looks, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The sensor's table, the last trusted pose, and the first frames as long as they are kept."""
+        """The sensor's table, the last trusted pose, and the first frames while they are kept."""
         arrays: dict[str, np.ndarray] = {}
         for part in (self.sensor, self.screen, self.loss, self.first, self.start, self.hand_over):
             arrays |= part.arrays()
         return arrays
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        """As `System.load`; what is saved after the map became a joint one has another filter."""
+        """As `System.load`; a checkpoint with a joint map has another filter."""
         self.filter = self.hand_over.taken_up(Path(path), self.sensor, self.filter.rng) or self.filter
         return super().load(path)
 
@@ -474,7 +473,7 @@ class MonoSlam(System):
             raise InputError("a landmark of the map is not in the table of features")
 
     def _new_filter(self, sensor: Sensor) -> Filter:
-        """A filter with an empty map; the parametrisations are named in it, so that a checkpoint can be read back."""
+        """A filter with an empty map and registered parametrisations, so that a checkpoint can be loaded."""
         config, velocity = self.config, self.config.velocity
         motion: MotionModel = MarginalVelocity(velocity.walk_std())
         if velocity.mode != "marginal":
@@ -490,14 +489,14 @@ class MonoSlam(System):
         return self.new_filter(motion, sensor, parts, config.proposal.build())
 
     def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
-        """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
+        """The first frame's measurement, and the camera's pose: the origin, unless known points define the world."""
         known, config = self.known, self.config
         if self.known_map is not None:
             return measured, None
         if known is None:
             return measured, PosePrior(SE3.identity(), np.zeros((6, 6)))
 
-        # What the frame shows of the known points.
+        # The known points in the frame.
         if isinstance(measured, Measurement):
             if not isinstance(known, KnownPixels):
                 raise InputError("known points without pixels are those of named features: images need KnownPixels")
@@ -512,12 +511,12 @@ class MonoSlam(System):
             start = KnownStart.from_frame(self.camera, known, measured)
 
         if self.features.group is None:
-            # Separate landmarks, in a world whose place each particle samples in the first frame: the prior is wide, the
-            # measurements of the frame, not the resection, say where in it the camera is.
+            # Separate landmarks, in a world whose pose each particle samples in the first frame: the prior is wide, and the
+            # frame's measurements, not the resection, determine the camera's pose in it.
             self._add_points(start.points)
             return measured, PosePrior(start.world_from_camera, config.start_cov())
 
-        # One landmark, placed by what the frame shows of it: the frame is not used again.
+        # One landmark, initialised by the frame's observations, which are not used again.
         landmark_map, group = self.filter.belief().map, Constellation(start.points.positions, start.points.cov)
         records = constellation_records(self.camera, start, group, self.filter.n, config.start_cov())
         landmark_map.add_records(records, group, ids=start.points.names[:1])
@@ -526,14 +525,14 @@ class MonoSlam(System):
         return measured, PosePrior(SE3.identity(), np.zeros((6, 6)))
 
     def _add_points(self, known: KnownPoints) -> None:
-        """They enter the map once, with their σ, and are ordinary landmarks from then on."""
+        """Adds them to the map once, with their σ, as ordinary landmarks."""
         landmark_map, n = self.filter.belief().map, self.filter.n
         mean = np.broadcast_to(known.positions, (n, *known.positions.shape))
         cov = np.broadcast_to(known.cov, (n, *known.cov.shape))
         landmark_map.add_records(Records(mean, cov), Point(3), ids=known.names)
 
     def _values(self, measured: Measurement | FeatureFrame, report: StepReport) -> dict[str, Any]:
-        """Of `columns`; whether it was relocalised, and the time of the rest, are added."""
+        """Values of `columns`, except `relocalised` and the time of the rest."""
         landmark_map = self.filter.belief().map
         rays = int(landmark_map.are(landmark_map.ids, self.features.unknown_depth.landmark).sum())
         seconds_search = seconds_new = 0.0
@@ -557,7 +556,7 @@ class MonoSlam(System):
     def _observed(
         self, measured: Measurement | FeatureFrame, world: Anchored | None, first_new: int
     ) -> dict[str, np.ndarray]:
-        """Of `observed`, in the heaviest particle."""
+        """Values of `observed`, in the heaviest particle."""
         if isinstance(measured, FeatureFrame):
             nowhere = {each.name: np.full((len(measured.z), *each.shape), np.nan) for each in self.observed[1:-2]}
             seen = {"features": measured.landmarks, "px": measured.z, "cov_px": measured.cov_z}

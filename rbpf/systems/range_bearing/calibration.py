@@ -1,4 +1,4 @@
-"""A robot that calibrates itself: where its sensor is, and what its wheels get wrong, as constants of the joint map."""
+"""Self-calibration of a robot: its sensor's mounting pose and systematic odometry errors, as constants of the joint map."""
 
 from dataclasses import replace
 from typing import Any, ClassVar, final
@@ -18,18 +18,18 @@ from rbpf.sensors.range_bearing import RigidPointModel
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 
 DECISIVE = 6.0
-"""Standard deviations by which observations are off to one side of what the wheels say when that is no chance any more."""
+"""Score test threshold in standard deviations, at which a systematic odometry error counts as detected."""
 AS_GOOD_AS_KNOWN = 1e-4
-"""How uncertain it is before, as a fraction of what it is then."""
+"""Standard deviation of the constants before detection, as a fraction of that after it."""
 
 
 @final
 class RobotCalibration(Kept):
-    """Constants (m,) of a joint map: coordinates of the sensor's place, then `wheel_errors`, whichever are uncertain.
+    """Constants (m,) of a joint map: the uncertain ones of the sensor's mounting coordinates and `wheel_errors`.
 
-    By default (`calibrate=auto`) they are as good as known until a score test, Mathematics (wheel-score), says otherwise.
-    `is_possible` is whether the map is a joint one of landmarks with names. Raises InputError: what is asked for by name is
-    not possible, or leaves nothing to estimate.
+    By default (`calibrate=auto`) they are nearly fixed until a score test, Mathematics (wheel-score), detects an error.
+    `is_possible` tells whether the map is joint with known association. Raises InputError: an explicitly requested
+    calibration is not possible, or has nothing to estimate.
     """
 
     kept: ClassVar = {"score": numbers(3, "learnt"), "_before": numbers("dim", "learnt"), "is_estimated": truths()}
@@ -51,18 +51,18 @@ class RobotCalibration(Kept):
                 "self_calibration above 0"
             )
         self.space, self.model = space, model
-        self.learnt = np.flatnonzero(std)  #: (m,) which of all (d + 4,) are uncertain.
-        self.free = np.eye(space.dim, std.size)[:, self.learnt]  #: (d, m) how the sensor's place moves with them.
+        self.learnt = np.flatnonzero(std)  #: (m,) indices of the uncertain ones among all (d + 4,).
+        self.free = np.eye(space.dim, std.size)[:, self.learnt]  #: (d, m) derivative of the mounting pose by them.
         self.is_estimated = is_asked
-        #: Its sum, the variance that right wheels have of it, and the sum of squares.
+        #: Sum of the score, its variance without systematic errors, and sum of squares.
         self.score = np.zeros((3, self.learnt.size))
-        self._before = np.zeros((space.dim, self.learnt.size))  # how the odometry of the last step moves with them
+        self._before = np.zeros((space.dim, self.learnt.size))  # derivative of the last step's odometry by them
         self._cov = np.diag(std[self.learnt] ** 2)
         scale = 1.0 if is_asked else AS_GOOD_AS_KNOWN
         self.prior = np.zeros(self.learnt.size), scale**2 * self._cov
 
     def driven(self, odometry: Odometry | None) -> Odometry | None:
-        """The odometry, which says how it moves with them; as it is if it is no increment: the motion model refuses it."""
+        """The odometry with its derivative by them; unchanged if it is invalid, as the motion model refuses it."""
         wheels = self.learnt >= self.space.dim
         if odometry is None or not wheels.any() or np.shape(odometry.delta) != (self.space.size,):
             return odometry
@@ -73,7 +73,7 @@ class RobotCalibration(Kept):
         return replace(odometry, by_constants=by_constants)
 
     def tuned(self, filter_: Filter) -> RigidPointModel:
-        """The sensor where the particles have it on average."""
+        """The sensor model at the particles' mean mounting pose."""
         if not self.free.any():
             return self.model
         own = filter_.marginals.driving()
@@ -81,13 +81,13 @@ class RobotCalibration(Kept):
         return self.model.tuned(filter_.particles.weights @ own, self.free)
 
     def watch(self, filter_: Filter, odometry: Odometry, factor: np.ndarray, found: Correction | None) -> bool:
-        """Tests a step by odometry, by what was found about its noise, whose covariance has a factor (d, r).
+        """Score test of an odometry step, by the posterior of its noise, whose covariance has the factor (d, r).
 
-        Whether what the wheels get wrong is estimated from here on, and was not before.
+        Returns whether the estimation of systematic odometry errors starts with this step.
         """
         if self.is_estimated or odometry.by_constants is None or found is None:
             return False
-        # Of the step before: what the odometry says now has its own noise in it, which is what was found.
+        # With the previous step's derivative: the current odometry is correlated with its own noise, which is tested.
         whitened = np.linalg.lstsq(factor, self._before)[0]
         self._before = odometry.by_constants
         score, variance = whitened.T @ found.mean, np.einsum("ac,ab,bc->c", whitened, found.cov, whitened)
@@ -101,7 +101,7 @@ class RobotCalibration(Kept):
         return self.is_estimated
 
     def wheels(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
-        """What the wheels get wrong as far as it is found (4,), as in `wheel_errors`, and its standard deviations (4,)."""
+        """The estimated systematic errors (4,), as of `wheel_errors`, and their standard deviations (4,)."""
         found, std, own = np.zeros(4), np.zeros(4), self.learnt >= self.space.dim
         if own.any() and self.is_estimated:
             (mean, cov), at = filter_.belief().moments(Part.SUBSTATE), self.learnt[own] - self.space.dim
@@ -109,12 +109,12 @@ class RobotCalibration(Kept):
         return found, std
 
     def corrected(self, filter_: Filter, deltas: np.ndarray) -> np.ndarray:
-        """Odometry (T, E) without what is found to be wrong with it."""
+        """Odometry (T, E) without the estimated systematic errors."""
         wrong = self.wheels(filter_)[0]
         return self.space.compose(deltas, self.space.exp(wheel_errors(deltas) @ wrong)) if wrong.any() else deltas
 
     def sensor_pose(self, filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
-        """Robot_from_sensor (E,) as it is given or found, and its covariance (d, d) in the right chart."""
+        """Robot_from_sensor (E,) as given or estimated, and its covariance (d, d) in the right chart."""
         if not self.free.any():
             return self.model.robot_from_sensor, np.zeros((self.space.dim, self.space.dim))
         mean, cov = filter_.belief().moments(Part.SUBSTATE)
@@ -122,7 +122,7 @@ class RobotCalibration(Kept):
         return self.model.tuned(mean, self.free).robot_from_sensor, slope @ cov @ slope.T
 
     def entries(self, filter_: Filter) -> dict[str, Any]:
-        """For summary.json: what was found, with standard deviations; nothing where nothing is estimated."""
+        """Entries of summary.json: estimates with standard deviations; empty without any."""
         if not self.is_estimated:
             return {}
         found = dict[str, tuple[float, float]]()

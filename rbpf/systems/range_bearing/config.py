@@ -20,19 +20,19 @@ class AssociationConfig(Ranged):
     """Unknown association."""
 
     accept_probability: Probability = 0.999  #: of the χ² gate within which a landmark may explain an observation.
-    #: of the χ² gate beyond which an observation may start a landmark; of a joint map that of its noise alone.
+    #: of the χ² gate beyond which an observation may start a landmark; with a joint map under its noise alone.
     isolate_probability: Probability = 0.999999
-    #: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
+    #: density of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
     new_density: Positive = 1e-3
     clutter_density: Positive = 1e-4  #: of clutter, same units.
-    max_range_m: Positive | None = None  #: beyond it a landmark is not expected to be seen; None is unlimited.
+    max_range_m: Positive | None = None  #: beyond it a landmark is not expected to be observed; None is unlimited.
     half_field_of_view_deg: Annotated[float, Range(gt=0.0, le=180.0)] = 180.0  #: likewise in yaw.
     hit: NotNegative = 1.0  #: added to a landmark's log-odds by an observation.
-    miss: NotNegative = 0.0  #: subtracted where it was expected and not seen.
+    miss: NotNegative = 0.0  #: subtracted if it was expected and not observed.
     drop: float = -2.0  #: log-odds below which a landmark is deleted.
-    #: of a joint map: explanations of all that was measured that are kept side by side, at most.
+    #: of a joint map: maximum number of association hypotheses.
     hypotheses: Annotated[int, Range(ge=1, le=4)] = 4
-    least_weight: Probability = 1e-4  #: below which such an explanation is dropped, or not taken up.
+    least_weight: Probability = 1e-4  #: weight below which a hypothesis is dropped or not started.
 
     def gates(self, dim: int) -> Gates:
         """χ² thresholds for measurements of `dim` numbers."""
@@ -45,60 +45,59 @@ class AssociationConfig(Ranged):
 
 @dataclass(frozen=True)
 class CalibrationConfig(Ranged):
-    """What a robot that calibrates itself may be wrong about, as standard deviations; 0 is known for certain.
+    """Priors of a robot's self-calibration, as standard deviations; 0 is known exactly.
 
-    How far its sensor is from where it is said to be, in the sensor's own directions, and what its wheels get wrong.
+    Of the sensor's given mounting pose, in the sensor's axes, and of systematic odometry errors.
     """
 
     x_m: NotNegative = 0.1  #: ahead.
     y_m: NotNegative = 0.1  #: to the left.
     z_m: NotNegative = 0.1  #: up, in space.
     yaw_deg: NotNegative = 0.0  #: turned to the left.
-    heading_deg_per_m: NotNegative = 1.0  #: the odometry's heading drifts for every metre ahead, in the plane.
-    turn: NotNegative = 0.05  #: fraction by which its turns are wrong, those to the left and those to the right.
-    distance: NotNegative = 0.05  #: fraction by which its distances are wrong; right with calibrate=online.
+    heading_deg_per_m: NotNegative = 1.0  #: heading drift per metre ahead, in the plane.
+    turn: NotNegative = 0.05  #: relative error of rotations, separately to the left and to the right.
+    distance: NotNegative = 0.05  #: relative error of distances; with calibrate=online they are exact.
 
 
 @dataclass(frozen=True)
 class RangeBearingConfig(RunConfig):
     """A run of range-bearing SLAM."""
 
-    #: landmarks named by the log, or by maximum likelihood, in each of some hypotheses: on a joint map.
+    #: known association by the log's names, or maximum likelihood in several hypotheses on a joint map.
     association: Literal["known", "ml"] = "known"
-    #: one Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true; or
-    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles). By default
-    #: (auto) joint, but particles where a lag is set.
+    #: one Gaussian of all landmarks and the frame, given the last few steps (joint), which stays consistent; or per-particle
+    #: landmarks, Gaussians given the whole sampled path (particles). By default (auto) joint, but particles if a lag is set.
     map: Literal["auto", "joint", "particles"] = "auto"
-    #: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample size
-    #: falls below the threshold of resampling, which does not take place. 1 is best where the sensor's place is
-    #: estimated, and the default then.
+    #: of a joint map: maximum steps sampled before they are merged into it; fewer if the effective sample size falls below
+    #: the threshold of resampling, which does not take place. 1 is best if the sensor's mounting pose is estimated, and then
+    #: the default.
     window: Count = 5
-    #: of a joint map: landmarks with which a sub-map ends and the next begins, so that a step costs the same however large
-    #: the map becomes; with 20 it ends where it reaches three times as far as the sensor. None keeps one Gaussian of all.
+    #: of a joint map: landmarks with which a sub-map ends and the next begins, which bounds the cost of a step however large
+    #: the map becomes; with 20 it ends at an extent of three times the sensor's range. None keeps one Gaussian of all.
     submap: Count | None = 150
-    #: of a joint map of landmarks with names: what is estimated with everything else: in the plane what the wheels get
-    #: wrong alike in all steps (odometry), or the sensor's place on the robot (sensor), or both (online; in space
-    #: the sensor's place alone). By default (auto) the odometry is taken as it is until what is observed is decidedly off to
-    #: one side of it, and from then on as with odometry.
+    #: of a joint map with known association: what is estimated with everything else: in the plane systematic odometry errors
+    #: (odometry), or the sensor's mounting pose (sensor), or both (online; in space the mounting pose alone). By default
+    #: (auto) the odometry is taken as unbiased until observations show a significant systematic error, and from then on as
+    #: with odometry.
     calibrate: Literal["auto", "off", "odometry", "sensor", "online"] = "auto"
-    #: what is known of a robot that calibrates itself.
+    #: priors of the self-calibration.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
-    proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
-    #: of an innovation; by default Gaussian. Of a log whose readings may be misread (MRCLAM) with outliers, if the log's
-    #: names are used: particles that differ in what no reading tells, as the heading after a blind turn, are else
-    #: chosen among by the first wrong one.
+    proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: the proposal distribution.
+    #: of an innovation; by default Gaussian. For logs with wrong associations (MRCLAM) with outliers, if the log's names are
+    #: used: particles that differ in what no reading measures, such as the heading after driving blind, are else selected by
+    #: the first wrong association.
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
     unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Self:
-        """The defaults that go with settings that are given, by name: sampled poses tell a calibration more than is known."""
+        """The defaults given other settings by name: sampled poses make a calibration overconfident, so its window is 1."""
         return cls(window=1) if given.get("calibrate") in ("sensor", "online") else cls()
 
     def uncertain(self, space: SE2Group | SE3Group) -> np.ndarray:
-        """Standard deviations (d + 4,) of what a robot may estimate of itself: its sensor's pose, then `wheel_errors`."""
+        """Standard deviations (d + 4,) of the calibration parameters: the mounting pose's, then `wheel_errors`."""
         of, is_planar = self.self_calibration, isinstance(space, SE2Group)
         yaw, shift = np.deg2rad(of.yaw_deg), (of.x_m, of.y_m, of.z_m)
         sensor = np.array([yaw, *shift[:2]] if is_planar else [0.0, 0.0, yaw, *shift])
@@ -107,7 +106,7 @@ class RangeBearingConfig(RunConfig):
             sensor[:] = 0.0
         if self.calibrate in ("off", "sensor") or not is_planar:
             wheels[:] = 0.0
-        if self.calibrate == "online":  # who turns one way cannot tell it from a sensor that stands to the side
+        if self.calibrate == "online":  # with rotations to one side it is not separable from a lateral sensor offset
             wheels[-1] = 0.0
         return np.concatenate([sensor, wheels])
 
@@ -123,6 +122,6 @@ class RangeBearingConfig(RunConfig):
         )
 
     def of_innovations(self, misread: bool) -> Likelihood:
-        """The likelihood of an innovation, where readings may be misread or not."""
+        """The likelihood of an innovation; `misread`: associations of the log may be wrong."""
         robust = misread and self.likelihood.kind is None and self.association == "known"
         return (replace(self.likelihood, kind="outliers") if robust else self.likelihood).build()

@@ -1,9 +1,9 @@
-"""Unknown association on a joint map: several explanations of what was measured, each a Gaussian of its own with a weight.
+"""Unknown association on a joint map: several weighted hypotheses, each with its own Gaussian.
 
-A hypothesis is a filter with its own joint map, and says of each measurement which landmark it is of: one for all of
-its particles. In each frame the most probable explanations are searched for in every hypothesis; those that mean something
-else, and are not much less probable, go on side by side. Which is right is left to the evidence of what comes after: no
-moments are taken over them, and none is dropped but for its weight, or for being the lightest of too many.
+A hypothesis is a filter with its own joint map and one association for all of its particles. In each frame the most probable
+associations are searched in every hypothesis; those that differ in a relevant landmark and are not much less probable are
+kept in parallel. The decision is left to the evidence of later frames: no moments are taken over hypotheses, and one is
+dropped only for its low weight, or as the lightest of too many.
 """
 
 import copy
@@ -33,12 +33,12 @@ _KEPT = {"counts": integers("steps", least=0), "chosen": integers("readings", le
 
 @dataclass
 class Hypothesis:
-    """One explanation of all that was measured."""
+    """One association of all measurements so far, with its filter."""
 
     filter: Filter
     log_weight: float = 0.0
-    log_odds: dict[int, float] = field(default_factory=dict)  #: that a landmark exists, by name.
-    #: name of every measurement, step by step, where they are kept.
+    log_odds: dict[int, float] = field(default_factory=dict)  #: log-odds that a landmark exists, by name.
+    #: landmark of every measurement, step by step, if kept.
     chosen: list[np.ndarray] = field(default_factory=list)
 
     @property
@@ -48,13 +48,13 @@ class Hypothesis:
         return held
 
     def copied(self) -> "Hypothesis":
-        """Another one that begins as this one is; generator, motion and sensors are theirs together."""
+        """A copy; random generator, motion and sensors are shared."""
         shared = self.filter.rng, self.filter.motion, self.filter.space, *self.filter.sensors, *self.chosen
         return copy.deepcopy(self, {id(one): one for one in shared})
 
 
 class _View(NamedTuple):
-    """Landmarks (M,) by name, and where they are expected, as seen from the robot: (M, D), (M, D, D)."""
+    """Names (M,) of landmarks, and their predictions relative to the robot: (M, D), (M, D, D)."""
 
     ids: np.ndarray
     mean: np.ndarray
@@ -62,7 +62,7 @@ class _View(NamedTuple):
 
 
 class _Explanation(NamedTuple):
-    """Of a frame, by a hypothesis: names (K,), NEW or NULL, what was expected, and what in the neighbourhood then is."""
+    """Association of a frame by a hypothesis: names (K,), NEW or NULL, the prediction, and nearby landmarks afterwards."""
 
     log_weight: float
     parent: Hypothesis
@@ -73,13 +73,13 @@ class _Explanation(NamedTuple):
 
 
 class Hypotheses:
-    """At most so many hypotheses, the most probable one first.
+    """A bounded set of hypotheses, the most probable one first.
 
     Args:
-        filter_: on a joint map, with a sensor of named landmarks: the names are chosen here.
-        model: how measurements arise.
-        config: of association.
-        keep: remember every association.
+        filter_: on a joint map, with a sensor of named landmarks; the names are assigned here.
+        model: the observation model.
+        config: settings of the association.
+        keep: store every association.
     """
 
     def __init__(self, filter_: Filter, model: RigidPointModel, config: AssociationConfig, keep: bool = False) -> None:
@@ -91,12 +91,12 @@ class Hypotheses:
     def step(
         self, z: Array, cov_z: Array, control: Odometry | None, stamp_ns: int | None
     ) -> tuple[np.ndarray, StepReport]:
-        """A step of every hypothesis: names (K,), NULL for clutter, and report of the first one, with the evidence of all.
+        """A step of every hypothesis: names (K,), NULL for clutter, and report of the best one, with the evidence of all.
 
-        Errors as `Filter.step`.
+        Errors as of `Filter.step`.
         """
         checked = checked_observations(Observations(z, cov_z, self.model))
-        # Explanations by weight, as the prediction judges them: those that mean something else than all weightier ones.
+        # Associations by predicted weight: those that differ from all weightier ones.
         found = list[_Explanation]()
         for one in sorted(self._explained(checked, control, stamp_ns), key=lambda one: -one.log_weight):
             if len(found) == self.most or (found and one.log_weight < found[0].log_weight - self.bound):
@@ -104,11 +104,11 @@ class Hypotheses:
             if all(self._differ(one, other) for other in found):
                 found.append(one)
 
-        # What any of them calls new has one name in all.
+        # A measurement that is new in several of them gets the same name in all.
         new = np.any([one.chosen == NEW for one in found], axis=0)
         fresh = self._next + np.cumsum(new) - 1
         self._next += int(new.sum())
-        # The last of a hypothesis's explanations goes on in it, the others in copies.
+        # The last association of a hypothesis continues in it, the others in copies.
         last = {id(one.parent): one for one in found}
         held = [one.parent if last[id(one.parent)] is one else one.parent.copied() for one in found]
         named, reports = list[np.ndarray](), list[StepReport]()
@@ -117,7 +117,7 @@ class Hypotheses:
             reports.append(self._stepped(each, named[-1], checked, control, stamp_ns))
             gained = reports[-1].log_evidence
             costs = self.gates.log_new * (one.chosen == NEW).sum() + self.gates.log_clutter * (one.chosen == NULL).sum()
-            # Where the likelihood is no density, and of what an old sub-map knows, what the prediction said.
+            # The predicted density if the likelihood is not normalised, or for landmarks of old sub-maps.
             predicted = np.isnan(gained) or one.recalls
             each.log_weight = one.log_weight if predicted else each.log_weight + gained + float(costs)
 
@@ -133,7 +133,7 @@ class Hypotheses:
         return named[first], report if np.isnan(report.log_evidence) else replace(report, log_evidence=evidence)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint must hold besides the filter of the first hypothesis."""
+        """The arrays of a checkpoint besides the first hypothesis's filter."""
         arrays = {"log_weights": np.array([each.log_weight for each in self.held]), "next": np.array([self._next])}
         for i, each in enumerate(self.held):
             own = each.filter.arrays() if i else {}
@@ -168,7 +168,7 @@ class Hypotheses:
     def _stepped(
         self, each: Hypothesis, names: np.ndarray, group: Observations, control: Odometry | None, stamp_ns: int | None
     ) -> StepReport:
-        """A step with the landmarks named; then what was expected and not seen is less probable, or dropped."""
+        """A step with the assigned names; then lowers the log-odds of landmarks expected but not observed, or drops them."""
         used, ids = names != NULL, each.map.ids
         held = set(ids.tolist())
         shown = FeatureFrame(stamp_ns or 0, names[used], group.z[used], group.cov[used])
@@ -198,20 +198,20 @@ class Hypotheses:
         return report
 
     def _explained(self, group: Observations, control: Odometry | None, stamp_ns: int | None) -> Iterator[_Explanation]:
-        """Explanations of what was observed, by all hypotheses."""
-        # Points as seen from the robot are linear in the map, whatever is measured.
+        """Associations of the observations, by all hypotheses."""
+        # Points relative to the robot are linear in the map, whatever the measurement.
         seen, origin = RelativePosition(self.model.space), self.model.space.identity()[None]
         points = self.model.initialise(origin, group.z, group.cov)
         z, noise = points.mean[0], points.cov[0]
         log_unit = 0.5 * (np.linalg.slogdet(noise)[1] - np.linalg.slogdet(group.cov)[1])
         for each in self.held:
-            # With the landmarks of old sub-maps that are near; one that is meant becomes one of the present sub-map, too.
+            # Includes nearby landmarks of old sub-maps; a matched one is added to the current sub-map, too.
             belief, wide = each.filter.expect(control, stamp_ns), each.map.widened()
             ids, dim = wide.ids, z.shape[1]
             view = _View(ids, np.zeros((0, dim)), np.zeros((0, dim, dim)))
             near, mean, cov = ids, view.mean, np.zeros((0, 0))
             if ids.size:
-                # Landmarks that are near any of the measurements, and what is expected of all of these together.
+                # Landmarks near any of the measurements, and their joint prediction.
                 view = _View(ids, *wide.project(seen, ids, belief))
                 squared = squared_mahalanobis(z[:, None] - view.mean, view.cov + noise[:, None])
                 near = ids[(squared <= self.gates.isolate).any(axis=0)]
@@ -224,9 +224,9 @@ class Hypotheses:
                 yield _Explanation(each.log_weight + one.log_density, each, chosen, view, after, recalls)
 
     def _differ(self, one: _Explanation, other: _Explanation) -> bool:
-        """Whether two explanations put a landmark at different places, as seen from the robot.
+        """Whether two associations put a landmark at different positions relative to the robot.
 
-        After the frame, of what is near: by more than the surer one can be off. Of all that was known before: for certain.
+        Nearby landmarks after the frame: beyond the smaller of the uncertainties; those known before: beyond their sum.
         """
         for mine, theirs, alone in ((one.after, other.after, True), (one.before, other.before, False)):
             _, a, b = np.intersect1d(mine.ids, theirs.ids, assume_unique=True, return_indices=True)

@@ -1,6 +1,6 @@
 """Range-bearing SLAM in the plane and in space: odometry, a mounted sensor, point landmarks, FastSLAM 2.0.
 
-`RangeBearingSlam(RangeBearingConfig(particles=100))` takes a log entry by `track(z, cov_z, names, odometry, stamp_ns)`.
+`RangeBearingSlam(RangeBearingConfig(particles=100))` processes a log entry by `track(z, cov_z, names, odometry, stamp_ns)`.
 """
 
 from dataclasses import replace
@@ -39,9 +39,9 @@ class RangeBearingSlam(System):
         measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
         robot_from_sensor: (E,) mounting pose of the sensor; by default the robot's own frame.
         pitch_sign: +1 where positive pitch points up, −1 where it points down.
-        keep_associations: remember which landmark every hypothesis took each observation for, until the end of the run
-            tells which one survives; the memory that this takes grows with the run.
-        misread: whether a reading may be of another landmark than is said.
+        keep_associations: store the association of every hypothesis, until the end of the run decides which one survives; its
+            memory grows with the run.
+        misread: whether given associations may be wrong.
     """
 
     name: ClassVar[str] = "range-bearing"
@@ -100,8 +100,10 @@ class RangeBearingSlam(System):
         self.columns = (
             *FILTER_COLUMNS,
             *([] if self.hypotheses is None else [HYPOTHESES]),
-            Column("correction", "what the observations say about the motion, in its whitened coordinates", shape=(d,)),
-            Column("cov_correction", "what a consistent filter expects of the correction", shape=(d, d)),
+            Column(
+                "correction", "correction of the motion by the observations, in its whitened coordinates", shape=(d,)
+            ),
+            Column("cov_correction", "covariance of the correction in a consistent filter", shape=(d, d)),
             Column("odometry", "world_from_robot by odometry alone", shape=(e,)),
             Column("delta", "odometry, previous_robot_from_robot; NaN in the first frame", shape=(e,)),
             Column("cov_delta", "its covariance in the right chart", "rad² and m²", shape=(d, d)),
@@ -129,12 +131,12 @@ class RangeBearingSlam(System):
         odometry: Odometry | None = None,
         stamp_ns: int | None = None,
     ) -> Tracked:
-        """One step: the motion since the last one, and what was then observed.
+        """One step: the motion since the last one, and the observations after it.
 
         Args:
             z: (K, p) measurements.
             cov_z: (K, p, p) their covariance.
-            landmarks: (K,) names; None, or −1, where they are not known.
+            landmarks: (K,) names; None, or −1, for unknown association.
             odometry: motion since the last step; None in the first one.
             stamp_ns: time; by default one second after the last step.
 
@@ -144,7 +146,7 @@ class RangeBearingSlam(System):
         self.sensor.model, odometry = self.calibration.tuned(self.filter), self.calibration.driven(odometry)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
-            # One that comes a second time in the frame that starts its landmark is not used.
+            # A second observation in the frame that starts its landmark is not used.
             again = np.ones(names.size, dtype=bool)
             again[np.unique(names, return_index=True)[1]] = False
             held = [np.ravel(group.ids) for group in report.groups if group.ids is not None]
@@ -162,7 +164,7 @@ class RangeBearingSlam(System):
 
         estimate = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
         if self.joint is not None and self.joint.old.maps:
-            # A landmark that a further sub-map begins anew has been measured before, which its density does not know.
+            # A landmark re-initialised by a new sub-map has been measured before, which its density does not include.
             report = replace(report, log_evidence=np.nan)
         d, e = self.space.dim, self.space.size
         return Tracked(
@@ -193,12 +195,12 @@ class RangeBearingSlam(System):
         found = estimate_map(self.filter)
         if self.hypotheses is None:
             return found
-        # Landmarks that more probably exist than not.
+        # Landmarks that exist with probability above one half.
         held = np.array([self.hypotheses.held[0].log_odds[name] > 0.0 for name in found.ids.tolist()], dtype=bool)
         return MapEstimate(found.ids[held], found.mean[held], found.cov[held])
 
     def measurements(self, name: str, log: FrameLog) -> Measurements:
-        """The odometry, and every observation that updated a landmark or started one."""
+        """The odometry, and all observations that updated or initialised a landmark."""
         frames = [log.observed(t) for t in range(len(log))]
         landmarks = self._final(log)
         used = [np.flatnonzero(ids >= 0) for ids in landmarks]
@@ -225,7 +227,7 @@ class RangeBearingSlam(System):
         )
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
-        """How much was observed and kept, and how far the particles have forgotten the past, if they sample it."""
+        """Counts of observations and landmarks, and the loss of particle diversity if paths are sampled."""
         distinct = {"ancestors_of_first_generation": self.filter.history.distinct_first()}
         return {
             "landmarks": int(self.map().ids.size),
@@ -237,7 +239,7 @@ class RangeBearingSlam(System):
         }
 
     def _final(self, log: FrameLog) -> list[np.ndarray]:
-        """The landmark of every observation, one array (K,) per step, as known now: by the heaviest hypothesis, if kept."""
+        """The landmark of every observation, one array (K,) per step, by the heaviest hypothesis, if stored."""
         found = [log.observed(t)["landmarks"] for t in range(len(log))]
         if self.hypotheses is None or not self.hypotheses.keep:
             return found

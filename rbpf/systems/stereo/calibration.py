@@ -1,8 +1,8 @@
-"""A pair that calibrates itself: an error common to all disparities is a constant of the joint map, learnt with all else.
+"""Self-calibration of a stereo pair: a common disparity offset as a constant of the joint map.
 
-Whether there is one is decided by evidence (`calibrate=auto`): until all pairs so far are far more probable with it than
-without, the constant is as good as known to be 0. How the map hangs on it tells by how much more probable they are, and how
-all poses move once it is learnt.
+Model selection decides whether there is one (`calibrate=auto`): the constant is nearly fixed at 0 until all pairs so far are
+far more probable with an offset than without. The map's regression on the constant gives the change of the evidence, and of
+all poses once it is estimated.
 """
 
 from typing import Any, ClassVar, final
@@ -22,20 +22,20 @@ from rbpf.systems.stereo.landmarks import F
 from rbpf.systems.system import Revision
 
 DECISIVE = 18.0
-"""Nats by which one of the two explains the pairs better when that is no chance any more: as much as six sigma."""
+"""Log-evidence ratio (nats) that decides between the two models: as much as six sigma."""
 AS_GOOD_AS_KNOWN = 1e-3
-"""How uncertain the constant is before, as a fraction of what it is then."""
+"""Standard deviation of the constant before the decision, as a fraction of that after it."""
 KNOWN = 0.25
-"""To which fraction of that it must be known to be decided: where little tells it, what else disparities err by is as much."""
+"""Largest posterior standard deviation, relative to the prior, for a decision: a weak estimate may be other errors."""
 REVISED = 1000
-"""Pairs before the decision whose poses are told anew, at most."""
+"""Maximum number of earlier poses that are revised at the decision."""
 
 
 @final
 class SelfCalibration(Kept):
-    """By how many px all disparities are too small; nothing, and certain, where that is not learnt.
+    """The offset by which all disparities are too small, px; exactly 0 if it is not estimated.
 
-    Raises InputError: it is asked for, and has no place in the map.
+    Raises InputError: it is requested explicitly, but the map cannot hold it.
     """
 
     kept: ClassVar = {
@@ -56,18 +56,18 @@ class SelfCalibration(Kept):
                 "calibrate=online holds the error of all disparities in a joint map of points: leave out map.kind=particles, "
                 "and a model of your own"
             )
-        #: Whether the map and the front end have a place for it, and it is not refused.
+        #: Whether map and front end support it, and it is not switched off.
         self.is_held = is_possible and config.calibrate != "off"
         self._free = Constants(np.zeros(1), np.full((1, 1), config.self_calibration.disparity_px**2))
         scale = 1.0 if self.is_estimated else AS_GOOD_AS_KNOWN
-        #: Mean (1,) and covariance (1, 1) before anything is seen, for the joint map; None where it has no place.
+        #: Prior mean (1,) and covariance (1, 1) for the joint map; None if it is not supported.
         self.prior = (np.zeros(1), scale**2 * self._free.cov) if self.is_held else None
-        # How the last update's pose moves with it; and, told before it was decided, poses, covariances and how they move.
+        # Regression of the last update's pose on it; and of the poses before the decision, with these and their covariances.
         self._slope, self.slopes = np.zeros(6), np.zeros((0, 6))
         self.stamps_ns, self.poses, self.covs = np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.zeros((0, 6, 6))
 
     def watch(self, filter_: Filter) -> str:
-        """After an update: in words, that from here on it is estimated, and was not before."""
+        """To be called after an update; returns a message if its estimation starts here."""
         if self.is_estimated or not self.is_held:
             return ""
         joint, particles = self._joint(filter_), filter_.particles
@@ -85,11 +85,11 @@ class SelfCalibration(Kept):
     def told(
         self, filter_: Filter, stamp_ns: int, pose: np.ndarray, cov: np.ndarray, since_update: np.ndarray
     ) -> Revision | None:
-        """All poses so far, anew, where it was decided by this pair, which has moved so since the last update."""
+        """The revision of all poses if this pair was decisive; `since_update` (7,) is the motion since the last update."""
         if not self.is_held or (self.is_estimated and not self.stamps_ns.size):
             return None
         if self.is_estimated:
-            # This pose knows what is learnt, the others do not.
+            # The current pose includes the estimate, the earlier ones do not.
             offset_px, std_px = self.estimate(filter_)
             self.poses = SE3.retract(self.poses, offset_px * self.slopes)
             self.covs = self.covs + std_px**2 * self.slopes[:, :, None] * self.slopes[:, None, :]
@@ -106,24 +106,24 @@ class SelfCalibration(Kept):
         return revision
 
     def estimate(self, filter_: Filter) -> tuple[float, float]:
-        """As it is known by now, with its standard deviation, px."""
+        """The current estimate with its standard deviation, px."""
         if not self.is_estimated:
             return 0.0, 0.0
         mean, cov = self._joint(filter_).moments(filter_.particles, Part.SUBSTATE)
         return float(mean[0]), float(np.sqrt(cov[0, 0]))
 
     def tune(self, filter_: Filter) -> float:
-        """As it is known by now the next pair is measured; px."""
+        """Sets the front end to the current estimate for the next pair; returns it, px."""
         offset_px, _ = self.estimate(filter_)
         if self.is_held:
             self.front_end.tune(np.array([offset_px]))
         return offset_px
 
     def retuned(self, filter_: Filter, features: F, then_px: float) -> F:
-        """Features of a pair, which was measured by `then_px`, as they are known after the filter has taken it.
+        """Features of a pair, measured with the offset `then_px`, corrected to the estimate after the filter's update.
 
-        The next pair is matched with them and measured by the same calibration: else what was learnt looks like a motion in
-        depth.
+        The next pair is matched with them under the same calibration; otherwise a change of the estimate would look like
+        motion in depth.
         """
         return self.front_end.shifted(features, then_px - self.estimate(filter_)[0]) if self.is_estimated else features
 

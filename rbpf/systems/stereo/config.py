@@ -22,25 +22,25 @@ OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0
 
 @dataclass(frozen=True)
 class OdometryConfig(Ranged):
-    """Motion from pair to pair (S05 §III-C), and its noise as the filter takes it."""
+    """Motion from pair to pair (S05 §III-C), and its noise in the filter."""
 
     estimate: VoConfig = field(default_factory=VoConfig)  #: how a motion is estimated from matches.
-    #: what is expected before anything is seen, and assumed where nothing is.
+    #: the motion prior, assumed if the estimate fails.
     prior: Annotated[MotionPrior, Formerly("prediction")] = field(default_factory=MotionPrior)
     limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors of two pairs.
-    std_added_rad: NotNegative = 0.0  #: injected per update (S05 §V), standard deviation of the turn about each axis.
-    std_added_m: NotNegative = 0.0  #: likewise of the shift along each axis.
-    #: S05 uses each feature twice, for the odometry and for the map ("none"). To measure what that does, the features
-    #: can be divided at random into two halves: one for the odometry and the other for the map ("apart"), or one of
-    #: them for both ("same").
+    std_added_rad: NotNegative = 0.0  #: added per update (S05 §V), standard deviation of the rotation about each axis.
+    std_added_m: NotNegative = 0.0  #: likewise of the translation along each axis.
+    #: S05 uses each feature twice, for the odometry and for the map ("none"). To measure the effect, the features can be
+    #: split at random into two halves: one for the odometry and the other for the map ("apart"), or one of them for both
+    #: ("same").
     split: Literal["none", "apart", "same"] = "none"
-    #: what the filter takes the odometry for. "motion" is S05: it moves the particles, with its own covariance, and the
-    #: map weighs them with the same pixels again. "proposal" uses them once: particles move by `prior`, the landmarks
-    #: weigh, and the odometry says where the proposal is linearised and landmarks are looked for. What pairs tell then
-    #: enters by the map alone: it needs proposal.kind=ekf, map.weigh=all, and landmarks enough.
+    #: role of the odometry in the filter. "motion" is S05: it moves the particles with its covariance, and the map weighs
+    #: them with the same pixels again. "proposal" uses pixels once: particles move by `prior`, the landmarks weigh, and the
+    #: odometry is the linearisation point of the proposal and the search. Motion information then enters only by the map: it
+    #: needs proposal.kind=ekf, map.weigh=all, and enough landmarks.
     role: Literal["motion", "proposal"] = "motion"
-    #: whether the errors of consecutive motions are chained as if they were independent, as in S05, though both motions
-    #: come from the pixels of the pair between them.
+    #: whether errors of consecutive motions are treated as independent, as in S05, although both motions share the pixels of
+    #: the pair between them.
     independent: bool = False
 
 
@@ -48,35 +48,35 @@ class OdometryConfig(Ranged):
 class MapConfig(Ranged):
     """Which features of a pair are landmarks of the map."""
 
-    used: bool = True  #: whether there is a map; without one the filter is the odometry and its noise.
-    #: one Gaussian of all landmarks and the frame, given the last few updates (joint): an uncertainty that stays true; or
-    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), as in S05. With a
-    #: joint map the odometry is the proposal, linearised once, and all candidates weigh, whatever odometry.role, proposal and
-    #: map.weigh say, and the likelihood must be a density. `StereoConfig.s05` has the defaults that go with particles, as
-    #: do the settings of a run that asks for them.
+    used: bool = True  #: whether there is a map; without one the filter is odometry with noise.
+    #: one Gaussian of all landmarks and the frame, given the last few updates (joint), which stays consistent; or
+    #: per-particle landmarks, Gaussians given the whole sampled path (particles), as in S05. With a joint map the odometry is
+    #: the proposal, linearised once, and all candidates weigh, regardless of odometry.role, proposal and map.weigh, and the
+    #: likelihood must be normalised. `StereoConfig.s05` has the defaults for particles, also used if the settings select
+    #: them.
     kind: Literal["particles", "joint"] = "joint"
-    #: of a joint map: updates sampled, at most, before they are taken into it; fewer where the effective sample size
-    #: falls below the threshold of resampling, which does not take place.
+    #: of a joint map: maximum updates sampled before they are merged into it; fewer if the effective sample size falls below
+    #: the threshold of resampling, which does not take place.
     window: Count = 1
-    #: of a joint map: landmarks beyond which a sub-map ends; those in the pair, and of the others those seen last up to half
-    #: of these, go over into the next one, and old ones come back when they are seen again. No landmark is dropped.
+    #: of a joint map: landmarks beyond which a sub-map ends; those in the pair, and the most recently seen others up to half
+    #: of these, are passed on to the next one; old ones return when they are re-observed. No landmark is dropped.
     submap: Annotated[Count, Formerly("active")] = 300
-    #: whether candidates, no landmarks yet, weigh the particles, too; in the map they are in any case.
+    #: whether candidates, which are not confirmed yet, also weigh the particles; they are in the map in any case.
     weigh: Literal["landmarks", "all"] = "landmarks"
     limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors of a feature and a landmark.
-    #: largest squared Mahalanobis distance from where the particles expect the landmark; 11.3 holds 99 %.
+    #: largest squared Mahalanobis distance from the landmark's prediction; 11.3 is the 99 % quantile.
     gate: Positive = 11.3
-    slack_px: NotNegative = 1.0  #: added to that expectation, standard deviation per axis.
-    #: particles, drawn evenly from the weight, that say where a landmark is expected.
+    slack_px: NotNegative = 1.0  #: added to the prediction, standard deviation per axis.
+    #: number of particles, drawn by weight, used to predict landmarks.
     subsample: Annotated[Count, Formerly("cloud")] = 32
-    margin_px: float = 20.0  #: landmarks so far outside the image, as the heaviest particle sees it, may be in it.
-    #: a landmark is not looked for once its line of sight has turned by this since it was seen last.
+    margin_px: float = 20.0  #: margin around the heaviest particle's image within which landmarks may be in view.
+    #: a landmark is not searched once its viewing direction has changed by this since its last observation.
     max_turn_deg: Annotated[Angle, Formerly("turn_deg")] = 45.0
-    max_scale_change: Annotated[Ratio, Formerly("scale")] = 2.0  #: nor once it is so many times nearer or farther.
-    #: where landmarks are expected with a larger standard deviation than this, the gate lets much pass: the matches
-    #: must then agree on one motion …
+    max_scale_change: Annotated[Ratio, Formerly("scale")] = 2.0  #: nor once its distance has changed by this factor.
+    #: if predictions have a larger standard deviation than this, the gate accepts many matches: they must then agree on one
+    #: motion …
     vague_px: Annotated[NotNegative, Formerly("doubt_px")] = 15.0
-    #: … and be so many, else none is taken, and the expectation stays as vague.
+    #: … and number at least this many, else none is used.
     min_agreeing: Annotated[int, Range(ge=3), Formerly("agreeing")] = 6
     #: a feature starts a landmark if the standard deviation of its depth is below this fraction of it.
     depth_fraction: Annotated[Positive, Formerly("depth_share")] = 0.1
@@ -84,16 +84,16 @@ class MapConfig(Ranged):
 
 @dataclass(frozen=True)
 class TriggerConfig(Ranged):
-    """The filter is updated only when the camera has moved enough since the last update (S05 §IV)."""
+    """The filter is updated only once the camera has moved enough since the last update (S05 §IV)."""
 
-    moved_m: NotNegative = 0.02  #: by so much …
-    turned_rad: NotNegative = 0.02  #: … or turned by so much …
-    frames: CountOrNone = 0  #: … or, having moved at all or not, after so many pairs; 0 for never.
+    moved_m: NotNegative = 0.02  #: least translation …
+    turned_rad: NotNegative = 0.02  #: … or rotation …
+    frames: CountOrNone = 0  #: … or number of pairs, whatever the motion; 0 for never.
 
     def reached(self, motion: Odometry, frames: int) -> bool:
-        """Whether the camera has moved enough since the last update, so many pairs ago.
+        """Whether the camera has moved enough since the last update, `frames` pairs ago.
 
-        By the root mean square, so that uncertainty counts as motion.
+        Compares the root mean square motion, so that uncertainty counts as motion.
         """
         variance = np.diagonal(motion.cov)
         turned, moved = SE3.log(motion.delta)[:3], SE3.translation(motion.delta)
@@ -104,25 +104,25 @@ class TriggerConfig(Ranged):
 
 @dataclass(frozen=True)
 class RecoveryConfig(Ranged):
-    """What is done where the motion since the last update was only assumed, for all or part of the way.
+    """Recovery if the motion since the last update was only assumed, at least in part.
 
-    The distribution of an assumed motion is far wider than what the map's landmarks leave open: no particle that is
-    drawn from it comes to lie where they are seen.
+    The distribution of an assumed motion is far wider than the posterior given the map's landmarks: no particle drawn from it
+    lies where they are observed.
     """
 
-    #: whether anything is done; without, such a motion moves the particles like any other, as in S05.
+    #: whether recovery is used; else such a motion moves the particles like any other, as in S05.
     used: bool = True
-    #: pairs after which the map goes on from wherever the camera may be: it may have come to where nothing was mapped.
+    #: pairs after which mapping continues from the assumed pose, as the camera may be in unmapped surroundings.
     patience: CountOrNone = 60
-    #: of an update after such a motion.
+    #: proposal of an update after such a motion.
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("ekf", iterations=5))
 
 
 @dataclass(frozen=True)
 class CalibrationConfig(Ranged):
-    """A pair that calibrates itself: how far its calibration may be from what is given, as a standard deviation."""
+    """Prior of a pair's self-calibration, as standard deviation from the given calibration."""
 
-    #: of all disparities together, px: 0.1 are cameras that are turned against each other by a hundredth of a degree.
+    #: of the common disparity offset, px: 0.1 corresponds to a relative yaw of a hundredth of a degree.
     disparity_px: Positive = 0.1
 
 
@@ -141,22 +141,22 @@ class StereoConfig(RunConfig):
     map: MapConfig = field(default_factory=MapConfig)  #: which features are landmarks.
     #: which features become landmarks, and how long they stay.
     new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
-    #: of a joint map: the pair calibrates itself, an error common to all disparities being estimated with everything else
-    #: (online); by default from when on that explains all pairs so far far better (auto).
+    #: of a joint map: self-calibration, estimating a common disparity offset with everything else (online); by default only
+    #: once it explains all pairs so far far better (auto).
     calibrate: Literal["auto", "off", "online"] = "auto"
-    #: what is known of a pair that calibrates itself.
+    #: prior of the self-calibration.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    #: of a landmark's innovation: with heavy tails, or S05 (6) with maps of the particles' own.
+    #: of a landmark's innovation: with heavy tails, or S05 (6) with per-particle maps.
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("student", outlier_volume=OUTLIER_VOLUME_PX3)
     )
-    proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))  #: where particles are sampled.
-    #: what is done after a motion that was only assumed.
+    proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))  #: the proposal distribution.
+    #: recovery after an assumed motion.
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
 
     @classmethod
     def s05(cls) -> Self:
-        """The defaults that go with maps of the particles' own: 400 of them, S05's truncated likelihood, keypoints' places."""
+        """The defaults for per-particle maps: 400 particles, S05's truncated likelihood, keypoints without alignment."""
         return cls(
             particles=400,
             pair=PairConfig(align=False),
@@ -166,10 +166,10 @@ class StereoConfig(RunConfig):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Self:
-        """The defaults that go with settings that are given, by name."""
+        """The defaults given other settings by name."""
         group = given.get("map")
         if isinstance(group, dict) and group.get("kind") == "particles":
             return cls.s05()
-        # Visual odometry alone has no use for a joint map, and its points may be aligned as well.
+        # Visual odometry alone needs no joint map, and its points may be aligned as well.
         is_used = not isinstance(group, dict) or group.get("used") is not False
         return cls() if is_used else replace(cls.s05(), pair=PairConfig())

@@ -1,4 +1,4 @@
-"""Where a stereo camera has come by its odometry alone, between the filter's updates and beyond them."""
+"""Dead reckoning of a stereo camera by visual odometry, between the filter's updates."""
 
 from dataclasses import dataclass, field
 from typing import final
@@ -25,30 +25,30 @@ _KEPT = {
 @final
 @dataclass(frozen=True, eq=False)
 class DeadReckoning:
-    """Where the camera has come by visual odometry, pair after pair, also over pairs that could not be used.
+    """Composed visual odometry, pair by pair, also over pairs that could not be used.
 
-    What is known of its motion at a pair, before the filter sees it.
+    The state at a pair, before the filter's update.
     """
 
-    stamp_ns: int | None = None  #: time of the last pair that was measured, from which the next one is; None before.
+    stamp_ns: int | None = None  #: time of the last measured pair, the reference of the next one; or None.
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  #: (6,) [ω, v] of the camera then, rad/s, m/s.
     since_update: Odometry = field(default_factory=Odometry.at_rest)  #: motion since the filter's last update.
-    #: (7,) by odometry alone; the first camera is the world.
+    #: (7,) world_from_camera by odometry alone; the first camera is the world.
     world_from_camera: np.ndarray = field(default_factory=SE3.identity)
-    assumed: int = 0  #: pairs since the filter's last update over which the motion was only assumed.
+    assumed: int = 0  #: pairs since the filter's last update with an assumed motion.
     waiting: int = 0  #: pairs since the first of these.
-    hidden: bool = False  #: whether nothing in the pair stood still.
-    passed_over: int = 0  #: pairs since that could not be measured.
+    hidden: bool = False  #: whether nothing in the pair was static.
+    passed_over: int = 0  #: pairs since the last measured one that could not be measured.
     velocity_at_update: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    #: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the last
-    #: measured pair, which the next step shares; none where the step was not chained or not measured.
+    #: (K, 6, 3) covariances of the last step's error, in the right chart there, with the pixel noise of each feature of the
+    #: last measured pair, which the next step shares; empty if the step was not chained or not measured.
     noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 6, 3)))
-    #: (K, 3, 4) pixels and their covariance, at the filter's last update, of each feature of the last measured pair that was
-    #: followed from there on and was of no use to a joint map then; zeros for others, and none with other maps.
+    #: (K, 3, 4) pixels and their covariance, at the filter's last update, of those features of the last measured pair that
+    #: were tracked since then and not used by a joint map; zeros for others, and empty with other maps.
     left_over: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4)))
 
     def seconds(self, stamp_ns: int) -> float:
-        """Time since the last pair that was measured; infinite before the first."""
+        """Time since the last measured pair; infinite before the first."""
         return np.inf if self.stamp_ns is None else 1e-9 * (stamp_ns - self.stamp_ns)
 
     def moved(
@@ -62,10 +62,11 @@ class DeadReckoning:
         noise: np.ndarray | None = None,
         left_over: np.ndarray | None = None,
     ) -> "DeadReckoning":
-        """At a pair, `step` after the last measured one, which it was matched with, or that is passed over.
+        """The state at the next pair, which was matched with the last measured one, or is passed over.
 
-        `step` is what was expected where it `is_assumed`; `cross` (6, 6) is the covariance of the last step's error and this
-        one's, None for independent ones; `noise` and `left_over` are those after this step, as the attributes.
+        `step` is the motion since the last measured pair, the prior's if it `is_assumed`; `cross` (6, 6) is the covariance
+        between the last step's error and this one's, None for independent ones; `noise` and `left_over` are the attributes
+        after this step.
         """
         missed = 1 + self.passed_over if is_assumed else 0
         return DeadReckoning(
@@ -82,7 +83,7 @@ class DeadReckoning:
         )
 
     def updated(self) -> "DeadReckoning":
-        """After the filter has taken the motion up to the last measured pair."""
+        """The state after the filter's update with the motion up to the last measured pair."""
         world = self.world_from_camera
         return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=world, velocity_at_update=self.velocity)
 

@@ -1,8 +1,8 @@
-"""What a stereo camera's frames show: features of each pair, and which of two pairs are the same point.
+"""Front end of stereo SLAM: features of each pair, and matches between two pairs.
 
-A front end measures a frame, which gives a `Pair`, and matches two pairs. It holds no pair itself: nothing depends on
-the order of its calls. Where `odometry.split` is not "none", odometry and map use features of their own: each feature is
-always in the same half, whenever it is seen.
+A front end measures a frame, giving a `Pair`, and matches two pairs. It stores no pair itself: results do not depend on the
+order of calls. If `odometry.split` is not "none", odometry and map use disjoint features: each feature is always in the same
+half.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
 _STOOD = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
 PIXELS = {"z": numbers("features", 3), "cov": numbers("features", 3, 3)}
-#: What the rest of `StereoFeatures` follows from.
+#: The fields of `StereoFeatures` from which the others are computed.
 KEPT = PIXELS | {
     "scale": numbers("features"),
     "orientation": numbers("features"),
@@ -41,58 +41,58 @@ class FrontEnd(ABC, Generic[F]):
     """Measures frames and matches pairs."""
 
     takes: ClassVar[type[Any]]  #: of the frames.
-    names_landmarks: ClassVar[bool] = False  #: whether the frames themselves say which landmark each feature is.
-    #: attributes of the features of a pair from which `features` makes them again, for checkpoints.
+    names_landmarks: ClassVar[bool] = False  #: whether the frames have known association.
+    #: attributes of a pair's features from which `features` restores them, for checkpoints.
     kept: ClassVar[Schema]
     rig: RectifiedStereo
     config: StereoConfig
-    landmarks: Landmarks[F]  #: the map's side: finds landmarks among the features.
+    landmarks: Landmarks[F]  #: associates features with the map's landmarks.
 
     @abstractmethod
     def measure(self, frame: Any) -> tuple[Pair[F], str]:
-        """What a frame shows, and in words what is wrong with it; empty where nothing is.
+        """The features of a frame, and a warning; empty if there is none.
 
-        Raises InputError: the frame shows that the cameras are not what they should be.
+        Raises InputError: the frame contradicts the camera model.
         """
 
     def refusal(self, frame: Any) -> str:
-        """In words, why a frame cannot be one of these cameras; empty where it can. `measure` then finds nothing in it."""
+        """The reason why a frame cannot be from these cameras, else empty. `measure` then returns no features."""
         return ""
 
     def impossible(self) -> tuple[int, int]:
-        """Matches within the frame that was measured last which no point in space has, and all of them."""
+        """Numbers of negative-disparity matches and of all matches in the frame measured last."""
         return 0, 0
 
     @property
     def is_tunable(self) -> bool:
-        """Whether cameras that calibrate themselves can be measured."""
+        """Whether self-calibration is supported."""
         return type(self).tune is not FrontEnd.tune and isinstance(self.landmarks.model, StereoPoint)
 
     def tune(self, about: np.ndarray) -> None:
-        """Columns of the right image are too large by `about` (1,) px: from here on they are measured without that."""
+        """Sets the offset `about` (1,) px of the right image's columns, which is subtracted from later measurements."""
         raise InputError(f"{type(self).__name__} has no cameras that calibrate themselves")
 
     def shifted(self, features: F, by_px: float) -> F:
-        """With columns of the right image so much larger: as they are now known to be. It must be overridden with `tune`."""
+        """The features with the right image's columns increased by `by_px`. It must be overridden with `tune`."""
         raise InputError(f"{type(self).__name__} has no cameras that calibrate themselves")
 
     @abstractmethod
     def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (M,) of the earlier pair and (M,) of the later one that are the same point, as the odometry takes it."""
+        """Rows (M,) of the earlier pair and (M,) of the later one that match, for the odometry."""
 
     def aligned(self, before: Pair[F], now: Pair[F], rows: tuple[np.ndarray, np.ndarray]) -> Pair[F]:
-        """The later pair, such rows of it put where the earlier one's points are exactly; by default as they were measured."""
+        """The later pair, with the matched rows aligned to the earlier one's patches; by default unchanged."""
         return now
 
     def matches(self, before: Pair[F], now: Pair[F], rows: tuple[np.ndarray, np.ndarray]) -> Matches:
-        """The pixels of such rows."""
+        """The pixels of matched rows."""
         first, second = before.features.take(rows[0]), now.features.take(rows[1])
         return Matches.checked(self.rig, first.z, second.z, first.cov, second.cov)
 
     def landmarks_of(self, pair: Pair[F], updated: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Landmark (K,) of each feature, NULL where there is none, and `FeatureKind` (K,) of each.
+        """Landmark (K,) of each feature, or NULL, and `FeatureKind` (K,) of each.
 
-        Of the pair that was measured last; `updated` says whether the filter has taken it.
+        For the pair measured last; `updated` tells whether it was in a filter update.
         """
         if updated:
             return self.landmarks.ids, self.landmarks.kinds()
@@ -100,14 +100,14 @@ class FrontEnd(ABC, Generic[F]):
 
     @abstractmethod
     def features(self, kept: dict[str, np.ndarray]) -> F:
-        """Features of which a checkpoint has held these arrays."""
+        """Features from the arrays of a checkpoint."""
 
     @abstractmethod
     def half(self, features: F) -> np.ndarray:
-        """A random half (K,) bool of the features, in which each is always or never, whenever it is seen."""
+        """Mask (K,) of a random half of the features, the same for all observations of a feature."""
 
     def arrays(self, pair: Pair[F]) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
+        """The arrays for a checkpoint."""
         return {f"pair/{name}": getattr(pair.features, name) for name in self.kept} | {"pair/stood": pair.labels}
 
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[F]:
@@ -117,10 +117,10 @@ class FrontEnd(ABC, Generic[F]):
         return replace(self.pair(0, self.features(found)), labels=labels)
 
     def pair(self, stamp_ns: int, features: F) -> Pair[F]:
-        """A pair whose features odometry and map share as the settings say."""
+        """A pair with its features assigned to odometry and map by the settings."""
         split, everything, half = self.config.odometry.split, np.ones(len(features), dtype=bool), self.half(features)
         for_map = {"none": everything, "same": half, "apart": ~half}[split]
-        # A point at infinity or beyond is no landmark.
+        # Points with no positive finite depth cannot be landmarks.
         for_map = for_map & (features.z[:, 0] > features.z[:, 2]) & self.config.map.used
         for_odometry = everything if split == "none" else half
         return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))
@@ -133,7 +133,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         rig: the cameras.
         config: all settings.
         extractor: see `rbpf.systems.stereo.slam.StereoSlam`.
-        landmarks: finds landmarks among the features; None for `DescriptorLandmarks`.
+        landmarks: associates features with landmarks; None for `DescriptorLandmarks`.
     """
 
     takes = ImageFrame
@@ -161,7 +161,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         return replace(pair, images=self.matcher.images, offset_px=self.matcher.offset_px), problem
 
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
-        """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
+        """Features of both images, matched along the rows, or None; and a warning, if any.
 
         Raises InputError: left and right image are swapped.
         """
@@ -211,6 +211,6 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         return StereoFeatures.measured(self.rig, *kept.values())
 
     def half(self, features: StereoFeatures) -> np.ndarray:
-        """Whose descriptor's first numbers outweigh its last ones."""
+        """By whether the descriptor's first entries outweigh its last ones."""
         side = features.descriptors.shape[1] // 3
         return features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)

@@ -1,11 +1,11 @@
-"""The map's landmarks in the features of a stereo pair, and new ones (S05 §III-B, §V).
+"""Data association of stereo features with the map's landmarks, and new landmarks (S05 §III-B, §V).
 
-A landmark competes for a feature if it may be in view, its descriptor is like the feature's, and the particles expect
-it there. Each feature is then one landmark's, the same for all particles, or has none: a null correspondence, which
-costs all particles the same. Landmarks that have not been seen often enough are candidates: they are in the map, where
-they follow each particle's path, without a say in the particles' weights.
+A landmark is a candidate for a feature if it may be in view, their descriptors are similar, and the feature is within the
+gate of its prediction. Each feature is then associated with one landmark, the same in all particles, or with none: a null
+correspondence, which costs all particles the same. Landmarks that have not been observed often enough are candidates: they
+are in the map and are updated, but do not weigh the particles.
 
-`DescriptorLandmarks` finds landmarks by SIFT descriptors; by names that the recording gives: `named_pixels.py`.
+`DescriptorLandmarks` associates by SIFT descriptors; known association is in `named_pixels.py`.
 """
 
 import time
@@ -40,21 +40,21 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.places import Places, make_room, places_of
 from rbpf.systems.system import MAP_IDS
 
-SEEN_AGAIN = 2  #: Observations of a landmark that stands still: one that moves is not where it was seen first.
-TINY = 1e-6  #: Added to the variance of expected pixels, px²: a landmark may be known exactly.
+SEEN_AGAIN = 2  #: Observations that show that a landmark is static.
+TINY = 1e-6  #: Added to the variance of predicted pixels, px², as a landmark may be known exactly.
 
 
 class FeatureKind(IntEnum):
-    """What a feature of a pair is to the map."""
+    """Role of a feature in the map."""
 
-    FEATURE = 0  #: nothing.
+    FEATURE = 0  #: not associated.
     LANDMARK = 1  #: a landmark that weighed the particles.
-    CANDIDATE = 2  #: a landmark that has not been seen often enough to weigh them.
-    NEW = 3  #: a landmark that it started.
+    CANDIDATE = 2  #: a landmark not observed often enough to weigh them.
+    NEW = 3  #: a new landmark initialised by it.
 
 
 class PairFeatures(Protocol):
-    """What a front end measures in a pair, with all that tells one feature from another.
+    """Features measured by a front end in a pair.
 
     Pixels z (K, 3) (u_left, v, u_right), and the covariance (K, 3, 3) of their noise, px².
     """
@@ -74,85 +74,85 @@ F = TypeVar("F", bound=PairFeatures)
 @final
 @dataclass(frozen=True, eq=False)
 class Pair(Generic[F]):
-    """What one frame showed; as the map is asked about it and the filter updated by it, without what is of moving things."""
+    """The features of one frame; for association and the filter's update without those on moving objects."""
 
     stamp_ns: int
     features: F  #: K of them.
     for_odometry: np.ndarray  #: (K,) bool, which the odometry may use.
     for_map: np.ndarray  #: (K,) bool, which the map may use.
-    labels: np.ndarray  #: (K,) whether each stood still, see `rbpf.systems.stereo.motion_segmentation`.
-    #: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks that were seen
-    #: again before, and none are started.
+    labels: np.ndarray  #: (K,) whether each was static, see `rbpf.systems.stereo.motion_segmentation`.
+    #: whether the camera's motion was only assumed: associations must then agree on one motion, of re-observed landmarks, and
+    #: no landmark is initialised.
     uncertain: bool = False
-    #: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
+    #: (K,) landmark of each feature, or NULL; None before association.
     landmarks: np.ndarray | None = None
-    starts: np.ndarray | None = None  #: rows of features that start landmarks; None where that is still to be found.
-    #: left and right, in which points that are known again are looked for; None for nowhere.
+    starts: np.ndarray | None = None  #: rows of features that initialise landmarks; None before they are selected.
+    #: left and right image, for the alignment of re-observed points; or None.
     images: tuple[np.ndarray, np.ndarray] | None = None
-    offset_px: float = 0.0  #: by which columns of the right image are too large: the features are without it.
+    offset_px: float = 0.0  #: offset of the right image's columns, already subtracted from the features.
 
     def __len__(self) -> int:
         return len(self.features)
 
 
 class Landmarks(Sensor, ABC, Generic[F]):
-    """Finds landmarks among features, and starts new ones. A subclass says how a landmark is known again."""
+    """Associates features with landmarks, and initialises new ones. A subclass implements the recognition."""
 
     rig: RectifiedStereo
-    model: CameraModel  #: how a landmark is measured.
+    model: CameraModel  #: observation model of a landmark.
     landmark: Landmark  #: its parametrisation.
-    ids: np.ndarray  #: (K,) landmark of each feature of the pair that the filter took last, NULL where there is none.
-    seconds: float = 0.0  #: that finding them took.
-    noise: LearntNoise | None = None  #: of the features, beside what they say, where that is learnt.
+    ids: np.ndarray  #: (K,) landmark of each feature of the last update's pair, or NULL.
+    seconds: float = 0.0  #: time of the association.
+    noise: LearntNoise | None = None  #: learnt noise factor of the features, or None.
 
     @abstractmethod
     def associate(self, pair: Pair[F], belief: Belief) -> np.ndarray:
-        """Landmark (K,) of each feature, NULL where it has none."""
+        """Landmark (K,) of each feature, or NULL."""
 
     def put_away(self, pair: Pair[F], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
-        """Landmark (K,) of some features, (K,) bool, of those that a joint map has put away; else, as by default, NULL."""
+        """For features in the mask `free` (K,) their landmark (K,) among those put away by a joint map; by default NULL."""
         return np.full(len(pair), NULL, dtype=np.int64)
 
     def left_over(self, pair: Pair[F]) -> tuple[Pair[F], np.ndarray]:
-        """The pair with those of its features that start landmarks, and which (K,) the map does not use; by default none."""
+        """The pair with `starts` set, and a mask (K,) of features that the map does not use; by default none."""
         return pair, np.zeros(len(pair), dtype=bool)
 
     def told(self, pair: Pair[F]) -> F:
-        """The features of the pair that the filter took last, as it was told of them; by default as they were measured."""
+        """The features of the last update's pair, as used by the filter; by default as measured."""
         return pair.features
 
     @abstractmethod
     def seen_again(self) -> np.ndarray:
-        """(M,) landmarks that were found again where the map has them: these stand still, and tell a place."""
+        """(M,) landmarks that were re-observed consistently: they are static and usable for relocalisation."""
 
     def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where landmarks (k,) will be measured: (k, 3) and covariance (k, 3, 3) without the measurements' noise."""
+        """Predicted measurements of landmarks (k,): (k, 3) and covariance (k, 3, 3) without the measurement noise."""
         return belief.project(self.model, ids)
 
     def kinds(self) -> np.ndarray:
-        """(K,) `FeatureKind` of each feature of the pair that the filter took last; by default all are landmarks."""
+        """(K,) `FeatureKind` of each feature of the last update's pair; by default all are landmarks."""
         return np.full(self.ids.size, FeatureKind.LANDMARK)
 
     def confirmed_static(self) -> np.ndarray:
-        """Rows of features of that pair that are where the map has them: they stand still. By default none is known."""
+        """Rows of that pair's features that are consistent with the map, and thus static. By default none."""
         return np.zeros(0, dtype=np.intp)
 
     def columns(self, ids: np.ndarray) -> dict[str, np.ndarray]:
-        """What is known of landmarks (M,) besides where they are, (M,) by name."""
+        """Further columns on landmarks (M,), (M,) by name."""
         return {}
 
     def counts(self, held: int) -> dict[str, float | int]:
-        """Entries of summary.json: SIFT features ever started, and landmarks, of so many that the map holds."""
+        """Entries of summary.json: SIFT features ever initialised, and landmarks, given the number `held` in the map."""
         return {"sift_features": 0, "landmarks_mean_per_particle": float(held)}
 
     def match_globally(self, pair: Pair[F]) -> np.ndarray:
-        """Landmark (K,) of each feature, wherever it may be expected; NULL where it has none, as by default all."""
+        """Landmark (K,) of each feature, regardless of predictions; NULL for none, by default for all."""
         return np.full(len(pair), NULL, dtype=np.int64)
 
     def log_support(self, pair: Pair[F], belief: Belief) -> float:
-        """How well landmarks are seen where particles expect them: a log-density, beside that of unknown things.
+        """Log-likelihood ratio of the features matched to predicted landmarks, against unknown features.
 
-        Candidates that were never seen again have no say: they may be of what moves.
+        Candidates that were never re-observed are ignored: they may be on moving objects.
         """
         ids = self.associate(pair, belief)
         rows = np.flatnonzero(np.isin(ids, self.seen_again()))
@@ -163,15 +163,14 @@ class Landmarks(Sensor, ABC, Generic[F]):
         return log_support(features.z - mean, features.cov + cov, z, self.rig)
 
     def relocalised(self, pair: Pair[F], belief: Belief, config: VoConfig) -> tuple[np.ndarray, int] | None:
-        """Where in its whole map a stereo camera is, by what its features look like: without a prediction.
+        """Global relocalisation in the map by the features' appearance, without a prediction.
 
-        Appearance alone mistakes some features, so that the matches must agree on one place. The consensus is that of
-        visual odometry; the map takes the place of the earlier pair, as a camera would see it that stands far enough back
-        to have all matched landmarks before it.
+        Some matches by appearance are wrong, so they must agree on one pose. The consensus search is that of visual odometry;
+        the map replaces the earlier pair, projected to a virtual camera far enough back to have all matched landmarks in
+        front of it.
 
         Returns:
-            world_from_camera (7,) in the world of the heaviest particle, and the number of landmarks that agree; None where
-            too few do.
+            world_from_camera (7,) in the world of the heaviest particle, and the number of inliers; None with too few.
         """
         ids = self.match_globally(pair)
         rows = np.flatnonzero(np.isin(ids, self.seen_again()))
@@ -201,9 +200,9 @@ class Landmarks(Sensor, ABC, Generic[F]):
 
 
 def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
-    """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
+    """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) matched to landmarks: each match is right, or is by chance.
 
-    Of innovations ν (k, 3) and S (k, 3, 3), px; the pair's features z (K, 3) are λ per px³ where they may be.
+    Innovations are ν (k, 3) and S (k, 3, 3), px; λ is the density of the pair's features z (K, 3) per px³.
     """
     depths = max(float(np.ptp(z[:, 0] - z[:, 2])), 1.0)
     density = len(z) / (rig.camera.width * rig.camera.height * depths)
@@ -212,12 +211,12 @@ def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedSt
 
 @dataclass(frozen=True)
 class Expected(RowByRow):
-    """K landmarks in (u_left, v, u_right), px."""
+    """Predictions of K landmarks in (u_left, v, u_right), px."""
 
-    mean: np.ndarray  #: (K, 3) of the particles.
+    mean: np.ndarray  #: (K, 3) over the particles.
     cov: np.ndarray  #: (K, 3, 3) within and between particles, without the noise of a measurement.
-    within: np.ndarray  #: (K, 3, 3) of the landmark in the heaviest particle, its pose given.
-    by_heaviest: np.ndarray  #: (K, 3) as that particle sees them.
+    within: np.ndarray  #: (K, 3, 3) of the landmark in the heaviest particle, given its pose.
+    by_heaviest: np.ndarray  #: (K, 3) prediction of that particle.
 
     @property
     def deviation(self) -> np.ndarray:
@@ -228,16 +227,16 @@ class Expected(RowByRow):
 @final
 @dataclass(frozen=True)
 class ParticleSubsample:
-    """A few particles, each for an equal fraction of the weight, and the heaviest one last."""
+    """A few particles of equal weight, sampled systematically, and the heaviest one last."""
 
-    rows: np.ndarray  #: (n + 1,) which ones.
+    rows: np.ndarray  #: (n + 1,) their indices.
     prior: Prior  #: their distribution before the observations.
-    middle: np.ndarray  #: (7,) world_from_camera in their middle.
-    std_direction_rad: float  #: standard deviation of the camera's direction about that.
+    middle: np.ndarray  #: (7,) their mean world_from_camera.
+    std_direction_rad: float  #: standard deviation of the camera's direction.
 
     @classmethod
     def of(cls, belief: Belief, count: int) -> "ParticleSubsample":
-        """So many at most."""
+        """At most `count` of them."""
         weights = belief.weights
         steps = (np.arange(min(count, weights.size)) + 0.5) / min(count, weights.size)
         rows = np.minimum(np.searchsorted(np.cumsum(weights), steps), weights.size - 1)
@@ -251,9 +250,9 @@ class ParticleSubsample:
         return cls(rows, prior, middle, float(np.sqrt(variance.max())))
 
     def expected(self, belief: Belief, model: CameraModel, ids: np.ndarray) -> Expected:
-        """Landmarks (K,) of the map.
+        """Predictions of landmarks (K,).
 
-        What is uncertain within a particle, given its path, hardly differs between them: the heaviest one's is taken.
+        The covariance within a particle is nearly equal for all, so that of the heaviest one is used.
         """
         records, state = belief.read(ids, self.rows), self.prior.predicted()
         px = model.predict(state[:, None], records.mean, records.const)
@@ -269,11 +268,11 @@ class ParticleSubsample:
 
 
 class AssociationGate(ABC):
-    """Which landmarks a feature may be, by where they are expected; their descriptors decide among these."""
+    """Gates candidate pairs of features and landmarks by their predictions; descriptors decide among them."""
 
     @abstractmethod
     def pairs(self, features: StereoFeatures, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (C,) of features and (C,) of landmarks that may be one another."""
+        """Rows (C,) of features and (C,) of landmarks that may match."""
 
 
 @final
@@ -289,7 +288,7 @@ class MahalanobisGate(AssociationGate):
 
 
 class DescriptorLandmarks(Landmarks[StereoFeatures]):
-    """Finds landmarks by their descriptors, and manages which there are.
+    """Associates landmarks by descriptors, and manages them.
 
     Args:
         rig: the cameras.
@@ -317,18 +316,18 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self._told: StereoFeatures
 
     def observe(self, frame: Pair[StereoFeatures], belief: Belief) -> Sequence[Observations]:
-        """The features that are landmarks, and those that are candidates."""
+        """Observations of landmarks, and of candidates."""
         started = time.perf_counter()
         self.ids = self.associate(frame, belief) if frame.landmarks is None else frame.landmarks
         self._told = features = self._aligned(frame)
         known = self.ids >= 0
         weighs = known
         if self.config.weigh != "all" and self.config.kind != "joint":
-            # With this observation they are seen often enough.
+            # This observation confirms them.
             often = self.manager.observations + 1 >= self.manager.config.observations
             weighs = np.isin(self.ids, self.manager.names[often])
         if self.noise is not None and known.any():
-            # What a keypoint marks on its thing moves along with the view, from sighting to sighting by as much as its noise.
+            # A keypoint's point on the object drifts as the view changes, between observations by as much as its noise.
             held, ids = belief.map, self.ids[known]
             assert isinstance(held, JointMap)
             local = SE3.inverse_transform(belief.state[belief.mode], belief.read_mode(ids).mean[0])
@@ -336,7 +335,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             variance = self.noise.factor(ids) * features.cov[known, 1, 1] * far**2
             held.loosen(ids, variance[:, None, None] * np.eye(3))
         groups = []
-        # A candidate is updated, and does not weigh; what is no landmark is a null correspondence for all.
+        # Candidates are updated, but do not weigh; features without a landmark are null correspondences in all particles.
         for chosen, options in (
             (weighs | ~known, {"log_clutter": self.likelihood.log_outlier()}),
             (known & ~weighs, {"updates": MAP}),
@@ -353,7 +352,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def new_landmarks(
         self, frame: Pair[StereoFeatures], belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Counts what was seen, drops candidates that were not seen again, starts new ones."""
+        """Counts observations, drops candidates that were not re-observed, and initialises new ones."""
         known = self.ids >= 0
         seen = self.ids[known]
         if self.noise is not None:
@@ -367,7 +366,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             self.places.remove(rows)
             if self.noise is not None:
                 self.noise.remove(dropped)
-        # Places are in the world, the particles' states and landmarks perhaps not.
+        # Positions are in the world; the particles' states and landmarks may be in another frame.
         mode = belief.state[belief.mode]
         pose = belief.map.world(mode[None], np.array([belief.mode]))[0]
         if seen.size:
@@ -375,7 +374,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             place = self.landmark.homogeneous(records.mean, records.const)[0]
             place = place[:, :3] / place[:, 3:]
             self.places.put(self.manager.rows(seen), SE3.transform(pose, SE3.inverse_transform(mode, place)), pose)
-        # Candidates that are not seen again are dropped anyway.
+        # Candidates that are not re-observed are dropped anyway.
         confirmed = self.manager.confirmed
         make_room(belief.map, self.manager.names[confirmed], self.manager.unseen_for[confirmed])
         if frame.uncertain:
@@ -384,7 +383,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if not rows.size:
             return []
         features = frame.features.take(rows)
-        # The manager counts as the map does: its numbers are the map's.
+        # The manager numbers landmarks like the map.
         ids = self.manager.add(features.descriptors)
         self.places.add(features.patch, features.first)
         self.places.put(self.manager.rows(ids), SE3.transform(pose, features.points), pose)
@@ -395,7 +394,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return [NewLandmarks(features.z, cov, self.model, self.landmark, ids=ids)]
 
     def _starts(self, pair: Pair[StereoFeatures], known: np.ndarray, manager: LandmarkManager) -> np.ndarray:
-        """Rows of features whose depth is known well enough for a Gaussian in space, and which the manager chooses."""
+        """Rows of features whose depth is precise enough for a Gaussian in space, selected by the manager."""
         features = pair.features
         deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
         rows = np.flatnonzero(~known & deep & pair.for_map)
@@ -408,13 +407,13 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return self._told
 
     def _aligned(self, pair: Pair[StereoFeatures]) -> StereoFeatures:
-        """The pair's features, those of landmarks put where these were seen first."""
+        """The pair's features, those of landmarks aligned with their first views."""
         features, rows = pair.features, np.flatnonzero(self.ids >= 0)
         if pair.images is None or not (rows.size and features.patch.size):
             return features
         held = self.manager.rows(self.ids[rows])
         patch, first = self.places.patch[held], self.places.first[held]
-        # Most are there, as they were followed from pair to pair.
+        # Most are already aligned, by tracking from pair to pair.
         moves = (first != features.first[rows]).any(axis=1) | (patch != features.patch[rows]).any(axis=(1, 2))
         which = rows[moves], patch[moves], first[moves]
         return aligned(self.rig, self._matching, pair.images, pair.offset_px, features, *which)
@@ -422,13 +421,13 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
     def left_over(self, pair: Pair[StereoFeatures]) -> tuple[Pair[StereoFeatures], np.ndarray]:
         assert pair.landmarks is not None
         free, manager = pair.landmarks == NULL, self.manager.copied()
-        manager.observe(pair.landmarks[~free])  # those that it confirms or drops make room for new ones
+        manager.observe(pair.landmarks[~free])  # confirmed and dropped ones make room for new ones
         pair = replace(pair, starts=self._starts(pair, ~free, manager))
         free[pair.starts] = False
         return pair, free
 
     def associate(self, pair: Pair[StereoFeatures], belief: Belief) -> np.ndarray:
-        """By their descriptors, where the particles expect them."""
+        """By descriptors, within the gate of their predictions."""
         out = np.full(len(pair), NULL, dtype=np.int64)
         rows = np.flatnonzero(pair.for_map)
         features = pair.features.take(rows)
@@ -436,7 +435,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         near = self.places.in_view(subsample.middle, subsample.std_direction_rad)
         held, limits = self.manager, self.config.limits
         if near.size and rows.size:
-            # Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
+            # More distant descriptors neither match nor count in the ratio test, whatever the prediction.
             most = limits.largest(held.length) / limits.ratio
             products = features.descriptors @ held.descriptors[near].T
             near = near[products.max(axis=0) >= 1.0 - 0.5 * most**2]
@@ -450,16 +449,16 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         k, m = self.gate.pairs(features, expected)
         found = match_pairs(features.descriptors, held.descriptors, (k, held.rows(ids)[m]), limits)
         taken = held.names[found.second]
-        agreed = self._agreed(
+        agreed = self._accepted(
             expected.take(np.searchsorted(ids, taken)), features.take(found.first), pair.uncertain, belief.rng
         )
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
     def put_away(self, pair: Pair[StereoFeatures], belief: Belief, joint: JointMap, free: np.ndarray) -> np.ndarray:
-        """By their descriptors, where they may be seen from anywhere that the camera may be in the world.
+        """By descriptors, within the view from all poses that the camera may have in the world.
 
-        Those that are not about where the present sub-map begins must agree on one motion: with them all is solved for.
+        Those not around the start of the current sub-map must agree on one motion, as they trigger a joint solution.
         """
         (old, places), held, prior = joint.old.places(), self.manager, belief.prior
         away, rows = ~joint.holds(old), np.flatnonzero(pair.for_map & free)
@@ -481,12 +480,14 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         taken = held.names[at[found.second]]
         far = np.flatnonzero(~np.isin(taken, joint.old.about.ids))
         agreed = np.ones(len(found), dtype=bool)
-        agreed[far] = self._agreed(expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng)
+        agreed[far] = self._accepted(
+            expected.take(found.second[far]), features.take(found.first[far]), True, belief.rng
+        )
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
     def match_globally(self, pair: Pair[StereoFeatures]) -> np.ndarray:
-        """By their descriptors alone."""
+        """By descriptors alone."""
         out = np.full(len(pair), NULL, dtype=np.int64)
         rows = np.flatnonzero(pair.for_map)
         out[rows] = self.manager.match(pair.features.descriptors[rows], self.config.limits)
@@ -509,13 +510,13 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return out
 
     def columns(self, ids: np.ndarray) -> dict[str, np.ndarray]:
-        """How often each was seen, and whether it is a landmark or a candidate."""
+        """Number of observations, and whether each is a landmark or a candidate."""
         rows = np.searchsorted(self.manager.names, ids)
         confirmed = self.manager.confirmed[rows].astype(int)
         return {"sightings": self.manager.observations[rows], "landmark": confirmed}
 
     def counts(self, held: int) -> dict[str, float | int]:
-        """All particles hold the same, as all associate alike."""
+        """All particles have the same landmarks, as their associations are common."""
         landmarks = float(self.manager.confirmed.sum())
         return {"sift_features": int(self.manager.next_name), "landmarks_mean_per_particle": landmarks}
 
@@ -534,17 +535,17 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         if self.noise is not None:
             self.noise.restore(arrays)
 
-    def _agreed(
+    def _accepted(
         self, expected: Expected, features: StereoFeatures, uncertain: bool, rng: np.random.Generator
     ) -> np.ndarray:
-        """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
+        """Mask (k,) of accepted matches: all, unless predictions are too uncertain for the gate to be selective."""
         all_of_them = np.ones(len(features), dtype=bool)
         vague = uncertain or (len(features) and np.median(expected.deviation) > self.config.vague_px)
         if not vague:
             return all_of_them
         if len(features) < self.config.min_agreeing:
             return ~all_of_them
-        # As the heaviest particle sees them, moved by an increment of any size.
+        # Consensus on the heaviest particle's predictions, under an increment of any size.
         cov = expected.within + TINY * np.eye(3)
         matches = Matches.checked(self.rig, expected.by_heaviest, features.z, cov, features.cov)
         config = VoConfig(min_matches=self.config.min_agreeing)

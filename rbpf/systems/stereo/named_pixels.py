@@ -1,4 +1,4 @@
-"""A stereo camera's landmarks by the names that a recording gives them: what its frames show, and what the map has of it."""
+"""Stereo front end and landmarks with known association, by the names in a recording."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,9 +23,9 @@ from rbpf.systems.system import MAP_IDS
 
 @final
 class NamedLandmarks(Kept, Landmarks[FeatureFrame]):
-    """Landmarks by the names that the recording gives them."""
+    """Landmarks with known association."""
 
-    # (M,) landmarks of the map, ascending, how often each was seen, and for how many pairs it has not been.
+    # (M,) landmarks of the map, ascending, number of observations of each, and pairs since the last one.
     kept: ClassVar = {
         "_held": integers("landmarks", least=0, ascending=True, refers=MAP_IDS),
         "_observations": integers("landmarks", least=1),
@@ -60,7 +60,7 @@ class NamedLandmarks(Kept, Landmarks[FeatureFrame]):
         return started
 
     def associate(self, pair: Pair[FeatureFrame], belief: Belief) -> np.ndarray:
-        """By their names; where the view is uncertain, only those that were observed more than once."""
+        """By name; for an uncertain view only those that were observed more than once."""
         known, names = self.seen_again() if pair.uncertain else self._held, pair.features.landmarks
         return np.where(pair.for_map & np.isin(names, known) & belief.map.holds(names), names, NULL)
 
@@ -74,9 +74,9 @@ class NamedLandmarks(Kept, Landmarks[FeatureFrame]):
 
 @final
 class NamedFrontEnd(FrontEnd[FeatureFrame]):
-    """Pixels of landmarks that have names.
+    """Pixels of named landmarks.
 
-    The frames' stamps are `ns_per_stamp` nanoseconds long: 10⁹ where they count frames of unknown time.
+    One unit of the frames' stamps is `ns_per_stamp` nanoseconds: 10⁹ if they count frames of unknown time.
     """
 
     takes = FeatureFrame
@@ -106,7 +106,7 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
         return first[used], second[used]
 
     def landmarks_of(self, pair: Pair[FeatureFrame], updated: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Their names, whether the filter has taken them or not."""
+        """Their names, whether the filter has used them or not."""
         kind = FeatureKind.LANDMARK if updated else FeatureKind.FEATURE
         return pair.features.landmarks, np.full(len(pair), kind)
 

@@ -1,4 +1,4 @@
-"""Where landmarks are and were seen last, by which those that a view may show are found; their first views; room in a map."""
+"""Positions and viewing conditions of landmarks, to select those in view; first views; limiting the map's size."""
 
 from typing import ClassVar
 
@@ -11,17 +11,17 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.systems.stereo.config import MapConfig
 
-SIGMAS = 3.0  #: The image is widened by so many standard deviations of the camera's direction.
+SIGMAS = 3.0  #: Margin of the view in standard deviations of the camera's direction.
 
 
 class Places(Kept):
-    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
+    """Last observations of landmarks, common to all particles, to select candidates for a view.
 
-    Landmarks go by their rows among those that are managed.
+    Landmarks are indexed by their rows in the manager.
     """
 
     place: np.ndarray  #: (M, 3) in the world of the heaviest particle.
-    patch: np.ndarray  #: (M, S, S) uint8, first views as `StereoFeatures` has them.
+    patch: np.ndarray  #: (M, S, S) uint8, first views as in `StereoFeatures`.
     first: np.ndarray  #: (M, 4), likewise.
     kept: ClassVar = {
         "place": numbers("landmarks", 3),
@@ -37,18 +37,18 @@ class Places(Kept):
         self.patch, self.first = np.zeros((0, 0, 0), np.uint8), np.zeros((0, 4))
 
     def add(self, patch: np.ndarray, first: np.ndarray) -> None:
-        """New landmarks follow, with first views (k, S, S) and (k, 4); `put` says where they are."""
+        """Adds new landmarks with first views (k, S, S) and (k, 4); `put` sets their positions."""
         self.patch = np.concatenate([self.patch, patch]) if len(self.patch) else patch
         self.first = np.concatenate([self.first, first])
 
     def put(self, rows: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
-        """Landmarks (k,), held or new, are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,)."""
+        """Landmarks (k,), old or new, are observed at (k, 3) in the heaviest particle's world, by its camera (7,)."""
         room = np.zeros((int((rows >= len(self.place)).sum()), 3))
         self.place, self._seen_from = (np.concatenate([one, room]) for one in (self.place, self._seen_from))
         self.place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
 
     def move(self, rows: np.ndarray, place: np.ndarray) -> None:
-        """Landmarks (k,) are at places (k, 3) as the map is bent now, and were seen from as far."""
+        """Moves landmarks (k,) to their positions (k, 3) in the corrected map, with unchanged viewing distances."""
         self._seen_from[rows] += place - self.place[rows]
         self.place[rows] = place
 
@@ -57,10 +57,10 @@ class Places(Kept):
             setattr(self, name, np.delete(getattr(self, name), rows, axis=0))
 
     def in_view(self, world_from_camera: np.ndarray, std_direction_rad: float = 0.0) -> np.ndarray:
-        """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""
+        """Landmarks that a camera (7,) of uncertain direction may observe and recognise, ascending."""
         camera = self.rig.camera
         margin = self.config.margin_px + min(SIGMAS * camera.fx * std_direction_rad, 0.5 * camera.width)
-        # In both images, or nearly; most are far from it.
+        # In or near both images; most are far outside.
         local = SE3.inverse_transform(world_from_camera, self.place)
         across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
         down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
@@ -77,7 +77,7 @@ class Places(Kept):
 
 
 def places_of(belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks (k,) as the heaviest particle has them (k, 3), with covariances (k, 3, 3), none of those that are put away."""
+    """Positions (k, 3) of landmarks (k,) in the heaviest particle, and covariances (k, 3, 3); none may be put away."""
     held, place, cov = belief.map.holds(ids), np.empty((ids.size, 3)), np.zeros((ids.size, 3, 3))
     if held.any():
         records = belief.read_mode(ids[held])
@@ -90,7 +90,7 @@ def places_of(belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_room(held: Map, landmarks: np.ndarray, unseen_for: np.ndarray) -> None:
-    """Where a joint map is full, puts landmarks (M,) away that were not seen for longest, (M,) pairs; none of this one."""
+    """Puts the longest unobserved landmarks (M,) of a full joint map away, by `unseen_for` (M,) pairs; none of this pair."""
     if isinstance(held, JointMap) and held.is_full:
         unseen_for = np.where(held.holds(landmarks) & ~np.isin(landmarks, held.leaving), unseen_for, 0)
         order = np.argsort(-unseen_for, kind="stable")

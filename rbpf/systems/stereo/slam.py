@@ -4,7 +4,7 @@
     for stamp_ns, left, right in source:
         frame = slam.track(left, right, stamp_ns)     # pose, covariance, state of tracking, what was observed
 
-`StereoSlam.take` is the life of a pair, in order.
+`StereoSlam.take` processes a pair step by step.
 """
 
 import time
@@ -67,19 +67,18 @@ _STEREO = {
 
 @final
 class StereoSlam(System):
-    """A rectified stereo camera; its first pair is the world.
+    """SLAM with a rectified stereo camera; its first pair is the world's origin.
 
-    What it keeps grows with the map alone; of the particles' paths it keeps `lag` updates.
+    Its memory grows only with the map; of the particles' paths it keeps `lag` updates.
 
     Args:
         rig: the two cameras.
         config: all settings.
-        extractor: finds and describes the keypoints of an image; None for SIFT.
-        gate: which landmarks may be which feature; None for that of `config`.
-        model: how a landmark is measured; None for pixels of points in space.
+        extractor: detects and describes keypoints; None for SIFT.
+        gate: gates features and landmarks; None for that of `config`.
+        model: observation model of landmarks; None for pixels of points in space.
         landmark: its parametrisation; None for points in space.
-        front_end: measures frames, and finds landmarks in them; None takes images, `NamedFrontEnd` pixels of landmarks that
-            have names.
+        front_end: measures frames and associates landmarks; None for images, `NamedFrontEnd` for pixels of named landmarks.
     """
 
     name: ClassVar[str] = "stereo"
@@ -87,7 +86,7 @@ class StereoSlam(System):
     columns = (
         Column("features", "features that both cameras see", kind=int, table=DIAGNOSTICS),
         Column("agreeing", "matches that agree with the motion since the last pair", kind=int, table=DIAGNOSTICS),
-        Column("assumed", "pairs whose motion was assumed since the place was known last", kind=int, table=DIAGNOSTICS),
+        Column("assumed", "consecutive pairs whose motion was only assumed", kind=int, table=DIAGNOSTICS),
         Column("updated", "whether the filter was updated", kind=bool, table=DIAGNOSTICS),
         Column("observed", "landmarks that weighed the particles", kind=int, table=DIAGNOSTICS),
         RESAMPLED,
@@ -97,18 +96,18 @@ class StereoSlam(System):
         NIS,
         timing("seconds_features", "time of measuring the pair", "features_ms"),
         timing("seconds_odometry", "time of estimating the motion", "odometry_ms"),
-        timing("seconds_matching", "time of finding landmarks", "matching_ms"),
+        timing("seconds_matching", "time of associating landmarks", "matching_ms"),
         timing("seconds_filter", "time of the rest of the update", "filter_ms"),
         Column("odometry", "world_from_camera by visual odometry alone", shape=(7,)),
         Column("measured", "whether the next pair is matched with this one", kind=bool),
-        Column("offset_px", "by which disparities were taken to be too small"),
+        Column("offset_px", "disparity offset used, by which disparities are too small"),
     )
     observed = (
         Ragged("z", "pixels (u_left, v, u_right) of the features", (3,)),
         Ragged("cov_z", "their covariance, px²", (3, 3), per="z"),
-        Ragged("kind", "what each is to the map, see `FeatureKind`", kind="int8", per="z"),
-        Ragged("landmarks", "landmark of each, −1 where there is none", kind="int64", per="z"),
-        Ragged("previous", "row of the point in the last measured pair; −1 where there is none", kind="int64", per="z"),
+        Ragged("kind", "role of each in the map, see `FeatureKind`", kind="int8", per="z"),
+        Ragged("landmarks", "landmark of each, −1 for none", kind="int64", per="z"),
+        Ragged("previous", "row of the match in the last measured pair, −1 for none", kind="int64", per="z"),
     )
     space = SE3
     config: StereoConfig
@@ -159,21 +158,21 @@ class StereoSlam(System):
         parts = [joint or own]
         self.filter = self.new_filter(odometry, front_end.landmarks, parts, self._proposal.build(), config.map.window)
         self.frames = 0  #: pairs taken so far.
-        self.reckoning = DeadReckoning()  #: where visual odometry has come.
+        self.reckoning = DeadReckoning()  #: composed visual odometry.
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
-        #: motion from the filter's last update to the last pair, also where it was only expected.
+        #: motion from the filter's last update to the last pair, including assumed motions.
         self.since_update = SE3.identity()
         self._last_update = 0
         self._kept: Pair[Any] | None = None
-        # Matches that no point in space has, and all, of the last pairs; whether that was said.
+        # Decaying counts of negative-disparity matches and of all; whether the warning was given.
         self._impossible, self._doubted = np.zeros(2), False
 
     def track(self, left: np.ndarray | None, right: np.ndarray | None, stamp_ns: int) -> Tracked:
         """A pair of rectified images (H, W) uint8, taken at one time.
 
-        A pair that shows too little, of which an image is missing or that the cameras cannot have taken, or of the last
-        one's time, is passed over: its pose is predicted, and `messages` say why. The first pair decides: images of
-        another size are refused there. None is an image that is missing.
+        A pair with too few features, with a missing image, that cannot be from these cameras, or with the last one's time, is
+        passed over: its pose is predicted, and `messages` give the reason. Images of another size in the first pair raise an
+        error. A missing image is None.
 
         Raises InputError: left and right are swapped, time runs backwards, no particle explains the pair, or the first images
         are not the cameras'.
@@ -186,17 +185,17 @@ class StereoSlam(System):
         if not isinstance(frame, front_end.takes):
             taken = front_end.takes.__name__
             raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {taken} here")
-        # The first frame is refused if it is not the cameras'.
+        # The first frame must fit the cameras.
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
         offset_px = self._calibration.tune(self.filter)
 
-        # 1. Measure the pair: features that both cameras see.
+        # 1. Measure the pair: features in both images.
         pair, problem = front_end.measure(frame)
         stamp_ns, messages, config, landmarks = frame.stamp_ns, list[str](), self.config, front_end.landmarks
         seconds_features = time.perf_counter() - started
 
-        # 2. How the camera has moved since the last pair that was measured; where this one tells too little, as before.
+        # 2. Estimate the motion since the last measured pair; with too few features predict it.
         dt, least = self.reckoning.seconds(pair.stamp_ns), config.odometry.estimate.min_matches
         if dt < 0.0:
             raise InputError(f"time runs backwards: a pair has the stamp {stamp_ns} ns, the last one a later one")
@@ -214,7 +213,7 @@ class StereoSlam(System):
             why = f"{problem}; {few}" if problem and len(pair) else problem or few
             expected = last = self.reckoning
             then = "the world begins with the first pair that is measured"
-            if last.stamp_ns is not None:  # the next pair is measured from the same one as this
+            if last.stamp_ns is not None:  # the next pair has the same reference pair
                 then = "the last velocity is assumed, widely"
                 self.reckoning = replace(last, passed_over=last.passed_over + 1)
                 step = self._constrained(config.odometry.prior.increment(last.velocity, dt))
@@ -224,8 +223,8 @@ class StereoSlam(System):
         at = motion.at
         seconds_odometry = time.perf_counter() - started - seconds_features
 
-        # 3. Update the filter if the camera has moved enough, and, where its motion was only assumed, if the map says where
-        # it has come: until then no particle moves.
+        # 3. Update the filter if the camera has moved enough. After an assumed motion only once the camera is relocalised in
+        # the map: until then no particle moves.
         report, seconds_filter = None, 0.0
         due = self.filter.steps == 0 or config.trigger.reached(at.since_update, self.frames - self._last_update)
         if measured:
@@ -237,7 +236,7 @@ class StereoSlam(System):
             for_map[motion.rows[1][motion.moving]] = False
             view = replace(pair, for_map=for_map, uncertain=uncertain)
             if uncertain:
-                control, message = self._found_again(view, at)
+                control, message = self._recovered_motion(view, at)
                 messages += filter(None, (message,))
             if control is not None:
                 begun = time.perf_counter()
@@ -252,7 +251,7 @@ class StereoSlam(System):
                 seconds_filter = time.perf_counter() - begun - landmarks.seconds
         updated = report is not None
 
-        # 4. Remember the pair, with what stood still in it: the next one is matched with it.
+        # 4. Store the pair with its labels, as the reference of the next one.
         if measured:
             static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
             features = self._calibration.retuned(self.filter, pair.features, offset_px) if updated else pair.features
@@ -263,7 +262,7 @@ class StereoSlam(System):
             self._kept = replace(pair, features=features, images=None, labels=motion.labelled(len(pair), static))
         self.frames += 1
 
-        # 5. Report: between updates the odometry moves the estimate.
+        # 5. Report: between updates the pose is extrapolated by the odometry.
         pose, cov = self.at_update.mean, self.at_update.cov
         self.since_update = SE3.identity() if updated else at.since_update.delta
         if not updated:
@@ -306,19 +305,19 @@ class StereoSlam(System):
         )
 
     def map(self) -> MapEstimate:
-        """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
+        """The landmarks, and the candidates; with further columns, see `Landmarks.columns`."""
         found = estimate_map(self.filter)
         return replace(found, columns=self.front_end.landmarks.columns(found.ids))
 
     def particle_poses(self) -> np.ndarray:
-        """(N, 7) world_from_camera of the particles at the last pair: between updates the odometry moves them."""
+        """(N, 7) world_from_camera of the particles at the last pair, extrapolated by odometry between updates."""
         return SE3.compose(super().particle_poses(), self.since_update)
 
     def measurements(self, name: str, log: FrameLog) -> FeatureLog:
-        """Every pixel that odometry or map used, once, as tracks; of pixels with names all of them."""
+        """All pixels used by odometry or map, each once, as tracks; for named pixels all."""
         shown, offset_px = [log.observed(t) for t in range(len(log))], self.calibration()[0]
         for pair, then_px in zip(shown, log["offset_px"].tolist(), strict=True):
-            # A run that calibrates itself knows better at its end.
+            # Corrected by the final self-calibration.
             pair["z"] = pair["z"] + [0.0, 0.0, then_px - offset_px]
         if self.front_end.names_landmarks:
             parts = [(pair["landmarks"], pair["z"], pair["cov_z"]) for pair in shown]
@@ -329,11 +328,11 @@ class StereoSlam(System):
         return FeatureLog(name, self.rig, frames)
 
     def calibration(self) -> tuple[float, float]:
-        """By how many px all disparities are too small, and its standard deviation; both 0 where that is not learnt."""
+        """Common disparity offset (all are too small by it), px, and its standard deviation; 0 if not estimated."""
         return self._calibration.estimate(self.filter)
 
     def summary(self, log: FrameLog) -> dict[str, Any]:
-        """What the pairs showed, and the filter's figures over its updates."""
+        """Counts over the pairs, and the filter's statistics over its updates."""
         updated = log["updated"].astype(bool)
         evidence = log["log_evidence"][updated]
         milliseconds = 1e3 * (log["seconds_matching"] + log["seconds_filter"])[updated] if updated.any() else 0.0
@@ -380,7 +379,7 @@ class StereoSlam(System):
         self._calibration.restore(arrays)
 
     def _motion_to(self, pair: Pair[Any], dt: float) -> tuple[Pair[Any], "_Motion"]:
-        """The pair, with those of its points that the last measured one has, aligned; the motion between, `dt` seconds."""
+        """The pair, with points matched to the last measured one aligned; and the motion between, in `dt` seconds."""
         before, kept, stamp_ns, config = self.reckoning, self._kept, pair.stamp_ns, self.config.odometry
         if kept is None:
             return pair, _Motion(replace(before, stamp_ns=stamp_ns))
@@ -390,12 +389,12 @@ class StereoSlam(System):
         expected, is_moving = config.prior.increment(before.velocity, dt), bool(before.velocity.any())
         motions, failure = candidate_motions(matches, expected, self.filter.rng, config.estimate)
 
-        # Which of the motions that matches agree on is the camera's: one is, if the rest of what is known agrees with it.
+        # Select the camera's motion among those with support; a single one is accepted unless other evidence contradicts.
         chosen = 0 if motions else -1
         doubted = len(motions) > 1 or (motions and contradicts(motions[0].inliers, labels, before.hidden))
         moving = np.zeros(len(matches), dtype=bool)
         if doubted:
-            # What the map says of each candidate, and of the prior alone.
+            # The map's support of each candidate, and of the prior alone.
             support = np.zeros(len(motions) + 1)
             if self.filter.steps:
                 view = replace(pair, uncertain=before.assumed > 0)
@@ -408,7 +407,7 @@ class StereoSlam(System):
             many = " and ".join(str(motion.inliers.sum()) for motion in motions)
             failure = f"{many} of {len(matches)} matches agree on a motion, but not the map and what stood still before"
 
-        # Where none is, what was expected is assumed.
+        # If there is none, the prior is assumed.
         if chosen < 0:
             what = "the last velocity" if is_moving else "a camera at rest"
             step = self._constrained(expected)
@@ -428,7 +427,7 @@ class StereoSlam(System):
             velocity = SE3.log(motion.odometry.delta) / dt
         cross, noise = None, None
         if not config.independent:
-            # Of the error of this step and the last one, which the pixels of the pair between them have caused both.
+            # Cross-covariance of this step's and the last one's error, by the shared pixels of the pair between them.
             used = matches.take(motion.inliers)
             earlier, later = pixel_gains(used, motion.odometry, config.estimate)
             if before.noise.size:
@@ -444,16 +443,15 @@ class StereoSlam(System):
         at = before.moved(stamp_ns, step, velocity, cross=cross, noise=noise, left_over=left_over)
         return pair, _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
 
-    def _found_again(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
-        """By what the particles are moved at a pair after a motion that was only assumed, and in words why.
+    def _recovered_motion(self, view: Pair[Any], at: DeadReckoning) -> tuple[Odometry | None, str]:
+        """The motion by which particles are moved after an assumed motion, or None, and a message.
 
-        The distribution of an assumed motion is a Gaussian, which can wait: as long as the map says nothing about where the
-        camera has come, it grows with every pair, and no particle is drawn from it: None. Drawn at once, a few hundred
-        particles would be decimetres apart, none of them within millimetres of the right place, and landmarks started then
-        would be so, too. A map that has not got so far that it could say where the camera is, is not waited for.
+        An assumed motion is a wide Gaussian that grows with every pair, and no particle is drawn from it before the camera is
+        relocalised: None. Drawn at once, a few hundred particles would be decimetres apart, none within millimetres of the
+        true pose, and so would be new landmarks. A map that is too small for relocalisation is not waited for.
 
-        A place that is found far from where the camera was assumed to go takes the place of the assumed mean: something has
-        deceived the odometry. Its covariance stays, and leaves the rest to each particle's own map.
+        A relocalised pose far from the assumed mean replaces it, as the odometry was misled. Its covariance is kept, and
+        leaves the refinement to each particle's map.
         """
         landmarks, motion, least = self.front_end.landmarks, at.since_update, self.config.map.min_agreeing
         if landmarks.seen_again().size < least:
@@ -474,10 +472,10 @@ class StereoSlam(System):
         return None, ""
 
     def _associated(self, view: Pair[Any], moved: Odometry) -> tuple[Pair[Any], int]:
-        """The view with the landmark of each feature, and how many have one.
+        """The view with associated landmarks, and their number.
 
-        What a joint map has put away of these it holds again, for which its window ends. Of what it cannot hold yet, too few
-        from afar, the features are left out.
+        Landmarks that a joint map has put away are brought back, for which its window ends. Features of those that cannot be
+        brought back yet (too few distant ones) are left out.
         """
         landmarks, belief = self.front_end.landmarks, self.filter.expect(moved, view.stamp_ns)
         ids, away = landmarks.associate(view, belief), np.zeros(len(view), dtype=bool)
@@ -493,17 +491,17 @@ class StereoSlam(System):
     def _proposed(
         self, view: Pair[Any], moved: Odometry, left_over: np.ndarray, offset_px: float
     ) -> tuple[Pair[Any], Odometry, Proposal | None]:
-        """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
+        """Inputs of the filter if the odometry is its proposal: the view with its landmarks, the prior, the proposal.
 
-        Where the map has too few landmarks in view to tell the motion, what the odometry has used is not in it either:
-        the odometry moves the particles.
+        If too few landmarks are in view to determine the motion, the odometry's pixels are not in the map either: then the
+        odometry moves the particles.
         """
         assert self.filter.stamp_ns is not None
         view, count = self._associated(view, moved)
         if count < self.config.map.min_agreeing:
             return view, moved, None
         dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
-        # Of a camera that has not been seen to move nothing is known: the prior is about what the odometry says.
+        # Without a measured velocity the prior is centred on the odometry.
         velocity = self.reckoning.velocity_at_update if self.filter.steps > 1 else SE3.log(moved.delta) / dt
         prior = self.config.odometry.prior.increment(velocity, dt)
         if self.joint is not None:
@@ -517,10 +515,10 @@ class StereoSlam(System):
     def _joined(
         self, prior: Odometry, moved: Odometry, before: np.ndarray, features: Any, offset_px: float
     ) -> Odometry:
-        """The prior, joined with what matches since the last update say of whose two pixels a joint map uses neither.
+        """The prior, fused with the motion from matches since the last update that a joint map does not use.
 
-        They are `before` (k, 3, 4), as `DeadReckoning.left_over`, and the features of the pair. Those of the next update begin
-        with pixels that these end with, whose noise has opposite signs in both. Taken as independent, they claim too little.
+        `before` (k, 3, 4) are their pixels as in `DeadReckoning.left_over`. The next update's matches start with the pixels
+        at which these end, whose noise has opposite signs in both. Treated as independent, they are underconfident.
         """
         noise, config = self.front_end.landmarks.noise, self.config.odometry.estimate
         factor = 1.0 if noise is None else noise.mean
@@ -532,8 +530,8 @@ class StereoSlam(System):
         measured = found.odometry
         if not self._calibration.is_held:
             return product(measured, prior)[0]
-        # The pixels are free of the disparities' error as it was known when the pair was measured, before old landmarks were
-        # brought back, which says more of it. The motion moves with what it is besides.
+        # The pixels are corrected by the disparity offset known when the pair was measured, before old landmarks were brought
+        # back, which changes its estimate. The motion depends on the difference.
         earlier, later = pixel_gains(matches.take(found.inliers), measured, config)
         slope = -(earlier + later).sum(axis=0)[:, 2:]
         joined, _ = product(replace(measured, by_constants=slope), prior)
@@ -545,19 +543,19 @@ _NO_ROWS, _NO_MATCHES = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)
 
 
 class _Motion(NamedTuple):
-    """The motion up to a pair, and what its M matches with the last measured pair say of it."""
+    """The motion up to a pair, and its M matches with the last measured pair."""
 
     at: DeadReckoning
-    rows: tuple[np.ndarray, np.ndarray] = (_NO_ROWS, _NO_ROWS)  # (M,) of that pair and of this one: the same points
-    labels: np.ndarray = np.zeros(0, dtype=np.int8)  # (M,) which stood still in the last measured pair
-    inliers: np.ndarray = _NO_MATCHES  # (M,) which agree with the camera's motion
-    moving: np.ndarray = _NO_MATCHES  # (M,) which agree on another one: they are of things that move
-    message: str = ""  # in words, what had to be assumed
+    rows: tuple[np.ndarray, np.ndarray] = (_NO_ROWS, _NO_ROWS)  # (M,) rows of that pair and of this one
+    labels: np.ndarray = np.zeros(0, dtype=np.int8)  # (M,) labels in the last measured pair
+    inliers: np.ndarray = _NO_MATCHES  # (M,) inliers of the camera's motion
+    moving: np.ndarray = _NO_MATCHES  # (M,) inliers of another one: on moving objects
+    message: str = ""  # a warning about assumptions made
 
     def labelled(self, count: int, mapped: np.ndarray) -> np.ndarray:
-        """Labels (K,) of this pair's features, some rows of which are where the map has them; see `motion_segmentation`.
+        """Labels (K,) of this pair's features, of which rows `mapped` are consistent with the map; see `motion_segmentation`.
 
-        Where no match agrees with the camera's motion, all stay what they were.
+        Without inliers of the camera's motion all keep their labels.
         """
         out = np.full(count, UNKNOWN, dtype=np.int8)
         if self.inliers.any():

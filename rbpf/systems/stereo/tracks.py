@@ -1,7 +1,7 @@
-"""Which features of which pairs are one point in space, by odometry and map together: what a batch adjustment needs.
+"""Feature tracks over all pairs, from odometry and map together, for batch adjustment.
 
-Odometry says which features of two pairs are the same, the map which features of distant pairs are. Every pixel that
-either of them used is one observation of one track, however often the run used it.
+Odometry matches features of two consecutive pairs, the map those of distant pairs. Every pixel that either of them used is
+one observation of one track, however often the run used it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,15 +14,15 @@ from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.sensors.feature_log import FeatureFrame
 
-LEAST = 2  #: Observations of a track that is kept: a single one says nothing about the path.
+LEAST = 2  #: Least observations of a track: a single one does not constrain the path.
 
 
 def tracked_features(
     stamps_ns: np.ndarray, measured: Iterable[bool], observed: Iterable[Mapping[str, np.ndarray]]
 ) -> list[FeatureFrame]:
-    """The observations of each of T pairs; a track of the map has the map's name, others follow on.
+    """The observations of each of T pairs; tracks in the map have the map's names, others get further numbers.
 
-    `measured` is the column of `StereoSlam`, `observed` what each pair showed.
+    `measured` is the column of `StereoSlam`, `observed` the features of each pair.
     """
     tracks = _Tracks()
     for step, (is_measured, shown) in enumerate(zip(measured, observed, strict=True)):
@@ -41,7 +41,7 @@ def tracked_features(
 
 @final
 class _Tracks:
-    """The tracks of the pairs so far, and what is to be joined."""
+    """The tracks of the pairs so far, and pairs of tracks to be merged."""
 
     def __init__(self) -> None:
         # Of each observation the numbers of its pair and its track, (k, 2), and its pixels and packed covariance, (k, 9).
@@ -52,20 +52,20 @@ class _Tracks:
         self._last = np.zeros(0, dtype=np.int64), np.zeros((0, 9))
 
     def add(self, step: int, shown: Mapping[str, np.ndarray]) -> None:
-        """The next pair that the one after it is matched with."""
+        """Adds the next measured pair."""
         numbers = np.concatenate([shown["z"], gaussian.pack(shown["cov_z"])], axis=1)
         tracks = np.full(len(numbers), NULL, dtype=np.int64)
         previous = shown["previous"]
         matched = np.argsort(previous, kind="stable")[(previous < 0).sum() :]
-        # Those that go on from the last pair; what has no track there yet begins in it.
+        # Continue tracks from the last pair; features without a track there start one in it.
         before, (last_tracks, last_numbers) = previous[matched], self._last
         if before.max(initial=-1) >= last_tracks.size:
-            raise InputError("the run's log is damaged: a feature follows one that the pair before it has not")
+            raise InputError("the run's log is damaged: a feature is matched to one that the previous pair lacks")
         fresh = before[last_tracks[before] < 0]
         last_tracks[fresh] = self._begin(fresh.size)
         self._append(self._step, last_tracks[fresh], last_numbers[fresh])
         tracks[matched] = last_tracks[before]
-        # Those that the map names; where odometry says another one, both are joined.
+        # Tracks by the map's landmarks; if odometry gives another one, both are merged.
         present, names = set(tracks.tolist()), shown["landmarks"]
         for row in np.flatnonzero(names >= 0).tolist():
             track, name = int(tracks[row]), int(names[row])
@@ -83,7 +83,7 @@ class _Tracks:
         self._step, self._last = step, (tracks, numbers)
 
     def labels(self, rows: np.ndarray) -> np.ndarray:
-        """What each track is called once those that are one have been joined, unless one pair shows both."""
+        """The name of each track after merging, which excludes tracks observed in the same pair."""
         parent = np.arange(self._count)
         name_of = {track: name for name, track in self._named.items()}
         concerned = {track for pair in self._joined for track in pair}

@@ -1,25 +1,25 @@
 """ROS bags of one camera or two: `.bag` of ROS 1, and of ROS 2 a folder with `metadata.yaml`, `.mcap` or `.db3`.
 
-- The images: a topic of sensor_msgs Image or CompressedImage; where there are several, one has to be named. For stereo two:
-  the left topic comes first; where none is named, the two that there are, in alphabetical order (`cam0` and `cam1`, `left`
-  and `right`). Encodings are those of `sensor_msgs/image_encodings`: grey and colour of 8 bits, grey of 16, and the Bayer
-  patterns. What a message claims is compared with its bytes before anything is made of it.
+- The images: a topic of sensor_msgs Image or CompressedImage; if there are several, one has to be named. For stereo two,
+the left topic first; by default the bag's only two, in alphabetical order (`cam0` and `cam1`, `left` and `right`).
+Encodings are those of `sensor_msgs/image_encodings`: grey and colour of 8 bits, grey of 16, and the Bayer patterns. The
+size that a message claims is checked against its bytes before it is decoded.
 - The camera: sensor_msgs CameraInfo beside it (`/cam0/camera_info` for `/cam0/image_raw`), its K, D and size, or a
-  `camera.yaml`. Where the last part of the topic's name says that the images are rectified (`image_rect`,
-  `image_rect_color`), which is all that a bag says about it, the camera is that of P, without distortion. Of two cameras R
-  and P say where they are, as `camera_calibration` leaves it; with a `camera.yaml` the images are taken as rectified, and
-  its `baseline_m` as the cameras' distance.
+`camera.yaml`. If the last part of the topic's name marks the images as rectified (`image_rect`, `image_rect_color`; a bag
+has no other mark), the camera is that of P, without distortion. R and P give the relative pose of two cameras, as
+`camera_calibration` writes them; with a `camera.yaml` the images are taken as rectified, and its `baseline_m` as the
+baseline.
 - The truth: a topic of geometry_msgs PoseStamped, PoseWithCovarianceStamped, TransformStamped or nav_msgs Odometry, if one
   is named. The poses are taken as world_from_camera, of the camera's optical frame (x to the right, y down, z ahead). A bag
-  whose poses are those of another frame, such as `base_link`, has to be converted first; where its names show that, a
-  logged message says so.
+  with poses of another frame, such as `base_link`, has to be converted first; a logged message warns if the frame names
+  show it.
 
-Times are those of the messages' headers. A bag does not say them in its index: the topic is gone through once as it is
-opened. A message that is too damaged to have a time is left out; one that has a time, but no image, is a frame that says so;
-a bag that is damaged further on is read until there.
+Times are those of the messages' headers. A bag's index does not have them: the topic is read once when it is opened. A
+message too damaged to have a time is left out; one that has a time but no valid image is a frame with a `problem`; a bag
+with a damaged end is read up to there.
 
 The library `rosbags` reads the containers. The messages have one standard definition per ROS version, which the library
-brings along: definitions that a bag carries are never compiled, so that nothing of a bag runs.
+provides: definitions in a bag are never compiled, so that no code from a bag runs.
 """
 
 import bz2
@@ -47,11 +47,11 @@ from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageS
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 
-MOST_BYTES = 1 << 30  #: No chunk of a bag is larger once it is unpacked.
+MOST_BYTES = 1 << 30  #: Largest accepted size of an unpacked chunk.
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
-#: Where a message begins with a header: after four bytes, in both versions of ROS, seconds and nanoseconds.
+#: The stamp of a message with a header, in both versions of ROS: seconds and nanoseconds after four bytes.
 _LITTLE, _BIG = Struct("<4xII"), Struct(">4xII")
 _LAYOUTS = {
     "mono8": (1, np.uint8, None),
@@ -66,8 +66,8 @@ _LAYOUTS = {
         for pattern in ("rggb", "bggr", "gbrg", "grbg")
         for bits, kind in ((8, np.uint8), (16, np.uint16))
     },
-}  #: Encoding to channels, type of their values, and OpenCV's way to grey, None where it is grey.
-#: Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero.
+}  #: Encoding to channels, data type, and OpenCV's conversion to grey, None if it is grey.
+#: Distortion models that begin with k1, k2, p1, p2, k3; further coefficients of the second one must be zero.
 _RADIAL_TANGENTIAL = "plumb_bob", "rational_polynomial"
 _EQUIDISTANT = "equidistant", "fisheye"  #: Models with k1, k2, k3, k4: ROS's name and OpenCV's.
 _POSES = {
@@ -75,14 +75,14 @@ _POSES = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
     "nav_msgs/msg/Odometry": "pose.pose",
     "geometry_msgs/msg/TransformStamped": "transform",
-}  #: Where a message holds its pose.
-#: A message of ROS 1 that the library does not bring along: its definition and its name.
+}  #: The field of a message that holds its pose.
+#: A message of ROS 1 that the library does not define: its definition and its name.
 _TRANSFORMS = "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
 _log = logging.getLogger(__name__)
 
 
 class RawMessage(NamedTuple):
-    """A message as it lies in the bag: its type such as sensor_msgs/msg/Image, its bytes, the time of its header."""
+    """A serialised message: its type such as sensor_msgs/msg/Image, its bytes, the time of its header."""
 
     type: str
     data: bytes
@@ -91,15 +91,15 @@ class RawMessage(NamedTuple):
 
 @final
 class Bag:
-    """An open bag, by the library's reader and the types of the bag's version of ROS."""
+    """An open bag, with the library's reader and the types of the bag's ROS version."""
 
     def __init__(self, path: Path, reader: Any, types: Any) -> None:
         self.path = path
         self._reader, self._types = reader, types
         self._ros1 = path.suffix == ".bag" and path.is_file()
-        # A file that was not summed up counts none at all.
+        # A file without a summary reports a count of zero for every topic.
         counted = any(c.msgcount for c in reader.connections)
-        #: Types of the topics that hold messages, by their names.
+        #: Types of the topics with messages, by name.
         self.topics: dict[str, str] = {c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted}
 
     def of_type(self, *types: str) -> list[str]:
@@ -107,9 +107,9 @@ class Bag:
         return sorted(topic for topic, kind in self.topics.items() if kind in types)
 
     def messages(self, topic: str, headed: bool = True) -> Iterator[RawMessage]:
-        """Messages of a topic in the order of the bag; those too short or too wrong to have a time are left out.
+        """Messages of a topic in the order of the bag, without those too damaged to have a time.
 
-        Those that do not begin with a header (`headed` is False) have the time of the bag.
+        Messages without a header (`headed` is False) get the time at which the bag recorded them.
         """
         chosen = [c for c in self._reader.connections if c.topic == topic]
         with _refusing(self.path), closing(self._reader.messages(connections=chosen)) as found:
@@ -125,7 +125,7 @@ class Bag:
                     yield RawMessage(connection.msgtype, data, int(seconds) * 10**9 + int(nanoseconds))
 
     def message(self, raw: RawMessage) -> Any:
-        """The message with its fields by name."""
+        """The message deserialised."""
         read = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr
         with _refusing(self.path):
             return read(raw.data, raw.type)
@@ -148,7 +148,7 @@ def opened(path: Path) -> Iterator[Bag]:
         types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
         if ros1:
             types.register(get_types_from_msg(*_TRANSFORMS))
-            # Packed chunks may unpack to no more than `MOST_BYTES`; the library itself takes what comes.
+            # Limits the unpacked size of chunks to `MOST_BYTES`; the library itself has no limit.
             for place, chunk in reader.chunks.items():
                 if chunk.datasize > MOST_BYTES:
                     raise InputError(f"{path}: a chunk claims to be larger than {MOST_BYTES >> 20} MiB.")
@@ -160,7 +160,7 @@ def opened(path: Path) -> Iterator[Bag]:
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
-    """What the library and its decompressors raise on damaged bytes, assertions among it, as one sentence."""
+    """Turns all exceptions on damaged bytes, assertions of the library included, into one InputError."""
     try:
         yield
     except InputError:
@@ -188,7 +188,7 @@ def _unpacked(unpack: Callable[[bytes], bytes], data: bytes) -> bytes:
 
 
 def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | None = None) -> Grey:
-    """Image (H, W) of a message, which `where` names in messages; of this height and width, if they are given.
+    """Image (H, W) of a message; `where` is for error messages, `shape` the required height and width.
 
     Raises InputError: it is damaged, of an encoding that is not known, or of another size.
     """
@@ -200,7 +200,7 @@ def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | N
 
 
 def image_of(message: Any, where: str, shape: tuple[int, int] | None = None) -> Grey:
-    """Image (H, W) of an Image or a CompressedImage; arguments and errors as `read_image`."""
+    """Image (H, W) of an Image or a CompressedImage; arguments and errors as of `read_image`."""
     import cv2
 
     data = np.asarray(message.data, np.uint8)
@@ -227,16 +227,16 @@ def image_of(message: Any, where: str, shape: tuple[int, int] | None = None) -> 
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A camera as its messages describe it."""
+    """A camera as described by CameraInfo messages."""
 
-    calibration: Calibration  #: the camera of the images as they are in the bag.
+    calibration: Calibration  #: the camera of the images in the bag.
     rotation: Array  #: (3, 3) R, which rectifies the pair that it belongs to.
     projection: Array  #: (3, 4) P, of the camera after that rotation; its last column holds the baseline.
-    is_rectified: bool  #: whether the images have been rotated so.
+    is_rectified: bool  #: whether the images are already rectified by R.
 
     @classmethod
     def read(cls, bag: Bag, image_topic: str) -> "CameraInfo":
-        """The camera of a topic of images, from the first message about it."""
+        """The camera of an image topic, from its first CameraInfo message."""
         named = image_topic.removesuffix("/compressed")
         topic = f"{named.rpartition('/')[0]}/camera_info"
         held = bag.of_type(CAMERA_INFO)
@@ -253,7 +253,7 @@ class CameraInfo:
 
     @classmethod
     def of(cls, message: Any, where: str, is_rectified: bool) -> "CameraInfo":
-        """The camera of a message, which `where` names in messages, of images that are rectified or not."""
+        """The camera of a CameraInfo message; `where` is for error messages."""
         roi = message.roi
         if max(message.binning_x, message.binning_y) > 1 or roi.x_offset or roi.y_offset:
             problem = "the images are binned or a part of the sensor's, which K does not describe"
@@ -283,24 +283,24 @@ class CameraInfo:
 
     @property
     def shift_m(self) -> float:
-        """How far to the right of the pair's left camera this one is, rectified; 0 where P does not say."""
+        """Offset to the right of the pair's left camera after rectification; 0 if P has none."""
         fx, shift = self.projection[0, [0, 3]]
         return float(-shift / fx) if fx > 0.0 and np.isfinite(shift) else 0.0
 
 
 def _field(message: Any, name: str) -> Array:
-    """Numbers that ROS 1 names with a capital letter and ROS 2 with a small one."""
+    """A numeric field that has an upper-case name in ROS 1 and a lower-case one in ROS 2."""
     return np.array(getattr(message, name if hasattr(message, name) else name.lower()), np.float64)
 
 
 def numbers_of(pose: Any) -> Array:
-    """[qx, qy, qz, qw, x, y, z] of a Pose or a Transform as it is in a message."""
+    """[qx, qy, qz, qw, x, y, z] of a Pose or Transform message."""
     turn, place = (pose.orientation, pose.position) if hasattr(pose, "position") else (pose.rotation, pose.translation)
     return np.array([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z], dtype=float)
 
 
 def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -> Truth:
-    """The truth that a topic holds, for images at (T,) times, whose frame the poses should be those of."""
+    """Ground truth from a topic, for images at (T,) times; warns if the poses are not of `camera_frame`."""
     kind = bag.topics.get(topic, "")
     if kind not in _POSES:
         held = bag.of_type(*_POSES)
@@ -343,7 +343,7 @@ class RosBag(ImageFormat):
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         topics, cameras = options.topics, 2 if options.stereo else 1
         with opened(path) as bag:
-            # The topics of images that are named, or those that there are; as many as cameras.
+            # The named image topics, or all of the bag; as many as cameras are required.
             held, named = bag.of_type(IMAGE, COMPRESSED), topics.images[:cameras]
             found = f"the bag's image topics are {', '.join(held)}" if held else "the bag has no topic of images"
             if missing := [topic for topic in named if topic not in held]:
@@ -352,7 +352,7 @@ class RosBag(ImageFormat):
             if len(names) != cameras:
                 what = "one of them with --image-topic" if cameras == 1 else "two of them with --image-topic LEFT,RIGHT"
                 raise InputError(f"{path}: {found}; name {what}." if held else f"{path}: {found}.")
-            # The cameras, by a file or as the bag says.
+            # The cameras, from a file or the bag.
             if options.calibration is None:
                 infos = [CameraInfo.read(bag, name) for name in names]
                 used = infos[0].calibration
@@ -383,7 +383,7 @@ class RosBag(ImageFormat):
         left, right = infos
         if left.is_rectified != right.is_rectified:
             both = " and ".join(names)
-            raise InputError(f"{path}: of {both} one is rectified and the other is not; give two of a kind.")
+            raise InputError(f"{path}: of {both} one is rectified and the other is not; choose two of a kind.")
         apart_m, where = right.shift_m - left.shift_m, right.calibration.where
         if apart_m <= 0.0:
             problem = f"P puts the right camera {apart_m:g} m to the right of the left one"
@@ -396,7 +396,7 @@ class RosBag(ImageFormat):
             wrong = InputError(f"{info.calibration.where}: R is no rotation; calibrate the two as a pair.")
             return pose_of_matrix(np.column_stack([info.rotation, np.zeros(3)]), lambda _: wrong)
 
-        # The right camera in the frame of the left one, by way of the rectified frames.
+        # left_from_right, composed from the two rectifying rotations and the baseline.
         aside = np.array([0.0, 0.0, 0.0, 1.0, apart_m, 0.0, 0.0])
         left_from_right = SE3.compose(SE3.inverse(turn(left)), SE3.compose(aside, turn(right)))
         note = f"{path}: the two cameras are not rectified; their images are, by the two CameraInfo."
@@ -404,9 +404,9 @@ class RosBag(ImageFormat):
 
 
 def _stamps_and_first(bag: Bag, topic: str) -> tuple[np.ndarray, tuple[int, int], str]:
-    """Of a topic of images the times (T,) of its messages' headers, not decreasing, and what the first image says.
+    """Header times (T,) of an image topic, not decreasing; height and width, and the name of the camera frame.
 
-    That is the first that can be read: height and width, and the name of the camera's frame.
+    The last two are those of the first image that can be read.
     """
     where, stamps = f"{bag.path}, {topic}", list[int]()
     first: tuple[tuple[int, int], str] | None = None
@@ -432,16 +432,16 @@ def _stamps_and_first(bag: Bag, topic: str) -> tuple[np.ndarray, tuple[int, int]
         raise InputError(f"{where}: the stamp of image {late[0] + 1} is before the one it follows.")
     if gaps.size and not gaps.any():
         alike = f"all {len(stamps)} images have the time {stamps_ns[0]}"
-        raise InputError(f"{where}: {alike}, their headers are not filled in.")
+        raise InputError(f"{where}: {alike}, their headers have not been set.")
     return stamps_ns, *first
 
 
 @final
 @dataclass(frozen=True)
 class BagImages(Source):
-    """Images of one topic, or pairs of two with the left camera's first, of a height and width, at times (T,).
+    """Images of one topic, or pairs of two topics, left first, of height and width `shape`, at times (T,).
 
-    For each topic `rows` (T,) are the numbers of the messages that are the images, increasing.
+    `rows` (T,) are, for each topic, the increasing indices of the messages used.
     """
 
     path: Path
@@ -452,7 +452,7 @@ class BagImages(Source):
 
     def frames(self, start: int) -> Generator[ImageFrame]:
         with ExitStack() as stack:
-            # Each topic has a reader of its own: a bag may hold all left images before all right ones.
+            # One reader per topic, as a bag may store all left images before all right ones.
             streams = [
                 self._stream(stack.enter_context(opened(self.path)), topic, rows[start:])
                 for topic, rows in zip(self.topics, self.rows, strict=True)
@@ -467,7 +467,7 @@ class BagImages(Source):
                 yield from frames
 
     def _stream(self, bag: Bag, topic: str, rows: np.ndarray) -> Generator[Callable[[], Grey]]:
-        """Of each of some messages of a topic the image, once it is called."""
+        """Yields for each selected message of a topic a function that decodes its image."""
         wanted = frozenset(rows.tolist())
         for number, raw in enumerate(bag.messages(topic)):
             if number in wanted:

@@ -9,8 +9,8 @@ width: 640                              # px, must be the size of the images
 height: 480
 distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # optional; OpenCV's k1, k2, p1, p2, k3; k3 may be left out;
                                         # of a fisheye lens cv2.fisheye's k1, k2, k3, k4
-rate_hz: 30.0                           # optional; images per second, where there are no times, or fewer than 0.2
-baseline_m: 0.12                        # optional; of a rectified pair, where the recording has two cameras
+rate_hz: 30.0                           # optional; images per second, if there are no times, or for rates below 0.2
+baseline_m: 0.12                        # optional; of a rectified pair
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ KIND = (
     "(`rbpf calibrate` makes one)"
 )
 
-#: What `model` may be, and the model of distortion that it means.
+#: Values of `model` and the distortion models they select.
 MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"}
 _REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")
@@ -34,9 +34,9 @@ _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and the file that says so, for messages.
+    """A camera and the file that defines it, for messages.
 
-    `rate_hz`, images per second, and `baseline_m`, of a rectified pair, are None where the file does not say.
+    `rate_hz`, images per second, and `baseline_m`, of a rectified pair, are None if the file does not have them.
     """
 
     where: str
@@ -45,7 +45,7 @@ class Calibration:
     baseline_m: float | None = None
 
     def require_shape(self, shape: tuple[int, int], what: str) -> None:
-        """Refuse images of another height and width; `what` they are, for the message."""
+        """Refuse images of another height and width; `what` names them in the message."""
         camera = self.camera
         if shape != (camera.height, camera.width):
             found = f"the images of {what} have {shape[1]}x{shape[0]} px"
@@ -67,7 +67,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def camera_text(camera: Pinhole, about: str = "", baseline_m: float | None = None) -> str:
-    """What `camera.yaml` holds of a camera, and the baseline of a rectified pair; its first line says what it is `about`."""
+    """The text of `camera.yaml` for a camera, or a rectified pair with its baseline; `about` is its first line."""
     lens = [float(value) for value in camera.distortion]
     entries: dict[str, object] = {
         "model": model_of(camera),
@@ -82,12 +82,12 @@ def camera_text(camera: Pinhole, about: str = "", baseline_m: float | None = Non
 
 
 def coefficients(value: YamlValue, model: str = "radial-tangential") -> tuple[float, ...]:
-    """Distortion of a list: k1, k2, p1, p2, k3, of which the last may be left out, or k1, k2, k3, k4 if equidistant."""
+    """Coefficients from a list: k1, k2, p1, p2, k3, the last one optional, or k1, k2, k3, k4 if equidistant."""
     count = len(LENSES[model].coefficient_names)
     numbers = [item.number() for item in value.items(*sorted({4, count}))]
     return (*numbers, *[0.0] * (count - len(numbers)))
 
 
 def model_of(camera: Pinhole) -> str:
-    """What `model` is in the file of a camera."""
+    """The value of `model` in a camera's file."""
     return next(name for name, distortion in MODELS.items() if distortion == camera.distortion_model)

@@ -1,7 +1,7 @@
-"""Image files to grey values, one after the other and a few ahead of the caller.
+"""Image files to grey images, in sequence and decoded a few ahead of the caller.
 
 Colour becomes grey by OpenCV's weights (ITU-R BT.601); 16 bits become 8 over the whole range, 65535 to 255.
-A photo is turned as its EXIF orientation says, as viewers and OpenCV's calibration do.
+A photo is rotated by its EXIF orientation, as viewers and OpenCV's calibration do.
 """
 
 from collections import deque
@@ -26,23 +26,23 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", "
 
 
 def read_grey(path: Path, shape: tuple[int, int] | None = None) -> Grey:
-    """Image of a file, (H, W); of this height and width, if they are given.
+    """Image of a file, (H, W); `shape` is its required height and width.
 
-    Raises InputError: the file is missing, is no complete image of a format that OpenCV knows, or has another size.
+    Raises InputError: the file is missing, is not a complete image of a format that OpenCV knows, or has another size.
     """
     return decode(path, np.frombuffer(read_bytes(path), dtype=np.uint8), shape)
 
 
 def decode(path: Path | str, data: NDArray[np.uint8], shape: tuple[int, int] | None = None) -> Grey:
-    """Image (H, W) of the content (B,) of a file, which `path` names in messages; raises as `read_grey`."""
+    """Image (H, W) of a file's content (B,); `path` is for messages. Raises as `read_grey`."""
     import cv2
     from PIL import Image
 
     if not data.size:
         raise InputError(f"{path}: the file is empty, expected an image.")
-    # Before anything is decoded, which makes room for all that a header claims: the pixels of a damaged one may be more than
-    # the camera has, or than Pillow takes for sane, and a part of a PNG file longer than the file, which `verify` sees.
-    damaged = InputError(f"{path}: the file is damaged, incomplete or no image.")
+    # Checked before decoding, which allocates whatever a header claims: a damaged file may claim more pixels than the
+    # camera has, or than Pillow's limit, and a PNG chunk longer than the file, which `verify` detects.
+    damaged = InputError(f"{path}: the file is damaged, incomplete or not an image.")
     try:
         with Image.open(BytesIO(data.tobytes())) as header:
             width, height = header.size
@@ -51,7 +51,7 @@ def decode(path: Path | str, data: NDArray[np.uint8], shape: tuple[int, int] | N
         raise InputError(f"{path}: the image claims to be larger than any camera's.") from None
     except Exception:
         raise damaged from None
-    if shape is not None and width * height != shape[0] * shape[1]:  # a photo may be turned
+    if shape is not None and width * height != shape[0] * shape[1]:  # EXIF may swap the two
         raise _other_size(path, (height, width), shape)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
@@ -75,7 +75,7 @@ def to_grey(path: Path | str, image: np.ndarray) -> Grey:
 
 
 def require_shape(path: Path | str, image: Grey, shape: tuple[int, int] | None) -> Grey:
-    """The image, if it has this height and width, or None is expected; else an InputError."""
+    """The image. Raises InputError: `shape` is given and the image has another one."""
     if shape is not None and image.shape != shape:
         raise _other_size(path, image.shape[:2], shape)
     return image
@@ -94,12 +94,12 @@ def _to_8_bits(path: Path | str, image: np.ndarray) -> Grey:
     return image
 
 
-AHEAD = 4  #: Images that are decoded before they are asked for.
+AHEAD = 4  #: Number of images decoded in advance.
 
 
 @dataclass(frozen=True)
 class FileImages(Source):
-    """One file per image of a height and width, at times (T,); of the right camera too where there are two."""
+    """One file per image of a height and width, at times (T,); also of the right camera if there are two."""
 
     stamps_ns: np.ndarray
     shape: tuple[int, int]
@@ -116,7 +116,7 @@ class FileImages(Source):
 
 
 def frame_of(stamp_ns: int, *reads: Callable[[], Grey]) -> ImageFrame:
-    """The images that one function or two return; one that raises an InputError leaves a place, and says why."""
+    """A frame from one or two readers; an InputError becomes the frame's `problem`, without that image."""
     images, problem = list[Grey | None](), None
     for read in reads:
         try:

@@ -4,13 +4,13 @@
   radial-tangential` with `distortion_coefficients` (k1, k2, p1, p2[, k3]) or `equidistant` with k1, k2, k3, k4, and
   `T_BS`, body_from_camera;
 - `cam0/data.csv`: time [ns] and file in `cam0/data` of each image;
-- `cam1`, for stereo: the same of the right camera. Pairs that are not rectified become so by the two `sensor.yaml`;
+- `cam1`, for stereo: the same of the right camera. Unrectified pairs are rectified by the two `sensor.yaml`;
 - `state_groundtruth_estimate0` or `vicon0`, if the truth is known: `data.csv` with time [ns], position of the
   sensor [m] and its quaternion qw, qx, qy, qz, world_from_sensor, and more columns; `sensor.yaml` with `T_BS`,
   body_from_sensor. The truth returned is world_from_camera = world_from_sensor body_from_sensor⁻¹ body_from_camera.
 
-A camera file given replaces that of `cam0`, and the pair's baseline, if it has one; the images are then taken as they
-are, and the truth stays that of the sequence's camera.
+A camera file given replaces that of `cam0`, and the pair's baseline, if it has one; the images are then taken as rectified,
+and the truth remains that of the sequence's camera.
 M. Burri, J. Nikolic, P. Gohl, T. Schneider, J. Rehder, S. Omari, M. W. Achtelik, R. Siegwart, "The EuRoC micro aerial
 vehicle datasets", IJRR 35(10), 2016.
 """
@@ -90,7 +90,7 @@ class Euroc(ImageFormat):
 
 
 def _read_camera(path: Path, hint: str) -> tuple[Calibration, Array]:
-    """A camera and where it sits, body_from_camera (7,), of a `sensor.yaml`; `hint` is what is expected to lie there."""
+    """A camera and its mounting pose body_from_camera (7,) from a `sensor.yaml`; `hint` describes the expected file."""
     entries = read_yaml(path, hint).entries(_CAMERA)
     entries["camera_model"].choice(["pinhole"])
     model = _LENSES[entries["distortion_model"].choice(list(_LENSES))]
@@ -102,7 +102,7 @@ def _read_camera(path: Path, hint: str) -> tuple[Calibration, Array]:
 
 
 def _read_truth(mav: Path, body_from_camera: Array, images_ns: np.ndarray) -> Truth | None:
-    """Of a camera with images at such times; None where there is none."""
+    """Ground truth of a camera with images at `images_ns`, or None."""
     for kind in _TRUTHS:
         file, mount = mav / kind / "data.csv", mav / kind / "sensor.yaml"
         if not file.exists():
@@ -112,7 +112,7 @@ def _read_truth(mav: Path, body_from_camera: Array, images_ns: np.ndarray) -> Tr
         xyzw = np.roll(table.block("q_w", "q_z"), -1, axis=1)
         world_from_sensor = normalised(np.hstack([xyzw, table.block("p_x", "p_z")]), table.error)
         if kind == _TRUTHS[0] and not mount.exists():
-            # The estimated state is the body's by definition; where a marker sits on it is not.
+            # The estimated state is that of the body by definition; a marker's mounting pose has to be given.
             sensor_from_body = SE3.identity()
         else:
             hint = "a sensor.yaml with T_BS, the pose of the sensor on the body"

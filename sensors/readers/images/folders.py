@@ -1,10 +1,10 @@
-"""Images of one camera that lie in folders, and what beside them says when and from where they were taken.
+"""Images of one camera that lie in folders, with files of their times and camera poses.
 
 TUM RGB-D sequences (J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, "A benchmark for the evaluation of RGB-D
 SLAM systems", IROS 2012):
 
-- `rgb.txt`: time [s] and file of each image, `#` starting a comment; images more than five seconds apart are refused, whose
-  times are in another unit, unless `rate_hz` of `camera.yaml` says so;
+- `rgb.txt`: time [s] and file of each image, `#` starting a comment; images more than five seconds apart are refused, as
+their times are probably not in seconds, unless `rate_hz` of `camera.yaml` confirms them;
 - `camera.yaml`: the calibration, which the distributed sequences do not bring along (`calibration` describes it);
 - `groundtruth.txt`, if the truth is known: `timestamp tx ty tz qx qy qz qw`, world_from_camera.
 
@@ -13,8 +13,8 @@ forests for camera relocalization in RGB-D images", CVPR 2013):
 
 - `frame-000000.color.png`, ...: colour images, 30 per second, whose number is their time;
 - `frame-000000.pose.txt`, ...: 4 x 4 matrix by rows, world_from_camera [m], of the depth camera, which is taken as the
-  colour camera's. Where tracking was lost, numbers that are not finite, the truth has a gap;
-- `camera.yaml`, if the camera was calibrated. Else the nominal intrinsics of the colour camera, f = 525 px at 640 x 480;
+  colour camera's. The truth has gaps where tracking was lost (numbers that are not finite);
+- `camera.yaml`, if the camera was calibrated; else the nominal intrinsics of the colour camera, f = 525 px at 640 x 480;
   the 585 px that some tools give are the depth camera's.
 
 Photos of one camera with measured poses, in `images`, and `cameras.txt`, `#` starting a comment:
@@ -26,7 +26,7 @@ Photos have no time: they are `1 / PHOTO_RATE_HZ` apart, in the order of their l
 
 Any other folder of images with a `camera.yaml`:
 
-- the images, in the folder itself or in its `images`, in the order of their names, numbers in them counted as such
+- the images, in the folder itself or in its `images`, in natural order of their names
   (`2.png` before `10.png`);
 - `times.txt`, if the times are known: one per image [s]. Else the images are `rate_hz` of `camera.yaml` apart,
   and without that a video's `DEFAULT_RATE_HZ`, which a logged message says;
@@ -163,26 +163,26 @@ class Folder(ImageFormat):
 
 
 def list_images(path: Path) -> list[Path]:
-    """Images in the folder, or if there is none in its `images`, in the order of their names."""
+    """Images in the folder, or else in its `images`, in natural order of their names."""
     for folder in (path, path / "images"):
         if folder.is_dir():
             found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
             if found:
-                # Numbers in a name count as such.
+                # Numbers in a name are compared by value.
                 parts = {file: re.split(r"(\d+)", file.name) for file in found}
                 return sorted(found, key=lambda f: ([int(p) if p.isdecimal() else p for p in parts[f]], f.name))
     return []
 
 
 def evenly(count: int, rate_hz: float) -> np.ndarray:
-    """(count,) int64 stamps from 0 at a rate."""
+    """(count,) int64 equidistant stamps from 0 at a rate."""
     return np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def _sequence(
     path: Path, camera: Calibration, stamps_ns: np.ndarray, files: list[Path], truth: Truth | None, listed: Path
 ) -> ImageSequence:
-    """Images in files of one size, which are `listed` in a file, or lie in the folder."""
+    """A sequence of image files of one size, `listed` in a file or found in the folder."""
     require_seconds(listed, stamps_ns, "images", camera.rate_hz)
     shape = first_shape(files, listed)
     camera.require_shape(shape, str(path))
@@ -191,7 +191,7 @@ def _sequence(
 
 
 def _scenes_pose(path: Path) -> Array | None:
-    """Pose (7,) of a file; None where there is none, or its numbers are not finite."""
+    """Pose (7,) of a file; None if it is missing, or its numbers are not finite."""
     if not path.exists():
         return None
     fields = read_text(path, "a 4 x 4 matrix").split()

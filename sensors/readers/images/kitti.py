@@ -6,8 +6,8 @@
 - the truth, if it is known: `poses.txt` beside it, or as distributed `../../poses/<sequence>.txt`, one line of a
   3 x 4 matrix by rows per image, world_from_camera of `image_0` [m].
 
-A camera file given replaces the intrinsics in `calib.txt`, and the baseline, if it has one. An image that is missing
-between others is a frame without an image.
+A camera file given replaces the intrinsics in `calib.txt`, and the baseline, if it has one. A missing image
+between others gives a frame without an image.
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012.
 """
 
@@ -27,7 +27,7 @@ from rbpf.sensors.readers.images.poses import pose_of_matrix
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import line_error, parse_number, read_columns, read_stamped, read_text, require_seconds
 
-ALIGNED_PX = 1e-2  #: How far intrinsics of the two cameras of a pair may differ.
+ALIGNED_PX = 1e-2  #: Tolerance of equal intrinsics of a pair's two cameras.
 _PAIRS = ((0, 1), (2, 3))
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
 
@@ -74,15 +74,15 @@ class Kitti(ImageFormat):
             where, theirs, first_from_right = _projection(calib, self.kind, right)
             baseline_m = float((first_from_right - first_from_camera)[4])
             if baseline_m == 0.0:
-                problem = "it is at the place of the left camera, a baseline of zero"
+                problem = "it is at the position of the left camera, a baseline of zero"
                 raise InputError(f"{where}: {problem}; give the projections of two cameras.")
             if np.abs(intrinsics - theirs).max() > ALIGNED_PX or baseline_m < 0.0:
                 problem = "expected the left camera's projection shifted to the right, as of a rectified pair"
                 raise InputError(f"{where}: {problem}.")
-        # A sentence about each folder that does not hold an image for every time.
+        # A note for each folder that does not have an image for every time.
         held = [sum(file.exists() for file in of_camera) for of_camera in files]
         notes = tuple(
-            f"{folder}: {number} images for {count} times; the other pairs come without."
+            f"{folder}: {number} images for {count} times; the other pairs lack that image."
             for folder, number in zip(folders, held, strict=False)
             if stereo and number < count
         )
@@ -103,9 +103,9 @@ class Kitti(ImageFormat):
 
 
 def _projection(path: Path, hint: str, camera: int) -> tuple[str, Array, Array]:
-    """A camera of `calib.txt` by its number; other lines are passed over. `hint` is what is expected to lie there.
+    """A camera of `calib.txt` by its number; other lines are ignored. `hint` describes the expected file.
 
-    Where its line is, in words; fx, fy, cx, cy (4,) [px]; its pose (7,) in the frame of camera 0, to which poses refer.
+    Returns its line for messages; fx, fy, cx, cy (4,) [px]; and its pose (7,) relative to camera 0, the poses' frame.
     """
     for number, line in enumerate(read_text(path, hint).splitlines(), 1):
         name, _, rest = line.partition(":")

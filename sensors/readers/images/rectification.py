@@ -1,8 +1,8 @@
-"""Two cameras side by side: which images belong together, and images made into those of a rectified pair.
+"""Two cameras side by side: pairing of their images in time, and rectification.
 
-Images are rectified by OpenCV's `stereoRectify`. Without fisheye lenses the rectified image is as wide as the given ones
-allow. One as wide as a fisheye's would have a small middle and borders drawn out: there the focal length stays what it is
-in the middle, and what then lies outside is left out. A lens of 140° on images 640 px wide, f = 262 px, leaves 101°.
+Images are rectified by OpenCV's `stereoRectify`. Without fisheye lenses the rectified field of view is as wide as the
+images allow. For a fisheye this would shrink the centre and stretch the borders: there the focal length at the centre is
+kept, and what lies outside the image is cut off. A lens of 140° on images 640 px wide, f = 262 px, keeps 101°.
 """
 
 from collections.abc import Iterator
@@ -16,24 +16,24 @@ from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 
-#: The baseline lies along the rows by this fraction of its length at least; beyond, most of the view is lost.
+#: Least component of the baseline along the rows, relative to its length; below it most of the view is lost.
 BESIDE = 0.7
-OUTSIDE = -10.0  #: A column and a row that no image has: what is drawn from there is black.
-ALIKE_PX = 1e-2  #: How far intrinsics of a rectified pair may differ: rounding, and no more than an image can show.
-#: How far the axes of a rectified pair may be rotated, and how far off the rows the baseline may point, relative to it.
+OUTSIDE = -10.0  #: A pixel outside every image: what is mapped from there becomes black.
+ALIKE_PX = 1e-2  #: Tolerance of equal intrinsics in a rectified pair: rounding errors, invisible in the image.
+#: Tolerances of a rectified pair: rotation of the axes, and the baseline's relative offset from the rows.
 ROTATED_RAD, ASIDE = 1e-4, 1e-2
 
 
-#: For each camera, columns and rows (H, W) float32 of the given image that the rectified one shows.
+#: For each camera, columns and rows (H, W) float32 of the original image for each rectified pixel.
 Maps = list[tuple[np.ndarray, np.ndarray]]
 
 
 def rectification(
     left: Pinhole, right: Pinhole, left_from_right: Array, where: str
 ) -> tuple[RectifiedStereo, Array, Maps]:
-    """How images of two cameras of one size, the second at `left_from_right` (7,), are made into those of a rectified pair.
+    """Computes the rectification of two cameras of one image size, the second at `left_from_right` (7,).
 
-    The pair, left_from_rectified (7,), which is a turn, and the maps. Raises InputError: as `rectified`.
+    Returns the pair, the pure rotation left_from_rectified (7,), and the maps. Raises InputError: as `rectified`.
     """
     import cv2
 
@@ -48,8 +48,8 @@ def rectification(
     motion = SE3.rotation(right_from_left), SE3.translation(right_from_left)[:, None]
     maps: Maps
     if "equidistant" in (left.distortion_model, right.distortion_model):
-        # Turned as OpenCV does, which depends on the two poses alone, and drawn by our own lenses: beyond the image where
-        # they see nothing.
+        # The rotations are OpenCV's, which depend on the two poses alone; the maps use our own lens models, and point
+        # outside the image where the lens sees nothing.
         fx, fy, cx, cy = np.mean([left.params[:4], right.params[:4]], axis=0).tolist()
         camera = Pinhole(*size, 0.5 * (fx + fy), 0.5 * (fx + fy), cx, cy)
         same = (*_opencv(camera), *_opencv(camera))
@@ -78,7 +78,7 @@ def rectification(
 @final
 @dataclass(frozen=True)
 class RectifiedImages(Source):
-    """Pairs of another source, rectified."""
+    """Rectifies the pairs of another source."""
 
     source: Source
     maps: Maps
@@ -95,13 +95,13 @@ class RectifiedImages(Source):
 
 
 def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, where: str, note: str) -> ImageSequence:
-    """The pairs of a sequence of the left camera rectified, and its truth; its images as they are where they are that.
+    """Rectifies the pairs of a sequence, and its truth; images that are already rectified are unchanged.
 
-    The second camera is at `left_from_right` (7,); `where` its calibration stands is for messages, and the `note` is what is
-    said if images are rectified. Raises InputError: the right camera is not to the right of the left one.
+    The second camera is at `left_from_right` (7,); `where` names its calibration in messages, and the `note` is added if
+    images are rectified. Raises InputError: the right camera is not to the right of the left one.
     """
-    # They are a rectified pair already if both have one size and one set of intrinsics, no distortion and equal axes, and
-    # the right one lies to the right of the left one along the rows.
+    # They are already rectified if both have equal sizes, intrinsics and axes and no distortion, and the right one lies to
+    # the right of the left one along the rows.
     left, (along, *across) = sequence.camera, SE3.translation(left_from_right)
     plain = left.lens.is_identity and right.lens.is_identity
     equal = plain and (left.width, left.height) == (right.width, right.height)
@@ -122,14 +122,14 @@ def _opencv(camera: Pinhole) -> tuple[Any, Any]:
 def pair_stamps(
     left_ns: np.ndarray, right_ns: np.ndarray, tolerance_s: float, where: str
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Pairs of images, each the other's nearest in time and within the tolerance, in order of time.
+    """Pairs of images that are mutual nearest neighbours in time, within the tolerance, in order of time.
 
-    Rows (P,) of the left camera's times (T,) and (P,) of the right one's (U,), both in order, and a sentence about each camera
-    whose images are left out.
+    Returns rows (P,) of the left camera's ordered times (T,) and (P,) of the right one's (U,), and a sentence about each
+    camera with images left out.
     """
     nearest, gap_ns = nearest_in_time(left_ns, right_ns)
     back, _ = nearest_in_time(right_ns, left_ns)
-    # Of equal times the first counts for all: go there and back by time, not by row.
+    # The first of equal times stands for all: mutual neighbours are compared by time, not by row.
     mutual = left_ns[back[nearest]] == left_ns
     left = np.flatnonzero(mutual & (gap_ns <= round(tolerance_s * 1e9)))
     left = left[np.unique(nearest[left], return_index=True)[1]]
@@ -148,7 +148,7 @@ def pair_stamps(
 
 
 def nearest_in_time(stamps_ns: np.ndarray, among_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row (T,) of the nearest time, the earlier of two, and its distance (T,) in ns."""
+    """Row (T,) of the nearest time (the earlier in a tie), and its distance (T,) in ns."""
     after = np.clip(np.searchsorted(among_ns, stamps_ns), 0, among_ns.size - 1)
     before = np.maximum(after - 1, 0)
     gap_before, gap_after = np.abs(stamps_ns - among_ns[before]), np.abs(stamps_ns - among_ns[after])

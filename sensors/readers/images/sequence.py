@@ -1,4 +1,4 @@
-"""What every reader of images returns: the camera, the times, the truth where known, and images one after the other."""
+"""What every reader of images returns: the camera, the times, the truth if known, and a stream of images."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -14,22 +14,22 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import Truth
 from rbpf.sensors.readers.format import Format
 
-TOLERANCE_S = 0.005  #: Two images whose times differ by no more were taken together.
+TOLERANCE_S = 0.005  #: Largest time difference of two images that form a pair.
 
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """One image or a pair, or the place of one that could not be read."""
+    """One image or a pair, or a placeholder for one that could not be read."""
 
     stamp_ns: int  #: time of the image, integer nanoseconds.
-    image: np.ndarray | None  #: (H, W) uint8 grey; None where it could not be read.
-    #: (H, W) uint8 grey, the second camera of a stereo sequence; None where there is none.
+    image: np.ndarray | None  #: (H, W) uint8 grey; None if it could not be read.
+    #: (H, W) uint8 grey, the second camera of a stereo sequence; None if there is none.
     right: np.ndarray | None = None
-    problem: str | None = None  #: one sentence that says why an image is missing; None where none is.
+    problem: str | None = None  #: one sentence that says why an image is missing; else None.
 
 
 class Source(ABC):
-    """Where the images of a sequence come from."""
+    """The source of a sequence's images."""
 
     @abstractmethod
     def frames(self, start: int) -> Iterator[ImageFrame]:
@@ -41,22 +41,22 @@ class Source(ABC):
 class ImageSequence:
     """A recording of a camera or of a rectified stereo pair.
 
-    Nothing of it but its first image is decoded before `frames` is called. Raises InputError: the stamps are no whole
+    Only the first image is decoded before `frames` is called. Raises InputError: the stamps are not whole
     numbers in order; the camera of a pair is distorted, or its baseline is not positive.
     """
 
     name: str  #: short name of the recording.
-    camera: Pinhole  #: of the (left) images as they come out of `frames`.
-    #: (T,) int64 times of the images, not decreasing; equal ones, between which no time passes, occur.
+    camera: Pinhole  #: of the (left) images that `frames` yields.
+    #: (T,) int64 times of the images, not decreasing; equal ones are allowed.
     stamps_ns: np.ndarray
     #: world_from_camera of the (left) camera at its own stamps, without landmarks; None where unknown.
     truth: Truth | None
-    baseline_m: float | None  #: of a rectified stereo pair, None where there is one camera.
+    baseline_m: float | None  #: of a rectified stereo pair, None for one camera.
     source: Source  #: where the images come from.
-    notes: tuple[str, ...] = ()  #: one sentence for each thing that was left out or changed.
+    notes: tuple[str, ...] = ()  #: one sentence for each omission or change.
 
     def __post_init__(self) -> None:
-        """A sequence may be made by hand."""
+        """Validates the fields, as a sequence may be made by hand."""
         if self.baseline_m is not None:
             RectifiedStereo(self.camera, self.baseline_m)
         require(self.name, vars(self), {"stamps_ns": stamps("T")})
@@ -74,8 +74,8 @@ class ImageSequence:
     def frames(self, start: int = 0) -> Iterator[ImageFrame]:
         """Images, or pairs of one size, in order of time, from number `start` on.
 
-        A frame of which an image cannot be read comes without that image and with the problem. A video that ends before
-        its last announced image ends with such a frame. Raises InputError: there is no image of that number.
+        A frame with an unreadable image comes without it, with a `problem`. A video that ends before its last announced
+        image ends with such a frame. Raises InputError: there is no image of that number.
         """
         if not 0 <= start < len(self):
             raise InputError(f"{self.name}: expected a start from 0 to {len(self) - 1}, got {start}.")
@@ -87,8 +87,8 @@ class ImageSequence:
 class Topics:
     """Names of streams in a recording that holds several, as a ROS bag does."""
 
-    images: tuple[str, ...] = ()  #: one, or a left and a right one; empty where the recording is to be asked.
-    truth: str | None = None  #: the stream of the camera's true poses; None for none.
+    images: tuple[str, ...] = ()  #: one, or a left and a right one; empty to use the recording's own.
+    truth: str | None = None  #: the stream of the camera's true poses; or None.
 
     @classmethod
     def parse(cls, images: str | None = None, truth: str | None = None) -> Self:
@@ -102,7 +102,7 @@ class Topics:
         return cls(names, truth)
 
     def entries(self) -> dict[str, str]:
-        """For a run's config.yaml; what `parse` takes."""
+        """The entries for a run's config.yaml, which `parse` reads."""
         named = {"image_topic": ",".join(self.images), "truth_topic": self.truth}
         return {name: value for name, value in named.items() if value}
 
@@ -113,16 +113,16 @@ UNNAMED = Topics()
 @final
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a caller may say about a recording."""
+    """A caller's options for reading a recording."""
 
-    calibration: Path | None = None  #: a `camera.yaml` in place of the recording's own calibration; None for that.
-    topics: Topics = UNNAMED  #: of a ROS bag, where they have to be named.
-    tolerance_s: float = TOLERANCE_S  #: images of two cameras whose times differ by no more belong together.
-    stereo: bool = False  #: both cameras are asked for, of a format that has a `stereo_kind`.
+    calibration: Path | None = None  #: a `camera.yaml` to use instead of the recording's own calibration.
+    topics: Topics = UNNAMED  #: topics of a ROS bag, if they have to be named.
+    tolerance_s: float = TOLERANCE_S  #: largest time difference of two images that form a pair.
+    stereo: bool = False  #: whether both cameras are read; needs a format with a `stereo_kind`.
 
 
 class ImageFormat(Format[ReadOptions, ImageSequence]):
     """A format of image sequences: of one camera, the left one of two, or of two cameras, rectified."""
 
-    stereo_kind: str = ""  #: As `kind`, of a recording of two cameras; empty where the format has one camera only.
-    has_topics: bool = False  #: Whether streams in it have names.
+    stereo_kind: str = ""  #: As `kind`, of a recording of two cameras; empty if the format has one camera only.
+    has_topics: bool = False  #: Whether its streams have names.

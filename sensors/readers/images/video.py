@@ -1,13 +1,13 @@
 """Video files that OpenCV's FFmpeg can decode, with a `camera.yaml` beside the video or given.
 
-Each image has the time that the video says, unless `camera.yaml` has `rate_hz`: a phone's images are not evenly spread. To
-know them the video is gone through once as it is opened. Times that are those of the header's rate to a millisecond are the
-rate's; then a video that ends before the last image that its header announces ends with a frame that has none and says so.
+Each image has the video's own time stamp, unless `camera.yaml` has `rate_hz`: a phone's images are not evenly spaced. To
+know the times the video is read once when it is opened. Times that agree with the header's rate to a millisecond are
+replaced by exact ones; then a video that ends before the number of images in its header ends with a frame with a `problem`.
 
-A video is turned as it says itself, as viewers do, and `camera.yaml` is that of the images as they are shown. One of the
-images as they are stored, which is noticed by its width and height, is turned with them.
+A video is rotated by its own rotation flag, as viewers do, and `camera.yaml` is for the images as displayed. One for the
+images as stored, recognised by width and height, is rotated with them.
 
-Beside them a camera at this computer, as a source of images that ends when it is unplugged or somebody presses Ctrl-C.
+Also a camera attached to this computer, as a source that ends when it is unplugged or on Ctrl-C.
 """
 
 import os
@@ -65,7 +65,7 @@ class VideoImages(Source):
 
     def frames(self, start: int) -> Generator[ImageFrame]:
         with opened(self.path) as capture:
-            # Jumping to an image is inexact in most codecs, going through those before it is not.
+            # Seeking is inexact in most codecs; reading all images before is exact.
             if not all(capture.grab() for _ in range(start)):
                 return
             indices = range(start, len(self.stamps_ns))
@@ -87,10 +87,10 @@ class VideoImages(Source):
 
 
 def read_header(path: Path) -> tuple[np.ndarray, tuple[int, int], int]:
-    """What a video says of itself: times (T,) int64 ns of its images, from 0; height and width of the first; and a turn.
+    """Reads times (T,) int64 ns of a video's images, from 0; height and width of the first; and its rotation.
 
-    By so many quarters, clockwise, the stored images are turned. Raises InputError: it cannot be opened, or no image of it
-    can be decoded.
+    The rotation is in clockwise quarter turns of the stored images. Raises InputError: the video cannot be opened, or none
+    of its images can be decoded.
     """
     import cv2
 
@@ -108,7 +108,7 @@ def read_header(path: Path) -> tuple[np.ndarray, tuple[int, int], int]:
     own_ns = np.rint(np.nan_to_num(np.array(times_ms) - times_ms[0]) * 1e6).astype(np.int64)
     if (np.diff(own_ns) > 0).all() and np.abs(own_ns - evenly(own_ns.size, rate_hz)).max() > _ROUNDING_NS:
         return own_ns, shape, quarters
-    # A header may announce what it likes; no image takes less than a byte.
+    # The image count in a header may be wrong; an image takes at least one byte of the file.
     count = int(announced) if 0 < announced <= path.stat().st_size else own_ns.size
     return evenly(count, rate_hz), shape, quarters
 
@@ -118,8 +118,8 @@ def opened(path: Path) -> Iterator[Any]:
     """OpenCV's decoder of a video, closed at the end."""
     import cv2
 
-    # Other backends take the number in a name such as 000001 for a pattern of images.
-    # An absolute path is never taken for a URL, and no file may send the decoder to another one over the network.
+    # Other backends take a number in a name such as 000001 as a pattern of image files.
+    # An absolute path is never taken for a URL, and no file can make the decoder open network resources.
     name = str(path.absolute())
     try:
         name.encode()
@@ -136,10 +136,10 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[tuple[str, Grey]]]:
-    """Up to `most` images, evenly spread, of a video or of a folder that has them in it or in its `images`, and how many.
+    """The number of images of a video or a folder (or its `images`), and up to `most` of them, evenly spaced.
 
-    Each comes with what it is called in messages; those that cannot be read are left out. Raises InputError: there is
-    nothing of that name, or no image in it.
+    Each image comes with its name for messages; unreadable ones are left out. Raises InputError: the path does not exist,
+    or has no image.
     """
     video = path.is_file() and path.suffix.lower() in SUFFIXES
     if not (video or path.is_dir()):
@@ -170,10 +170,10 @@ def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[tuple[str, G
 
 @final
 class LiveCamera:
-    """The images of an attached camera, each the newest one when it is asked for.
+    """Images of an attached camera; each is the newest at the time of the call.
 
     Args:
-        number: as OpenCV counts cameras, from 0.
+        number: OpenCV's index of the camera, from 0.
         calibration: its camera.yaml.
 
     Raises InputError: there is no calibration, no such camera, or it gives images of another size.
@@ -192,7 +192,7 @@ class LiveCamera:
         self._capture: Any = cv2.VideoCapture(number)
         if not self._capture.isOpened():
             raise InputError(f"there is no camera {number}, or another program uses it")
-        # One image in the driver's queue: what waits there would be old by the time it is filtered.
+        # A driver queue of one image: queued images would be outdated when filtered.
         self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width)
         self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height)
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
@@ -202,7 +202,7 @@ class LiveCamera:
         calibrated.require_shape(self._first.image.shape, self.name)
 
     def frames(self, start: int = 0) -> Iterator[ImageFrame]:
-        """Images until the camera is gone or Ctrl-C is pressed; the first one is that which the run was started from."""
+        """Images until the camera is gone or Ctrl-C is pressed; the first one is that used for initialisation."""
         stopped = threading.Event()
         in_main = threading.current_thread() is threading.main_thread()
         before = signal.signal(signal.SIGINT, lambda *_: stopped.set()) if in_main else None

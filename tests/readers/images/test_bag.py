@@ -218,7 +218,7 @@ WRONG = {
     "binned": ({"binning": 2}, "the images are binned"),
     "size": ({"size": (48, 64)}, "width and height are 64x48, the images of .*image_raw have 24x16 px"),
     "no size": ({"size": (0, 0)}, "/cam0/camera_info: .*width"),
-    "times never set": ({"stamps": (0, 0, 0)}, "all 3 images have the time 0, their headers are not filled in"),
+    "times never set": ({"stamps": (0, 0, 0)}, "all 3 images have the time 0, their headers have not been set"),
     "topic": (Topics(("/nothing",)), "/nothing is no topic of images; the bag's image topics are /cam0/image_raw"),
     "poses for images": (Topics(("/truth",)), "/truth is no topic of images"),
     "truth": (Topics(truth="/nothing"), "expected poses in the topic /nothing, found /truth with poses"),

@@ -48,7 +48,7 @@ def encoded(image, suffix=".png", cut=0):
 
 
 NOISE = np.random.default_rng(1).integers(0, 255, SIZE, dtype=np.uint8)
-DAMAGED = "the file is damaged, incomplete or no image."
+DAMAGED = "the file is damaged, incomplete or not an image."
 LOST = [
     (None, "no such file."),
     (b"", "the file is empty, expected an image."),

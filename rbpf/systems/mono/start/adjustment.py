@@ -1,7 +1,7 @@
-"""The first frames of a run, and their adjustment in one piece: path, features and, where it is not known, the camera.
+"""Batch adjustment (bundle adjustment) of a run's first frames: path, features and, for self-calibration, the camera.
 
-A feature is a direction d, a unit vector, and an inverse distance q, both from the first camera, which is the origin: the
-camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it is. What is minimised is Mathematics (start-cost).
+A feature is a direction d, a unit vector, and an inverse distance q, both relative to the first camera, the origin: the
+camera (R, t) observes it in the direction c = Rᵀ(d − q t), at any distance. The cost is Mathematics (start-cost).
 """
 
 from contextlib import suppress
@@ -26,29 +26,29 @@ from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.system import Revision
 
-MIN_VIEWS = 3  #: Frames that must see a feature for it to take part.
+MIN_VIEWS = 3  #: Least observations of a feature.
 MIN_FRAMES = 3
-#: Features that two frames in a row must have in common: three determine a pose, and half of them may be wrong.
+#: Features that consecutive frames must share: three determine a pose, and half of them may be wrong.
 MIN_SHARED = 6
-SCALE_STD = 1e-4  #: Standard deviation to which the scale is held.
-MAX_STEPS, MIN_GAIN = 30, 1e-4  #: Steps of the adjustment at most, and the fraction of the cost that ends it.
-SAME_COST = 10.0 * MIN_GAIN  #: Two minima whose costs differ by less than this fraction are one.
-#: Times the noise: residuals that a minimum is far from, and by how much less each time on the way to it.
+SCALE_STD = 1e-4  #: Standard deviation of the scale constraint.
+MAX_STEPS, MIN_GAIN = 30, 1e-4  #: Maximum steps, and the relative decrease of the cost that ends the adjustment.
+SAME_COST = 10.0 * MIN_GAIN  #: Minima whose costs differ by less than this fraction are identical.
+#: Graduated non-convexity: residuals over noise at which it starts, and factor by which the noise is reduced.
 FAR, NEARER = 1.5, 3.0
 _HALF = CAUCHY_SCALE**2 / 2.0
 _BEYOND = float(np.exp(_HALF) * exp1(_HALF))
 LOSS_INFORMATION = (1.0 - _HALF * _BEYOND) ** 2 / ((_BEYOND + _HALF * _BEYOND - 1.0) * _HALF * _BEYOND)
-"""How many times Gauss's and Newton's information with the loss's weights w is known where noise is Gaussian: 1.27.
+"""Correction factor of the Gauss-Newton information with the loss's weights w, for Gaussian noise: 1.27.
 
-The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), the weights' is E w of it. In two dimensions, with
+The estimate's is (E ψ′)²/E ψ² of that of least squares (P. Huber, 1981), Gauss-Newton's E w of it. In two dimensions, with
 a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
 """
 
-FARTHEST = 0.2  #: Times the mean inverse distance: no feature is farther away after a reversal.
-CHI2_MEDIAN = float(2.0 * np.log(2.0))  #: Of χ² with two degrees of freedom.
-#: A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s.
+FARTHEST = 0.2  #: Least inverse distance after a reversal, relative to the mean.
+CHI2_MEDIAN = float(2.0 * np.log(2.0))  #: Median of χ² with two degrees of freedom.
+#: Least random walk of the velocity in one second, rad/s, m/s, so that its density exists.
 MIN_STD_VELOCITY = 1e-6
-#: Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down.
+#: Levenberg-Marquardt damping: initial value, its factor per step, and the value that ends the iteration.
 DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
 _PREFIX = "start/frames/"
 _FRAMES = {
@@ -65,13 +65,13 @@ _FRAMES = {
 
 @final
 class FirstFrames:
-    """What was seen in the first frames, and from where (7,) as far as is known, in the particles' world.
+    """Observations of the first frames, and approximate poses (7,) in the particles' world.
 
     Attributes:
-        stamps_ns: of all frames.
-        seen: those that are kept.
-        path: as many poses, from which an adjustment may start.
-        last: where the last camera is in the particles' world, from which the next pose is counted on.
+        stamps_ns: (T,) of all frames.
+        seen: the frames.
+        path: their poses, initial values of an adjustment.
+        last: the last camera pose in the particles' world, reference of the next increment.
     """
 
     def __init__(self) -> None:
@@ -84,27 +84,27 @@ class FirstFrames:
         self.last = SE3.identity()
 
     def note(self, seen: FeatureFrame, pose: np.ndarray) -> None:
-        """The next frame; of its pose counts how far it is from the last one."""
+        """Adds a frame; of its pose only the increment from the last one is used."""
         self.stamps_ns.append(seen.stamp_ns)
         self.seen.append(seen)
         self.path.append(SE3.compose(self.path[-1], SE3.between(self.last, pose)) if self.path else pose)
         self.last = pose
 
     def thin(self, most: int) -> None:
-        """Of more than `most` those are dropped that lie closest for their age: the longer ago, the fewer are left."""
+        """Reduces them to `most` frames, dropping those closest together relative to their age: older ones become sparser."""
         while len(self.seen) > most:
             at = np.array([frame.stamp_ns for frame in self.seen])
             dropped = 1 + int(np.argmin((at[2:] - at[:-2]) / np.maximum(at[-1] - at[1:-1], 1)))
             del self.seen[dropped], self.path[dropped]
 
     def seen_first(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Names (F,) of all features, and from where (F, 7) on the path (T, 7) of all frames each of them was seen first."""
+        """Names (F,) of all features, and the pose (F, 7) of their first observation on the path (T, 7) of all frames."""
         names, first = np.unique(np.concatenate([frame.landmarks for frame in self.seen]), return_index=True)
         stamps = np.repeat([frame.stamp_ns for frame in self.seen], [frame.landmarks.size for frame in self.seen])
         return names, path[np.searchsorted(self.stamps_ns, stamps[first])]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint; nothing where there are none."""
+        """The arrays for a checkpoint; empty without frames."""
         if not self.seen:
             return {}
         found = {
@@ -133,15 +133,15 @@ class FirstFrames:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """What an adjustment of the first T frames leaves."""
+    """The result of an adjustment of the first T frames."""
 
-    filter: Filter  #: that goes on, in place of the one so far.
+    filter: Filter  #: the filter that replaces the previous one.
     revision: Revision  #: of all poses so far.
-    seen_first: tuple[np.ndarray, np.ndarray]  #: names (F,) of all features, and from where (F, 7) they were.
+    seen_first: tuple[np.ndarray, np.ndarray]  #: names (F,) of features, and poses (F, 7) of their first observation.
 
 
 def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Poses (W, n, 7) of paths (n, T, 7) at other times (W,): on the way between two, or the first or the last."""
+    """Poses (W, n, 7) of paths (n, T, 7) at other times (W,), interpolated, or the first or the last."""
     moved = SE3.log(SE3.between(paths[:, :-1], paths[:, 1:]))
     k = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, times.size - 2)
     fraction = np.clip((wanted - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
@@ -159,19 +159,19 @@ class Known:
 
 @dataclass(frozen=True)
 class Window:
-    """What T frames saw of F features, K observations in all."""
+    """K observations of F features in T frames."""
 
     camera: Pinhole  #: of the images.
     stamps_ns: np.ndarray  #: (T,) of the frames.
-    frame: np.ndarray  #: (K,) in which of them.
-    feature: np.ndarray  #: (K,) which one; no feature twice in a frame.
-    px: np.ndarray  #: (K, 2) where.
+    frame: np.ndarray  #: (K,) frame of each observation.
+    feature: np.ndarray  #: (K,) feature of each; no feature twice in a frame.
+    px: np.ndarray  #: (K, 2) pixel of each.
     noise_px: float  #: standard deviation, per axis.
-    known: Known | None = None  #: those of the features whose place is known.
+    known: Known | None = None  #: features of known position.
     tuning: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  #: (k, k) information of the camera's `tuned`.
 
     def is_connected(self) -> bool:
-        """Whether every two frames in a row have enough features in common."""
+        """Whether consecutive frames share enough features."""
         sees = np.zeros((self.stamps_ns.size, self.feature.max(initial=-1) + 1), dtype=bool)
         sees[self.frame, self.feature] = True
         return bool(((sees[1:] & sees[:-1]).sum(axis=1) >= MIN_SHARED).all())
@@ -180,10 +180,10 @@ class Window:
 def gathered(
     first: FirstFrames, features: FeatureSensor, belief: Belief, most: int, min_views: int = MIN_VIEWS
 ) -> tuple[np.ndarray, np.ndarray, Window, "Structure"] | None:
-    """Numbers (T,) of `most` frames to adjust, names (F,) of features in the map that were seen often enough, what was seen.
+    """Frames (T,), at most `most`, features (F,) in the map with enough observations, these, and the particles' estimate.
 
-    The frames see something, with a stamp of their own, the first and the last among them. Last, where path and features are
-    as far as the particles know. None: too few frames.
+    The frames have observations and distinct stamps, and include the first and the last one. Returns None with too few
+    frames.
     """
     stamps = np.array([frame.stamp_ns for frame in first.seen])
     fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in first.seen]
@@ -216,16 +216,16 @@ def gathered(
 @final
 @dataclass(frozen=True)
 class Structure:
-    """Paths and features."""
+    """The parameters of an adjustment."""
 
     path: np.ndarray  #: (T, 7) world_from_camera; the first one is the identity.
     direction: np.ndarray  #: (F, 3) unit vectors.
     inverse: np.ndarray  #: (F,) 1/m.
-    tuned: np.ndarray = field(default_factory=lambda: np.zeros(0))  #: (k,) of the camera, where it is not known.
-    frame: np.ndarray | None = None  #: (7,) first camera_from_known of the known points' frame, where there are some.
+    tuned: np.ndarray = field(default_factory=lambda: np.zeros(0))  #: (k,) of the camera's self-calibration.
+    frame: np.ndarray | None = None  #: (7,) first camera_from_known of the known points' frame, or None.
 
     def moved(self, step: np.ndarray) -> "Structure":
-        """By a step (6 (T − 1) + 3 F + k + 6,) in the right charts of the poses, the tangent planes and 1/m."""
+        """Moved by a step (6 (T − 1) + 3 F + k + 6,) in the right charts of the poses, the tangent planes and 1/m."""
         free = 6 * (self.path.shape[0] - 1)
         end = free + 3 * self.inverse.size
         path, of_features = self.path.copy(), step[free:end].reshape(-1, 3)
@@ -237,9 +237,9 @@ class Structure:
         return Structure(path, direction, self.inverse + of_features[:, 2], tuned, frame)
 
     def reversed(self) -> "Structure":
-        """What is near is far and what is far is near, along the same path.
+        """Depth reversal: near and far exchanged, along the same path.
 
-        From little parallax both shapes look alike, with a turn in place of a shift (L. Necker's reversal).
+        With little parallax both solutions fit, with rotation instead of translation (L. Necker's reversal).
         """
         middle = float(self.inverse.mean())
         return replace(self, inverse=np.maximum(2.0 * middle - self.inverse, FARTHEST * middle))
@@ -248,11 +248,11 @@ class Structure:
 @final
 @dataclass(frozen=True)
 class Optimum:
-    """A minimum."""
+    """A minimum of the cost."""
 
-    structure: Structure  #: there.
-    cost: float  #: the sum above.
-    #: (6 (T − 1) + 3 F + k + 6, …) of the step from it: its inverse is the covariance of the minimum's error.
+    structure: Structure  #: its parameters.
+    cost: float  #: its cost.
+    #: (6 (T − 1) + 3 F + k + 6, …) information of a step from it; its inverse is the covariance of the minimum.
     information: np.ndarray
 
     @cached_property
@@ -261,11 +261,11 @@ class Optimum:
 
     @cached_property
     def log_weight(self) -> float:
-        """Logarithm of how much of the posterior lies about this minimum, up to what all minima share (P. Laplace)."""
+        """Log posterior mass around this minimum by Laplace's approximation, up to a common constant."""
         return -self.cost - float(np.log(np.diag(self._factor)).sum())
 
     def paths(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Paths (n, T, 7) drawn from the Gaussian about the minimum (P. Laplace's approximation)."""
+        """Paths (n, T, 7) drawn from the Gaussian at the minimum (Laplace's approximation)."""
         whitened = rng.standard_normal((self.information.shape[0], n))
         step = solve_triangular(self._factor.T, whitened, lower=False).T
         path = self.structure.path
@@ -274,7 +274,7 @@ class Optimum:
         return out
 
     def depth_std_ratio(self, features: np.ndarray) -> float:
-        """Median standard deviation of the inverse distances of some features, as a fraction of each; infinite of none."""
+        """Median standard deviation of the inverse distances of some features, relative to each; infinite without any."""
         relative = (self.std_inverse() / np.maximum(self.structure.inverse, np.finfo(float).tiny))[features]
         return float(np.median(relative)) if relative.size else np.inf
 
@@ -289,24 +289,23 @@ class Optimum:
 
 
 def optimum(seen: Window, config: MonoConfig, start: Structure) -> Optimum | None:
-    """The minimum that lies downhill from a start; None: none.
+    """The local minimum reached from a start; None if there is none.
 
-    What is expected before anything is seen, of inverse distances and velocities, is that of the settings. Where residuals are
-    far beyond the noise the loss is all but flat: from there by way of minima with more noise (graduated non-convexity: A.
-    Blake and A. Zisserman 1987).
+    The priors of inverse distances and velocities are those of the settings. If residuals are far beyond the noise, where the
+    loss is nearly flat, it goes through minima with larger noise (graduated non-convexity: A. Blake and A. Zisserman 1987).
     """
     now = Linearised(seen, config, start)
     noise_px = min(now.spread_px(), float(seen.camera.width))
     while noise_px > FAR * seen.noise_px:
-        nearer = _downhill(Linearised(replace(seen, noise_px=noise_px), config, now.at))
+        nearer = _levenberg_marquardt(Linearised(replace(seen, noise_px=noise_px), config, now.at))
         if nearer is None:
             return None
         now, noise_px = Linearised(seen, config, nearer.structure), noise_px / NEARER
-    return _downhill(now)
+    return _levenberg_marquardt(now)
 
 
 def minima(seen: Window, config: MonoConfig, start: Structure, reverse: bool) -> list[Optimum]:
-    """Likeliest first: `optimum`, and with `reverse` that from its result with near and far exchanged, if it is another."""
+    """The most probable first: `optimum`, and with `reverse` that from its depth reversal, if it is different."""
     best = optimum(seen, config, start)
     other = optimum(seen, config, best.structure.reversed()) if reverse and best is not None else None
     found = [each for each in (best, other) if each is not None]
@@ -315,14 +314,14 @@ def minima(seen: Window, config: MonoConfig, start: Structure, reverse: bool) ->
     return sorted(found, key=lambda each: -each.log_weight)
 
 
-def _downhill(now: "Linearised") -> Optimum | None:
-    """By Levenberg's and Marquardt's method on the normal equations."""
+def _levenberg_marquardt(now: "Linearised") -> Optimum | None:
+    """Levenberg-Marquardt on the normal equations."""
     damping = DAMPING
     for _ in range(MAX_STEPS):
         information, vector = now.normal_equations()
         while True:
             ahead = None
-            with suppress(LinAlgError, ValueError):  # ValueError where it is not finite
+            with suppress(LinAlgError, ValueError):  # ValueError for non-finite values
                 factor = cho_factor(information + damping * np.diag(np.diag(information)))
                 ahead = Linearised(now.seen, now.config, now.at.moved(np.asarray(cho_solve(factor, vector))))
             if ahead is not None and ahead.cost < now.cost:
@@ -338,7 +337,7 @@ def _downhill(now: "Linearised") -> Optimum | None:
 
 
 def residual_px(seen: Window, config: MonoConfig, best: Optimum) -> float:
-    """Standard deviation per axis, px, of what was seen, as the residuals of a minimum say it: by their median."""
+    """Standard deviation per axis, px, of the observations, from the median residual of a minimum."""
     count = 2 * seen.frame.size
     free = count - best.information.shape[0]
     return Linearised(seen, config, best.structure).spread_px() * float(np.sqrt(count / free)) if free > 0 else 0.0
@@ -346,7 +345,7 @@ def residual_px(seen: Window, config: MonoConfig, best: Optimum) -> float:
 
 @final
 class Linearised:
-    """All residuals at a structure, whitened; their derivatives where they are asked for."""
+    """All residuals at a structure, whitened; derivatives are computed on request."""
 
     def __init__(self, seen: Window, config: MonoConfig, at: Structure) -> None:
         self.seen, self.config, self.rho, self.at = seen, config, config.inverse_depth, at
@@ -360,9 +359,9 @@ class Linearised:
         self.weight = 1.0 / (1.0 + squared)
         self._interval = np.diff(seen.stamps_ns) * 1e-9
         self._relative = SE3.between(at.path[:-1], at.path[1:])
-        # Of the first mean velocity and the differences of mean velocities: that over an interval δ is v + w₁/δ with the noise
-        # of E06 (5), so that the difference from the one before has the variance (δ + δ′)/3 of the walk's in a second, and
-        # shares δ/6 with the difference after it.
+        # Residuals of the first mean velocity and of differences of mean velocities: the mean over an interval δ is v + w₁/δ
+        # with the noise of E06 (5), so the difference from the previous one has the variance (δ + δ′)/3 of the walk's in one
+        # second, and the covariance δ/6 with the next difference.
         interval, before = self._interval, np.concatenate([[0.0], self._interval[:-1]])
         walk = np.diag((before + interval) / 3.0) + np.diag(interval[:-1] / 6.0, 1) + np.diag(interval[:-1] / 6.0, -1)
         cov = np.square(np.maximum(config.velocity.walk_std(), MIN_STD_VELOCITY))[:, None, None] * walk
@@ -370,7 +369,7 @@ class Linearised:
         self._whitener = np.linalg.inv(np.linalg.cholesky(cov))
         self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
         self.prior = (at.inverse - self.rho.mean_per_m) / self.rho.std_per_m
-        # The scale is the known points', or held.
+        # The scale is fixed by known points, or by a constraint.
         holding = np.bincount(feature, minlength=at.inverse.size) >= MIN_VIEWS
         self._by_scale = (
             0.0 * holding if seen.known else holding / (max(holding.sum(), 1) * self.rho.mean_per_m * SCALE_STD)
@@ -386,12 +385,12 @@ class Linearised:
         self.cost = float(0.5 * CAUCHY_SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
 
     def _differences(self, velocity: np.ndarray) -> np.ndarray:
-        """The first of T − 1 rows, and from row to row, whitened."""
+        """The first of T − 1 rows, and differences of consecutive rows, whitened."""
         moved = np.concatenate([velocity[:1], np.diff(velocity, axis=0)])
         return np.einsum("ktj,jk...->tk...", self._whitener, moved)
 
     def spread_px(self) -> float:
-        """Standard deviation per axis, px, that the residuals have, by their median."""
+        """Standard deviation per axis, px, of the residuals, by their median."""
         squared = np.square(self.misfit).sum(axis=1)
         return self.seen.noise_px * float(np.sqrt(np.median(squared) / CHI2_MEDIAN))
 
@@ -402,7 +401,7 @@ class Linearised:
         return Optimum(self.at, self.cost, information) if is_finite else None
 
     def normal_equations(self, loss_information: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss and Newton's: information of the step, what was seen counting so often, and the vector it is solved with."""
+        """Gauss-Newton information, the observations' part times `loss_information`, and right-hand side."""
         seen, at, direction = self.seen, self.at, self._direction
         frames, features = at.path.shape[0], at.inverse.size
         free = 6 * frames
@@ -414,7 +413,7 @@ class Linearised:
         of_features = h[free:end, free:end].reshape(features, 3, features, 3)
         across = h[:free, free:end].reshape(frames, 6, features, 3)
 
-        # Derivatives of what should be seen by the pose (K, 2, 6) and by the feature (K, 2, 3).
+        # Derivatives of the predictions by the pose (K, 2, 6) and by the feature (K, 2, 3).
         pose, inverse = at.path[seen.frame], at.inverse[seen.feature, None, None]
         slope = self.camera.jacobian(direction) / seen.noise_px
         by_pose = np.concatenate([np.cross(slope, direction[:, None, :]), -inverse * slope], axis=2)
@@ -422,7 +421,7 @@ class Linearised:
         along = turned @ tangents(at.direction)[seen.feature]
         by_feature = np.concatenate([along, -turned @ SE3.translation(pose)[:, :, None]], axis=2)
 
-        # What was seen, each observation with its loss's weight.
+        # The observations, with the weights of the loss.
         of_pose, of_feature = (np.swapaxes(self.weight[:, None, None] * by, 1, 2) for by in (by_pose, by_feature))
         each = np.arange(frames), np.arange(features)
         of_poses[each[0], :, each[0]] = _summed(of_pose @ by_pose, seen.frame, frames)
@@ -443,7 +442,7 @@ class Linearised:
         h[end:frame, end:frame] += seen.tuning
         b[end:frame] -= seen.tuning @ at.tuned
 
-        # Velocities between frames; their logarithms' derivatives by the poses to first order in a step.
+        # Velocities between frames; derivatives of their logarithms by the poses, to first order in a step.
         steps = frames - 1
         by_poses, k = np.zeros((steps, 6, frames, 6)), np.arange(steps)
         by_poses[k, :, k + 1] = np.eye(6) / self._interval[:, None, None]
@@ -473,7 +472,7 @@ class Linearised:
 
 
 def tangents(direction: np.ndarray) -> np.ndarray:
-    """Two unit vectors (F, 3, 2) across each unit vector (F, 3) and one another."""
+    """Two orthonormal tangent vectors (F, 3, 2) of each unit vector (F, 3)."""
     helper = np.where(np.abs(direction[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(direction, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""A start from known points: the first camera, and what its image says of them."""
+"""Initialisation from known points: the first camera pose, and the points' observations in its image."""
 
 from dataclasses import dataclass
 
@@ -20,22 +20,22 @@ from rbpf.sensors.features.corners import corner_score
 from rbpf.sensors.readers import KnownPixels
 from rbpf.systems.map_estimate import Anchored
 
-#: A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more.
+#: Largest residual of a known point after resection: this many σ, plus this many pixels.
 MAX_SIGMAS, MAX_PX = 6.0, 4.0
-#: Fraction of a known point's standard deviation along an axis across the line of sight: alike in all directions, and
-#: of a point that was located from views five degrees apart.
+#: Fraction of a known point's standard deviation along an axis perpendicular to the ray: for isotropic errors, and for a
+#: point triangulated from views five degrees apart.
 ISOTROPIC, TRIANGULATED = 3.0**-0.5, 0.05
-NOISE_PROBABILITY = 0.95  #: Residuals that noise alone would exceed less often than this leaves are beyond the noise.
-SAME_PX = 1.0  #: Known points nearer to each other in the image are one.
-#: Slope that a known point's surroundings must have in every direction, grey levels per pixel: noise has as much.
+NOISE_PROBABILITY = 0.95  #: Quantile of residuals by noise alone, beyond which they indicate errors of the points.
+SAME_PX = 1.0  #: Known points closer to each other in the image are duplicates.
+#: Least corner score of a known point, grey levels per pixel: that of noise.
 MIN_TEXTURE = 2.0
 
 
 def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.ndarray:
-    """Pose world_from_camera (7,) that best explains the known points in the first image, each of them counting alike.
+    """Pose world_from_camera (7,) that best explains the known points in the first image, equally weighted.
 
-    Raises InputError: a point lies outside the image, two are at one place, the points do not determine the camera, or no pose
-    explains them.
+    Raises InputError: a point lies outside the image, two coincide, the points do not determine the pose, or no pose fits
+    them.
     """
     inside = camera.inside(known.px)
     if not inside.all():
@@ -58,7 +58,7 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
     if (error > allowed).any():
         worst = int(np.argmax(error / allowed))
         raise InputError(
-            f"no camera sees the known points as given: from the best one, known point {known.names[worst]} is "
+            f"no camera pose fits the known points: with the best one, known point {known.names[worst]} is "
             f"{error[worst]:.1f} px away; check the positions, their axes and which point is which"
         )
     return world_from_camera
@@ -66,21 +66,21 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
 
 @dataclass(frozen=True)
 class KnownStart:
-    """Known points, and what the first frame shows of them."""
+    """Known points, and their observations in the first frame."""
 
     points: KnownPoints  #: M of them.
-    world_from_camera: np.ndarray  #: (7,) of the first frame, as resected from them.
-    rows: np.ndarray  #: (K,) which of the points it shows.
-    seen: FeatureFrame  #: where, K features with the names of these points.
+    world_from_camera: np.ndarray  #: (7,) of the first frame, resected from them.
+    rows: np.ndarray  #: (K,) rows of the observed points.
+    seen: FeatureFrame  #: K features with the names of these points.
 
     @classmethod
     def from_pixels(cls, camera: Pinhole, known: KnownPixels, noise_px: float) -> "KnownStart":
-        """Of points that are given with their pixels in the first image, named 0, 1, …; errors as `resect_known`.
+        """From points with their pixels in the first image, named 0, 1, …; errors as `resect_known`.
 
-        What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
-        standard deviation is taken. Across it the first image has the word: where even the best camera leaves residuals
-        beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions. Where it is
-        given how uncertain they are across it, they are at least so. Their covariances have the traces std_m².
+        Points located by cameras or a depth sensor are uncertain along the ray, and hardly across it; the given standard
+        deviation is interpreted so. The first image determines it across the ray: if the best pose leaves residuals beyond
+        the measurement noise, the points are as uncertain as these, up to isotropic errors. A given standard deviation across
+        the ray is a lower bound. The covariances have the traces std_m².
         """
         pose = resect_known(camera, known, noise_px)
         local = SE3.inverse_transform(pose, known.positions)
@@ -102,7 +102,7 @@ class KnownStart:
 
     @classmethod
     def from_frame(cls, camera: Pinhole, known: KnownPoints, first: FeatureFrame) -> "KnownStart":
-        """Of named features of the first frame; an InputError if fewer than four, or they do not determine the camera."""
+        """From named features of the first frame. Raises InputError: fewer than four, or they do not determine the pose."""
         inside = np.flatnonzero(camera.inside(first.z))
         _, rows, which = np.intersect1d(known.names, first.landmarks[inside], return_indices=True)
         seen = first.take(inside[which])
@@ -112,14 +112,13 @@ class KnownStart:
 def constellation_records(
     camera: Pinhole, start: KnownStart, group: Constellation, n: int, cov_frame: np.ndarray
 ) -> Records:
-    """Known points after the first image, whose camera is the world: records (n, 1, …).
+    """Known points after the first image, whose camera is the world's origin: records (n, 1, …).
 
-    The frame is hardly known before: an update linearised there would leave errors of the second order, larger than a
-    pixel, in everything that is mapped afterwards. So the optimum of both, what is given and what is seen, is found
-    first, and the covariance is taken there. `cov_frame` (6, 6) is that of the points' frame around where the resection
-    puts it.
+    The frame's prior is wide: an update linearised there would leave second-order errors of more than a pixel in all later
+    mapping. So the joint optimum of prior and observations is found first, and the covariance is linearised there.
+    `cov_frame` (6, 6) is the prior of the points' frame around the resected one.
     """
-    from scipy.optimize import least_squares  # takes long to import
+    from scipy.optimize import least_squares  # slow to import
 
     # Whitened residuals by x = (ξ, e_1, …, e_M): group_from_camera = T Exp(ξ), point m at k_m + e_m in the group.
     model, given, seen = CameraPoint(camera), start.points, start.seen
@@ -156,9 +155,9 @@ def constellation_records(
 
 
 def world_of(filter_: Filter) -> Anchored | None:
-    """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
+    """The known points' frame in each particle's world, whose origin is its first camera; None without known points."""
     landmark_map = filter_.belief().map
-    first = landmark_map.ids[:1]  # it was the first landmark: no other one has to be asked
+    first = landmark_map.ids[:1]  # the constellation is the first landmark
     group = landmark_map.landmark_of(int(first[0])) if first.size else None
     if not isinstance(group, Constellation):
         return None
@@ -166,12 +165,12 @@ def world_of(filter_: Filter) -> Anchored | None:
 
 
 def require_texture(image: np.ndarray, known: KnownPixels) -> None:
-    """Refuses, by an InputError, known points where the first image (H, W) uint8 shows nothing to recognise."""
+    """Raises InputError: the first image (H, W) uint8 has no texture at a known point."""
     score = corner_score(image, known.px)
     worst = int(np.argmin(score))
     if score[worst] < MIN_TEXTURE:
         u, v = known.px[worst]
         raise InputError(
-            f"known point {known.names[worst]} at ({u:.1f}, {v:.1f}) px cannot be found again, the first image shows "
+            f"known point {known.names[worst]} at ({u:.1f}, {v:.1f}) px cannot be tracked, the first image has "
             "no corner there: check the pixel, or leave the point out"
         )
