@@ -54,8 +54,9 @@ def twice(column: str) -> KnownPixels:
             KnownPixels(*(getattr(points(), name)[:3] for name in ("names", "px", "positions", "std_m"))),
             "at least four",
         ),
+        (replace(points(), positions=points().positions + [0, 5e6, 0]), "lie 5e.06 m from the origin but only 1.82 m"),
     ],
-    ids=["behind", "one pixel", "one place", "on a line", "three"],
+    ids=["behind", "one pixel", "one place", "on a line", "three", "far"],
 )
 def test_no_camera_is_found_by_them(given, words):
     with pytest.raises(InputError, match=words):
@@ -128,5 +129,5 @@ def test_a_point_where_the_image_shows_no_corner(shown):
     if shown == "a corner":
         require_texture(image, points())
         return
-    with pytest.raises(InputError, match=r"known point 3 at \(60.0, 200.0\) px cannot be found again"):
+    with pytest.raises(InputError, match=r"known point 3 at \(60.0, 200.0\) px cannot be tracked"):
         require_texture(image, points())

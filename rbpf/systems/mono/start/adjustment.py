@@ -395,10 +395,11 @@ class Linearised:
         return self.seen.noise_px * float(np.sqrt(np.median(squared) / CHI2_MEDIAN))
 
     def optimum(self) -> Optimum | None:
-        """This structure as a minimum; None where it is not finite."""
-        information = self.normal_equations(LOSS_INFORMATION)[0]
-        is_finite = np.isfinite(self.cost) and np.isfinite(information).all()
-        return Optimum(self.at, self.cost, information) if is_finite else None
+        """This structure as a minimum; None where it is not finite or its information is singular."""
+        found = Optimum(self.at, self.cost, self.normal_equations(LOSS_INFORMATION)[0])
+        with suppress(LinAlgError, ValueError):  # ValueError for non-finite values
+            return found if np.isfinite(found.log_weight) else None
+        return None
 
     def normal_equations(self, loss_information: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Gauss-Newton information, the observations' part times `loss_information`, and right-hand side."""

@@ -27,6 +27,7 @@ MAX_SIGMAS, MAX_PX = 6.0, 4.0
 ISOTROPIC, TRIANGULATED = 3.0**-0.5, 0.05
 NOISE_PROBABILITY = 0.95  #: Quantile of residuals by noise alone, beyond which they indicate errors of the points.
 SAME_PX = 1.0  #: Known points closer to each other in the image are duplicates.
+FAR_AWAY = 1e6  #: Distance of the known points from the origin, in their extents, beyond which rounding is too large.
 #: Least corner score of a known point, grey levels per pixel: that of noise.
 MIN_TEXTURE = 2.0
 
@@ -34,8 +35,8 @@ MIN_TEXTURE = 2.0
 def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.ndarray:
     """Pose world_from_camera (7,) that best explains the known points in the first image, equally weighted.
 
-    Raises InputError: a point lies outside the image, two coincide, the points do not determine the pose, or no pose fits
-    them.
+    Raises InputError: a point lies outside the image, two coincide, all are very far from the origin, the points do not
+    determine the pose, or no pose fits them.
     """
     inside = camera.inside(known.px)
     if not inside.all():
@@ -51,6 +52,12 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
         if near.size:
             one, other = known.names[first[near[0]]], known.names[second[near[0]]]
             raise InputError(f"known points {one} and {other} have the same {what}: keep one of the two")
+    away, extent = np.abs(known.positions).max(), np.ptp(known.positions, axis=0).max()
+    if away > FAR_AWAY * extent:
+        raise InputError(
+            f"the known points lie {away:.3g} m from the origin but only {extent:.3g} m apart, too far for the filter's "
+            "precision: subtract the position of one of them from all"
+        )
     world_from_camera = resect(camera, known.positions, known.px)
     local = SE3.inverse_transform(world_from_camera, known.positions)
     error = np.linalg.norm(camera.project(local) - known.px, axis=1)
