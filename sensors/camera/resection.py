@@ -80,9 +80,9 @@ class Resected:
     """A camera pose world_from_camera (7,), and its `inliers` (M,)."""
 
     world_from_camera: np.ndarray
-    information: np.ndarray  #: (6, 6) JᵀJ of the inliers' residuals in σ, right chart, order [ω, v].
+    information: np.ndarray  #: (6, 6) JᵀJ of the inliers' residuals, right chart, order [ω, v].
     inliers: np.ndarray
-    rms_px: float  #: residual of the inliers per axis, in σ, corrected for the degrees of freedom.
+    rms_px: float  #: residual of the inliers per axis, corrected for the degrees of freedom.
 
 
 def resect_consensus(

@@ -65,7 +65,7 @@ def test_a_filter_that_has_diverged_says_so():
 
 
 def test_a_bias_that_is_a_copy_in_all_particles_is_told_before_anything_diverges():
-    with pytest.warns(HealthWarning, match=r"number 3 of the state has \d+ values left among 100 particles"):
+    with pytest.warns(HealthWarning, match=r"component 3 of the state has \d+ values left among 100 particles"):
         filter_ = driven(100, 20)
     assert findings(filter_) == {"copies"}
 

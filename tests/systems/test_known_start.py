@@ -54,7 +54,7 @@ def twice(column: str) -> KnownPixels:
             KnownPixels(*(getattr(points(), name)[:3] for name in ("names", "px", "positions", "std_m"))),
             "at least four",
         ),
-        (replace(points(), positions=points().positions + [0, 5e6, 0]), "lie 5e.06 m from the origin but only 1.82 m"),
+        (replace(points(), positions=points().positions + 5e6), "lie 5e.06 m from the origin but only 1.82 m"),
     ],
     ids=["behind", "one pixel", "one place", "on a line", "three", "far"],
 )

@@ -382,10 +382,11 @@ class Relocaliser:
         """A pose refined on landmarks, and on the last view's corners if they agree; `inliers` are the landmarks'."""
         inlier_px = self.config.inlier_px
         if view is not None:
-            sights = Sights.known(points, places, inlier_px / np.sqrt(GATE)) + view
-            found = refined_on_all(self.camera, rough, sights)
+            std = inlier_px / np.sqrt(GATE)
+            found = refined_on_all(self.camera, rough, Sights.known(points, places, std) + view)
             if found is not None and most_agree(found.inliers[len(points) :]):
-                return replace(found, inliers=found.inliers[: len(points)])
+                of_px = found.information * std**2  # in px of the landmarks, as without a view
+                return Resected(found.world_from_camera, of_px, found.inliers[: len(points)], found.rms_px * std)
         return refined(self.camera, rough, points, places, inlier_px)
 
 
