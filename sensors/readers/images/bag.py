@@ -1,14 +1,14 @@
 """ROS bags of one camera or two: `.bag` of ROS 1, and of ROS 2 a folder with `metadata.yaml`, `.mcap` or `.db3`.
 
 - The images: a topic of sensor_msgs Image or CompressedImage; if there are several, one has to be named. For stereo two,
-the left topic first; by default the bag's only two, in alphabetical order (`cam0` and `cam1`, `left` and `right`).
-Encodings are those of `sensor_msgs/image_encodings`: grey and colour of 8 bits, grey of 16, and the Bayer patterns. The
-size that a message claims is checked against its bytes before it is decoded.
+  the left topic first; by default the bag's only two, in alphabetical order (`cam0` and `cam1`, `left` and `right`).
+  Encodings are those of `sensor_msgs/image_encodings`: grey and colour of 8 bits, grey of 16, and the Bayer patterns. The
+  size that a message claims is checked against its bytes before it is decoded.
 - The camera: sensor_msgs CameraInfo beside it (`/cam0/camera_info` for `/cam0/image_raw`), its K, D and size, or a
-`camera.yaml`. If the last part of the topic's name marks the images as rectified (`image_rect`, `image_rect_color`; a bag
-has no other mark), the camera is that of P, without distortion. R and P give the relative pose of two cameras, as
-`camera_calibration` writes them; with a `camera.yaml` the images are taken as rectified, and its `baseline_m` as the
-baseline.
+  `camera.yaml`. If the last part of the topic's name marks the images as rectified (`image_rect`, `image_rect_color`; a bag
+  has no other mark), the camera is that of P, without distortion. R and P give the relative pose of two cameras, as
+  `camera_calibration` writes them; with a `camera.yaml` the images are taken as rectified, and its `baseline_m` as the
+  baseline.
 - The truth: a topic of geometry_msgs PoseStamped, PoseWithCovarianceStamped, TransformStamped or nav_msgs Odometry, if one
   is named. The poses are taken as world_from_camera, of the camera's optical frame (x to the right, y down, z ahead). A bag
   with poses of another frame, such as `base_link`, has to be converted first; a logged message warns if the frame names
