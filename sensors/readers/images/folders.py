@@ -4,7 +4,7 @@ TUM RGB-D sequences (J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, 
 SLAM systems", IROS 2012):
 
 - `rgb.txt`: time [s] and file of each image, `#` starting a comment; images more than five seconds apart are refused, as
-their times are probably not in seconds, unless `rate_hz` of `camera.yaml` confirms them;
+  their times are probably not in seconds, unless `rate_hz` of `camera.yaml` confirms them;
 - `camera.yaml`: the calibration, which the distributed sequences do not bring along (`calibration` describes it);
 - `groundtruth.txt`, if the truth is known: `timestamp tx ty tz qx qy qz qw`, world_from_camera.
 
