@@ -239,11 +239,11 @@ class HandOver:
             return None
         return self._use(self._new_filter(self._rays, sensor, rng), self._rays, sensor)
 
-    def hold(self, filter_: Filter, lost: bool) -> None:
-        """Keeps the joint map's frame fixed while the camera is lost."""
+    def hold(self, filter_: Filter, blind: bool) -> None:
+        """Keeps the joint map's frame fixed while nothing is measured: it would take on the uncertainty of the motion."""
         due = filter_.consolidation
-        if due is not None and due.held != lost:
-            filter_.consolidation = replace(due, held=lost)
+        if due is not None and due.held != blind:
+            filter_.consolidation = replace(due, held=blind)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays for a checkpoint."""

@@ -290,7 +290,7 @@ class MonoSlam(System):
         seen = measured.features if isinstance(measured, Measurement) else frame
         assert isinstance(seen, FeatureFrame)
         # 6. Until depths are known: batch adjustment of the frames so far, and particles drawn from it; then the joint map,
-        # if configured. Its frame is fixed while the camera is lost.
+        # if configured. Its frame is fixed from the first frame without measurements on.
         revision: Revision | None = None
         if not self.start.over or self.hand_over.is_ahead:
             # Initial value of an adjustment: the mixture before sampling, free of the particles' sampling noise.
@@ -311,7 +311,7 @@ class MonoSlam(System):
                     self.loss.trust(self.filter, measured.image)
             if self.start.over and not self.hand_over.is_ahead:
                 self.first.clear()
-        self.hand_over.hold(self.filter, sensor.lost)
+        self.hand_over.hold(self.filter, sensor.bad_frames > 0)
 
         if self.joint is not None and not sensor.bad_frames:
             image, used = (measured.image, measured.used) if isinstance(measured, Measurement) else (None, measured)
@@ -464,7 +464,7 @@ class MonoSlam(System):
         """The inverse of `arrays`."""
         for part in (self.sensor, self.screen, self.loss, self.first, self.start, self.hand_over):
             part.restore(arrays)
-        self.hand_over.hold(self.filter, self.sensor.lost)
+        self.hand_over.hold(self.filter, self.sensor.bad_frames > 0)
         table, landmark_map = self.sensor.table, self.filter.belief().map
         own = np.flatnonzero(table.alive & (table.member < 0))
         if not landmark_map.holds(own).all():
