@@ -262,18 +262,18 @@ def main(
     """Prints the tables; returns the mean NEES of every filter's poses, and the error of its map relative to the batch's.
 
     Args:
-        runs: simulated logs of a robot, seeds 0, 1, …; none by 0.
+        runs: number of simulated logs of a robot, with seeds 0, 1, ….
         steps: of each.
-        particles: numbers of them.
+        particles: numbers of particles.
         windows: of the joint map.
-        many_runs: logs with 800 landmarks, seeds 0, 1, …, beside one Gaussian of all; each takes minutes.
-        recordings: folder of the recorded logs; None leaves them out.
-        seeds: of the filter on each recording, 0, 1, ….
-        long_runs: logs of 20,000 steps among 300 landmarks, seeds 0, 1, …; each takes ten minutes.
-        room_runs: two cameras in a room, seeds 0, 1, …; none by 0.
+        many_runs: number of logs with 800 landmarks, compared with one Gaussian of all; each takes minutes.
+        recordings: folder of the recorded logs; None skips them.
+        seeds: number of seeds of the filter on each recording, 0, 1, ….
+        long_runs: number of logs of 20,000 steps among 300 landmarks; each takes ten minutes.
+        room_runs: number of stereo runs in a room, with seeds 0, 1, ….
         frames: of each.
         workers: processes.
-        out: folder for picture and tables.
+        out: folder for plot and tables.
         quick: one short log and few particles.
     """
     if quick:
