@@ -1,7 +1,7 @@
-"""Figures against stated baselines: `python -m benchmarks`.
+"""Benchmarks against stated baselines: `python -m benchmarks`.
 
-BLAS works on one thread, here and in the peers: products of 2 x 2 matrices gain nothing from more, and threads that
-wait for one another make a shared machine's figures meaningless. It has to be said before NumPy is imported.
+BLAS runs on one thread, here and in the peers: products of 2 x 2 matrices gain nothing from more, and threads that
+wait for one another make figures of a shared machine meaningless. It must be set before NumPy is imported.
 """
 
 import os

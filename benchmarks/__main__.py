@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent
 BASELINE = FOLDER / "baseline.json"
 NAMES = (
     "start_up",
-    "stereo_memory",  # before others: the peak of a process begins at what its parent holds
+    "stereo_memory",  # before others: a process's peak starts at its parent's memory
     "small_update",
     "many_particles",
     "map_size",
@@ -41,7 +41,7 @@ NAMES = (
 
 
 def main() -> int:
-    """Runs, prints, writes results.json where all were run; 1 where the gate finds a regression."""
+    """Runs, prints, and writes results.json if all were run; returns 1 if the gate finds a regression."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="name", help=f"any of: {', '.join(NAMES)}; by default all")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def show(rows: list[Row], machine: dict[str, object]) -> None:
-    """The table, then the notes."""
+    """Prints the table, then the notes."""
     console = Console(width=150 if not sys.stdout.isatty() else None)
     table = Table(title=", ".join(f"{key} {value}" for key, value in machine.items()))
     for heading in ("benchmark", "figure", "floor", "ratio", "asked", "goal", ""):

@@ -1,4 +1,4 @@
-"""What is asked of each benchmark's figure, or of its ratio to the floor beside it, and what is hoped for."""
+"""Required limit and goal of each benchmark's figure, or of its ratio to the floor."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from benchmarks.rows import Row
 
 @dataclass(frozen=True)
 class Limit:
-    """Of a row: what is `asked`, and the `goal`; both at `least` or at most, of the ratio or of the figure itself."""
+    """Limits of a row: `asked` is required, `goal` desired; lower (`least`) or upper limits of the ratio or the figure."""
 
     asked: float
     goal: float | None = None
@@ -15,13 +15,13 @@ class Limit:
     ratio: bool = False
 
     def words(self, limit: float | None, row: Row) -> str:
-        """One of the two, with its unit."""
+        """One of the limits, with its unit."""
         if limit is None:
             return ""
         return f"{'>=' if self.least else '<='} {limit:g} {'×' if self.ratio else row.unit.split(',')[0]}"
 
     def met(self, limit: float, row: Row) -> bool:
-        """Whether the row keeps one of the two."""
+        """Whether the row meets one of the limits."""
         value = row.ratio if self.ratio else row.figure
         return value >= limit if self.least else value <= limit
 
@@ -59,11 +59,11 @@ LIMITS = {
     "stereo memory, 400 particles, 11000 landmarks each": Limit(0.7 * 1024),
     **{f"bootstrap N={n} vs particles": Limit(1.0, 2.0, least=True, ratio=True) for n in (100, 1_000, 10_000, 100_000)},
 }
-"""By the row's name; of the others nothing is asked."""
+"""Limits by the row's name; other rows have none."""
 
 
 def verdict(row: Row) -> tuple[str, str, str]:
-    """Asked, goal, and whether they are met."""
+    """Required limit, goal, and whether they are met."""
     limit = LIMITS.get(row.name)
     if limit is None:
         return "", "", ""

@@ -1,7 +1,7 @@
-"""The bootstrap filter of `rbpf` beside those of `particles` and Stone Soup: the same model, N, data and resampling.
+"""The bootstrap filter of `rbpf` compared with `particles` and Stone Soup: the same model, N, data and resampling.
 
-A point walks at random in the plane, x_t = x_{t−1} + w, w ~ N(0, Q), and its distances from two beacons are
-measured, z = |x − b| + v, v ~ N(0, R). Systematic resampling at every step.
+A random walk in the plane, x_t = x_{t−1} + w, w ~ N(0, Q), with measured distances from two beacons,
+z = |x − b| + v, v ~ N(0, R). Systematic resampling at every step.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ EPOCH = datetime(2020, 1, 1)
 
 
 def distances(points: np.ndarray) -> np.ndarray:
-    """(…, 2) → (…, 2)."""
+    """Distances of points (…, 2) from both beacons, (…, 2)."""
     return np.hypot(points[..., :1] - BEACONS[:, 0], points[..., 1:] - BEACONS[:, 1])
 
 
@@ -46,7 +46,7 @@ class Walk(MotionModel):
 
 
 class Distances(ObservationModel):
-    """Of the state from the beacons."""
+    """Distances of the state from the beacons."""
 
     dim = 2
     reads = frozenset({Part.STATE})
@@ -166,7 +166,7 @@ PEERS: dict[str, Callable[..., Any]] = {"particles": ParticlesRun, "stonesoup": 
 
 
 def run(settings: Settings) -> list[Row]:
-    """Time per step of each at each N, and whether they agree."""
+    """Time per step of each filter at each N, and the agreement of their estimates."""
     present = {name: kind for name, kind in PEERS.items() if find_spec(name) is not None}
     if not present:
         raise SkippedError("neither particles nor stonesoup is installed")
@@ -176,7 +176,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def evidence_agreement(data: np.ndarray, runs: int, n: int = 1_000) -> str:
-    """Mean log-evidence of ours and of `particles` over some seeds."""
+    """Mean log-evidence of `rbpf` and of `particles` over some seeds."""
     logs = np.array([[evidence(kind, n, data, seed) for seed in range(runs)] for kind in (OurRun, ParticlesRun)])
     error = np.sqrt(logs.var(axis=1, ddof=1).sum() / runs)
     gap = logs[0].mean() - logs[1].mean()

@@ -1,4 +1,4 @@
-"""Features found in a map's descriptors: by a matrix product, or near their predicted places; on one thread."""
+"""Matching features with a map's descriptors by a matrix product, or gated by predicted positions; on one thread."""
 
 from collections.abc import Callable
 
@@ -12,11 +12,11 @@ from rbpf.sensors.features import Sift, SiftConfig
 
 SIZES, FEATURES, IN_VIEW = (1000, 10_000, 40_000), 300, 600
 LENGTH, NOISE = 36, 0.012
-"""Per entry: descriptors of one place are 0.06 to 0.1 apart in recordings."""
+"""Noise per entry: descriptors of one point are 0.06 to 0.1 apart in recordings."""
 
 
 def real_descriptors(count: int) -> np.ndarray:
-    """SIFT descriptors (count, 36) of smoothed noise of several grains."""
+    """SIFT descriptors (count, 36) of noise smoothed at several scales."""
     sift, descriptors, size = Sift(SiftConfig(0, 1.0, contrast=0.02)), [], 0
     while size < count:
         image = picture(480, 640, 1.5 + 0.1 * len(descriptors), seed=len(descriptors))
@@ -26,7 +26,7 @@ def real_descriptors(count: int) -> np.ndarray:
 
 
 class Map:
-    """A map of so many descriptors, and features of which five in six are in it."""
+    """A map of descriptors, and features, five in six of which are in it."""
 
     def __init__(self, descriptors: np.ndarray) -> None:
         rng, count = np.random.default_rng(0), len(descriptors)
@@ -43,7 +43,7 @@ class Map:
         self.matcher = cv2.BFMatcher(cv2.NORM_L2)
 
     def contestants(self) -> dict[str, Callable[[], object]]:
-        """By name."""
+        """Contestants by name."""
         return {
             "exact": lambda: match_all(self.query, self.descriptors, MatchLimits()),
             "gated": self.gated,
@@ -51,13 +51,13 @@ class Map:
         }
 
     def gated(self) -> object:
-        """Compares a feature with the landmarks that are predicted near it."""
+        """Compares each feature only with landmarks predicted near it."""
         k, m = gate_pairs(*self.gate)
         return match_pairs(self.query, self.descriptors, (k, self.ids[m]), MatchLimits())
 
 
 def run(settings: Settings) -> list[Row]:
-    """One row for each size of the map, and one for the largest with a gate."""
+    """One row per size of the map, and one for the largest with gating."""
     descriptors, rows = real_descriptors(max(SIZES)), []
     with one_thread():
         for size in SIZES:
@@ -71,7 +71,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def row(name: str, times: dict[str, Timing], ours: str, other: str, baseline: str, notes: str = "") -> Row:
-    """Milliseconds beside another contestant's."""
+    """A row of milliseconds, with another contestant as baseline."""
     figure, theirs = times[ours].median * 1e3, times[other].median * 1e3
     return Row(
         name,

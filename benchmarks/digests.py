@@ -1,11 +1,11 @@
-"""Digests of what short runs of every system leave: the net under a restructuring, which must keep every one of them.
+"""Digests of the results of short runs of every system, which a refactoring must not change.
 
     python benchmarks/digests.py record FILE       runs the cases and writes their digests
     python benchmarks/digests.py compare FILE      runs them again and says what differs
 
-Runs go through the command line, so that only what a user sees is compared. The last digits of results depend on the
-processor and on the versions of the libraries: record and compare on one machine, from one environment. Arrays are
-compared by name and content; a checkpoint, whose arrays may be renamed, by content alone. Times are left out.
+Runs use the command line, so that only results visible to users are compared. The last digits depend on the processor
+and on library versions: record and compare on one machine, in one environment. Arrays are compared by name and
+content; those of a checkpoint, which may be renamed, only by content. Times are excluded.
 """
 
 import hashlib
@@ -29,14 +29,14 @@ TIMES = ("finished", "ms_per_", "peak_memory", "seconds", "_ms", "milliseconds")
 
 
 def rbpf(*words: Any) -> None:
-    """A command that must succeed."""
+    """Runs a command that must succeed."""
     done = subprocess.run([*RBPF, *map(str, words)], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"rbpf {' '.join(map(str, words))}: {done.returncode}\n{done.stderr}")
 
 
 def interrupted(out: Path, *words: Any) -> None:
-    """A run that is stopped at its first checkpoint, and resumed."""
+    """Runs, stops at the first checkpoint, and resumes."""
     process = subprocess.Popen(
         [*RBPF, *map(str, words), "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -48,7 +48,7 @@ def interrupted(out: Path, *words: Any) -> None:
 
 
 def beginning(name: str, frames: int, folder: Path) -> Path:
-    """The first images of a TUM-style recording, as one of its own."""
+    """The first images of a TUM-style recording, as a separate recording."""
     source, target = DATA / name, folder / name
     target.mkdir()
     for file in source.iterdir():
@@ -61,7 +61,7 @@ def beginning(name: str, frames: int, folder: Path) -> Path:
 
 
 def cases(work: Path) -> dict[str, tuple[Any, ...]]:
-    """What is run, by name; a run whose name ends in `resumed` is interrupted once."""
+    """The runs by name; a run whose name ends in `resumed` is interrupted once."""
     desk, pairs, plane, space = work / "desk", work / "pairs", work / "plane", work / "space"
     rbpf("simulate", "desk", "--frames", 45, "--width", 320, "--height", 240, "--out", desk)
     rbpf("simulate", "desk", "--frames", 20, "--baseline-m", 0.1, "--width", 320, "--height", 240, "--out", pairs)
@@ -94,12 +94,12 @@ def cases(work: Path) -> dict[str, tuple[Any, ...]]:
 
 
 def digest(content: bytes) -> str:
-    """Short and sufficient."""
+    """A shortened digest."""
     return hashlib.sha256(content).hexdigest()[:16]
 
 
 def timeless(value: Any) -> Any:
-    """A summary without its times and without the paths of its folder."""
+    """A summary without times and paths of its folder."""
     if isinstance(value, dict):
         return {name: timeless(v) for name, v in value.items() if not any(t in name for t in TIMES)}
     return value
@@ -129,7 +129,7 @@ def digests_of(folder: Path) -> dict[str, str]:
 
 
 def all_digests(only: list[str]) -> dict[str, dict[str, str]]:
-    """Of all cases, two at a time."""
+    """Digests of all cases, run two at a time."""
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as pool:
         work = Path(name)
         chosen = {case: words for case, words in cases(work).items() if not only or case in only}

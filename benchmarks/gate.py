@@ -1,4 +1,4 @@
-"""Compares a run's ratios with committed ones."""
+"""Compares a run's ratios with the committed ones."""
 
 import json
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from benchmarks.rows import Row
 
 
 def write_baseline(path: Path, rows: Sequence[Row], partial: bool) -> None:
-    """Ratios and tolerances, by name; where only some were run, those of the others stay."""
+    """Writes ratios and tolerances by name; in a `partial` run those of the others stay."""
     kept = json.loads(path.read_text(encoding="utf-8")) if partial else {}
     figures = kept | {
         row.name: {
@@ -23,9 +23,9 @@ def write_baseline(path: Path, rows: Sequence[Row], partial: bool) -> None:
 
 
 def regressions(path: Path, rows: Sequence[Row], partial: bool) -> list[str]:
-    """What got worse by more than its tolerance or has no baseline; in sentences.
+    """Sentences about rows that got worse by more than their tolerance, or have no baseline.
 
-    Unless only some were run, also what the baseline has and the run has not.
+    Unless the run is `partial`, also about rows of the baseline that are missing in the run.
     """
     baseline = json.loads(path.read_text(encoding="utf-8"))
     measured = {row.name: row.ratio for row in rows}

@@ -1,4 +1,4 @@
-"""Nodes of the genealogy against steps and particles; theory: T + C·N log N (P. Jacob et al., 2015). What kept paths cost."""
+"""Size of the genealogy by steps and particles; theory: T + C·N log N (P. Jacob et al., 2015). Cost of retained paths."""
 
 import time
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ FIGURES = Path(__file__).parent / "out"
 
 @dataclass(frozen=True)
 class Curve:
-    """Nodes (T,) and generations (T,) after every step, and the mean variance of N W where it resampled.
+    """Nodes (T,) and generations (T,) after every step, and the mean variance of N W at resampling.
 
-    Systematic resampling lays descendants side by side, so that the rounding of their numbers cancels within a family:
-    families grow and shrink by the variance of the weights alone.
+    In systematic resampling descendants are adjacent, so that the rounding of their numbers cancels within a family:
+    family sizes vary only by the variance of the weights.
     """
 
     n: int
@@ -64,7 +64,7 @@ def grow(n: int, steps: int, threshold: float, rng: np.random.Generator) -> Curv
 
 
 def run(settings: Settings) -> list[Row]:
-    """Growth when every step resamples and when the effective sample size asks for it."""
+    """Growth with resampling at every step, and by the effective sample size."""
     steps = STEPS // 4 if settings.quick else STEPS
     rng = np.random.default_rng(0)
     curves = {
@@ -76,7 +76,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def history() -> Row:
-    """Whole paths kept, beside a lag of one step: 100,000 particles, resampled at every step, the last 20 of 100."""
+    """Whole paths against a lag of one step: 100,000 particles, resampled at every step, the last 20 of 100 steps."""
     milliseconds = []
     for lag in (1, None):
         contestant, seconds = OurRun(100_000, simulate(np.random.default_rng(0), 100), 0, lag), []
@@ -99,7 +99,7 @@ def history() -> Row:
 
 
 def row(label: str, curves: dict[int, Curve], steps: int) -> Row:
-    """The size at which the genealogy is largest against theory."""
+    """The particle number with the largest genealogy relative to theory."""
     ratios = {n: curve.extra / curve.expected for n, curve in curves.items()}
     n = max(ratios, key=lambda size: ratios[size])
     constants = {size: curve.extra / (size * np.log(size)) for size, curve in curves.items()}
@@ -122,7 +122,7 @@ def row(label: str, curves: dict[int, Curve], steps: int) -> Row:
 
 
 def plot(curves: dict[str, dict[int, Curve]], steps: int) -> None:
-    """Nodes against steps and against particles, as PNG."""
+    """Plots nodes by steps and by particles, as PNG."""
     import matplotlib
 
     matplotlib.use("Agg")

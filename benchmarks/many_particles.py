@@ -1,4 +1,4 @@
-"""50,000 particles that see 30 landmarks: refine and weigh, the whole update, the memory's floor, and threads."""
+"""50,000 particles that observe 30 landmarks: refine and weigh, the whole update, memory bandwidth, and threads."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ DOUBLE = 8
 
 
 def refine_stage(run: Run) -> Callable[[], None]:
-    """Refine and weigh against the next frame, and leave the filter as it is."""
+    """Refines and weighs with the next frame, without changing the filter."""
     filter_, frame = run.filter, run.frames[-1]
 
     def stage() -> None:
@@ -30,7 +30,7 @@ def refine_stage(run: Run) -> Callable[[], None]:
 
 
 def on_threads(threads: int, call: Callable[[], None]) -> Callable[[], None]:
-    """The call with the kernels on so many threads."""
+    """The call with the kernels on this number of threads."""
 
     def limited() -> None:
         allowed = numba.get_num_threads()
@@ -44,12 +44,12 @@ def on_threads(threads: int, call: Callable[[], None]) -> Callable[[], None]:
 
 
 def run(settings: Settings) -> list[Row]:
-    """The plane, then space."""
+    """Rows in the plane, then in space."""
     return [row for world in (planar(K, M, DWELL), spatial(K, M, DWELL)) for row in figures(world, settings)]
 
 
 def figures(world: World, settings: Settings) -> list[Row]:
-    """Rates of both stages against the memory's floor, and one thread against all."""
+    """Rates of both stages against memory bandwidth, and one thread against all."""
     space = "planar" if world.sight.dim == 2 else "spatial"
     turns = settings.repetitions(18)
     warm_up = 4

@@ -1,4 +1,4 @@
-"""A step against maps of 100 to 100,000 landmarks; one landmark enters the view and one leaves in each step."""
+"""Time per step with maps of 100 to 100,000 landmarks; one landmark enters the view and one leaves in each step."""
 
 import time
 from collections.abc import Callable
@@ -14,7 +14,7 @@ SIZES = (100, 1_000, 10_000, 100_000)
 
 
 class Stopwatch:
-    """Collects what the calls of a function cost."""
+    """Collects the times of a function's calls."""
 
     def __init__(self, call: Callable[..., Any]) -> None:
         self.call = call
@@ -28,7 +28,7 @@ class Stopwatch:
 
 
 class Sized:
-    """A run on a map of m landmarks, whose resamplings are timed apart."""
+    """A run on a map of m landmarks, with resampling timed separately."""
 
     def __init__(self, m: int, steps: int) -> None:
         self.run = Run(planar(K, m), N, steps)
@@ -44,7 +44,7 @@ class Sized:
 
 
 def run(settings: Settings) -> list[Row]:
-    """Each size against the smallest."""
+    """One row per size, against the smallest."""
     turns = settings.repetitions(600)
     warm_up = 150
     sized = {m: Sized(m, turns + warm_up) for m in SIZES}

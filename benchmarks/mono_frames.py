@@ -1,4 +1,4 @@
-"""Frames per second of the whole monocular system on images rendered on the fly, decoding apart."""
+"""Frames per second of the whole monocular system on rendered images, without decoding."""
 
 import time
 from collections.abc import Iterator
@@ -23,12 +23,12 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 SETTLING, TIMED, MEASUREMENTS = 30, 90, 25
 WIDTHS = 320, 640
 FRACTION_OF_WIDTH = 0.625
-"""Focal length over the image's width, the desk world's 400 px at 640."""
+"""Focal length relative to the image's width: the desk world's 400 px at 640."""
 
 
 @dataclass(frozen=True)
 class Decoded(Source):
-    """Images that are in memory: what reading them costs is not the system's."""
+    """Images in memory, as the cost of reading them is not the system's."""
 
     held: list[ImageFrame]
 
@@ -37,7 +37,7 @@ class Decoded(Source):
 
 
 def rendered(width: int, frames: int) -> tuple[ImageSequence, KnownPixels]:
-    """A desk in images 4 : 3 of this width."""
+    """A desk in 4 : 3 images of this width."""
     height, focal = width * 3 // 4, FRACTION_OF_WIDTH * width
     camera = Pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     with TemporaryDirectory() as folder:
@@ -49,7 +49,7 @@ def rendered(width: int, frames: int) -> tuple[ImageSequence, KnownPixels]:
 
 
 def run(settings: Settings) -> list[Row]:
-    """A row for each size, beside OpenCV's tracking of as many corners from frame to frame, without map or filter."""
+    """A row per size, against OpenCV's tracking of as many corners from frame to frame, without map or filter."""
     timed = settings.repetitions(TIMED)
     return [figure(width, timed) for width in WIDTHS]
 
@@ -79,7 +79,7 @@ def figure(width: int, timed: int) -> Row:
 
 
 def optical_flow(sequence: ImageSequence) -> float:
-    """Median seconds that the pyramidal tracker of Lucas and Kanade takes from frame to frame."""
+    """Median seconds per frame of the pyramidal Lucas-Kanade tracker."""
     images = [frame.image for frame in sequence.frames() if frame.image is not None]
     seconds = []
     for before, now in pairwise(images[SETTLING:]):
@@ -91,7 +91,7 @@ def optical_flow(sequence: ImageSequence) -> float:
 
 
 def by_stage(run: Run) -> dict[str, np.ndarray]:
-    """Seconds of each frame (T,) by what they were spent on."""
+    """Seconds of each frame (T,) by stage."""
     return {
         "search": run.log["seconds_search"],
         "filter and report": run.log["seconds"] - run.log["seconds_search"] - run.log["seconds_new_landmarks"],

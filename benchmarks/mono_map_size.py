@@ -1,4 +1,4 @@
-"""A whole monocular frame against the number of landmarks in the map (E06 Fig. 3): the choice of them is O(M)."""
+"""Time of a monocular frame by the number of landmarks in the map (E06 Fig. 3): their selection is O(M)."""
 
 from dataclasses import replace
 
@@ -17,11 +17,11 @@ from rbpf.systems.system import Tracked
 WIDTH, TIMED = 320, 60
 LANDMARKS = 10_000
 BEHIND_M = 5.0
-"""The landmarks of elsewhere lie this far behind the first camera: none comes into view, all have to be looked at."""
+"""Distance of the additional landmarks behind the first camera: none comes into view, but all are checked."""
 
 
 def run(settings: Settings) -> list[Row]:
-    """One desk twice: with its own landmarks alone, and with ten thousand of elsewhere in the map from frame one on."""
+    """One desk twice: with its own landmarks only, and with ten thousand more in the map from frame one on."""
     frames = SETTLING + settings.repetitions(TIMED)
     sequence, known = rendered(WIDTH, frames)
     held = sequence.source
@@ -54,7 +54,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def add_elsewhere(run: Run, count: int) -> None:
-    """Landmarks of which nothing is seen; the table of appearances has a row for each, as if they had been left."""
+    """Adds landmarks out of view; each has a row in the table of appearances, as if it had been visited."""
     rng, filter_, table = np.random.default_rng(0), run.system.filter, run.system.sensor.table
     pose = filter_.particles.state[0, :7]
     behind = rng.uniform([-3.0, -3.0, -BEHIND_M - 2.0], [3.0, 3.0, -BEHIND_M], (count, 3))

@@ -1,4 +1,4 @@
-"""One frame of monocular SLAM on features: 50 particles, 25 measurements, beside its NumPy twin."""
+"""One frame of monocular SLAM on features: 50 particles, 25 measurements, against its NumPy twin."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,11 +11,11 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.slam import MonoSlam
 
 SETTLING = 100
-"""Frames before the timed ones: the map then holds points and rays."""
+"""Frames before the timed ones, after which the map has points and rays."""
 
 
 class Walk:
-    """A filter that goes through a log, frame by frame."""
+    """A filter that processes a log frame by frame."""
 
     def __init__(self, log: FeatureLog, config: MonoConfig) -> None:
         self._frames: Iterator[FeatureFrame] = iter(log.frames)
@@ -26,7 +26,7 @@ class Walk:
             self()
 
     def __call__(self) -> None:
-        """One frame."""
+        """Processes one frame."""
         frame = next(self._frames)
         self.filter.step(frame, None, frame.stamp_ns)
 

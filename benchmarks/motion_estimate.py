@@ -1,4 +1,4 @@
-"""The motion between two stereo frames from 300 matches, beside OpenCV's PnP of the left image alone."""
+"""The motion between two stereo frames from 300 matches, against OpenCV's PnP of the left image alone."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ INCREMENT = SE3.exp(np.array([0.003, 0.03, -0.002, 0.02, -0.02, 0.9]))
 
 
 class TwoFrames:
-    """Points 5 to 60 m away, a fifth of them matched falsely."""
+    """Points 5 to 60 m away, a fifth of them with wrong matches."""
 
     def __init__(self) -> None:
         self.rng = np.random.default_rng(0)
@@ -37,7 +37,7 @@ class TwoFrames:
         return estimate_motion(Matches.checked(CAMERA, self.z_prev, self.z_now, self.cov, self.cov), self.rng)
 
     def peer(self) -> np.ndarray:
-        """Consensus and refinement of the left image, points taken as exact, no covariance: the increment (7,)."""
+        """Consensus and refinement in the left image, with exact points and without covariance: the increment (7,)."""
         points, seen = CAMERA.triangulate(self.z_prev), self.z_now[:, :2].copy()
         _, turn, shift, inliers = cv2.solvePnPRansac(
             points, seen, self.matrix, None, reprojectionError=2.0, confidence=0.9999

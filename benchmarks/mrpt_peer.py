@@ -1,7 +1,7 @@
-"""Beside MRPT's EKF-SLAM (`kf-slam`) on a log that MRPT simulates: the same observations, associations known.
+"""Comparison with MRPT's EKF-SLAM (`kf-slam`) on a log simulated by MRPT: the same observations, known association.
 
-An EKF over all landmarks is not a particle filter: this row says what a step costs and how good the map is where
-both apply, on few landmarks.
+A joint EKF is not a particle filter: this row compares time per step and map error where both apply, with few
+landmarks.
 """
 
 import re
@@ -72,7 +72,7 @@ std_sensor_yaw_deg = {STD_YAW_DEG}
 
 
 def call(folder: Path, *command: str) -> str:
-    """Standard output of a program that runs in the folder."""
+    """Standard output of a program run in the folder."""
     done = subprocess.run(
         command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False
     )
@@ -140,7 +140,7 @@ def make_filter(seed: int) -> Filter:
 
 
 def read(folder: Path) -> tuple[list[SimpleNamespace], dict[int, np.ndarray]]:
-    """Frames with odometry drawn as the simulation's own, and the true landmarks by number."""
+    """Frames with odometry sampled from the simulation's model, and the true landmarks by number."""
     rows = np.loadtxt(folder / "z.txt", comments="%")
     path = np.loadtxt(folder / "log.rawlog_ground_truth_robot_path.txt", comments="%")[:, [3, 0, 1]]
     truth = np.loadtxt(folder / "log.rawlog_ground_truth.txt")
@@ -179,7 +179,7 @@ def theirs_error(output: str) -> float:
 
 
 def map_error(filter_: Filter, landmarks: dict[int, np.ndarray]) -> float:
-    """Mean distance of the estimates from the truth, metres; the start is known, so nothing is aligned."""
+    """Mean landmark error, metres, without alignment as the start is known."""
     belief = filter_.belief()
     ids = belief.map.ids
     points, _ = belief.moments(ids)

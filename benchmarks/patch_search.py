@@ -1,4 +1,4 @@
-"""Active search of image patches and choice of corners on one thread, beside OpenCV's functions for the same."""
+"""Active search of image patches and corner selection on one thread, against OpenCV's functions."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,13 +18,13 @@ COV = (RADIUS_PX / SIGMAS) ** 2 * np.eye(2)
 
 
 def picture(height: int, width: int, blur_px: float, seed: int = 0) -> np.ndarray:
-    """Smoothed noise over the whole range of grey levels."""
+    """Smoothed noise over the full range of grey levels."""
     noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
     return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), blur_px), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
 
 
 class Ellipses:
-    """Templates cut at known places, looked for around a guess: all of an ellipse, or its enclosing square."""
+    """Templates from known positions, searched around a prediction: in an ellipse, or in its bounding square."""
 
     def __init__(self) -> None:
         self.image = picture(480, 640, 1.5)
@@ -37,7 +37,7 @@ class Ellipses:
         self.covs = np.tile(COV, (K, 1, 1))
 
     def ours(self) -> np.ndarray:
-        """Places."""
+        """Positions."""
         return search(self.image, self.templates, self.guess, self.covs, SIGMAS).px
 
     def peer(self) -> np.ndarray:
@@ -52,12 +52,12 @@ class Ellipses:
         return np.array(found)
 
     def warp(self) -> np.ndarray:
-        """The templates."""
+        """The warped templates."""
         return warp(self.sources, self.affines)
 
 
 class WholeImage:
-    """One template in all of a small image, as after the camera has lost its place."""
+    """One template in a whole small image, as after tracking loss."""
 
     def __init__(self) -> None:
         self.image = picture(240, 320, 1.5)
@@ -65,7 +65,7 @@ class WholeImage:
         self.template = warp(cut(self.image, self.truth[0])[None], np.eye(2)[None])
 
     def ours(self) -> np.ndarray:
-        """Place."""
+        """Position."""
         middle = (np.array([self.image.shape[::-1]]) - 1) / 2
         return search(self.image, self.template, middle, 1e8 * np.eye(2)[None], most_px=np.inf).px
 
@@ -89,7 +89,7 @@ def one_thread() -> Iterator[None]:
 
 
 def run(settings: Settings) -> list[Row]:
-    """Three rows; the first two once both contestants have found what there is to find."""
+    """Three rows; the first two after checking that both contestants find the templates."""
     ellipses, whole, scene = Ellipses(), WholeImage(), picture(480, 640, 4.5)
     detector = CornerDetector()
     with one_thread():
@@ -117,11 +117,11 @@ def run(settings: Settings) -> list[Row]:
 
 
 def measure(contestants: dict[str, Callable[[], Any]], turns: int) -> dict[str, Timing]:
-    """Times in turn."""
+    """Times the contestants in turn."""
     return interleaved(contestants, turns, warm_up=5)
 
 
 def row(name: str, peer: str, times: dict[str, Timing], notes: str) -> Row:
-    """Milliseconds beside the peer's."""
+    """A row of milliseconds, with the peer as baseline."""
     ours, theirs = times["rbpf"].median * 1e3, times["peer"].median * 1e3
     return Row(name, ours, "ms", peer, theirs, theirs / ours, notes=f"one thread; {notes}; {times['rbpf'].spread}")

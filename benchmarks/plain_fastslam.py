@@ -1,7 +1,7 @@
 """FastSLAM 2.0 as a textbook loop: one Python object per particle, small NumPy arrays, every map copied.
 
 M. Montemerlo, S. Thrun, D. Koller, B. Wegbreit, "FastSLAM 2.0" (2003), with the exact importance ratio and the
-look-ahead weight of E06 (10): the same mathematics as `rbpf`, and, drawing the same random numbers, the same result.
+look-ahead weight of E06 (10): the same mathematics as `rbpf`, and, with the same random numbers, the same result.
 """
 
 import copy
@@ -23,7 +23,7 @@ class Particle:
 
 
 class PlainFastSlam:
-    """Planar range-bearing FastSLAM 2.0 of n particles that know points (M, 2) with a standard deviation."""
+    """Planar range-bearing FastSLAM 2.0 with n particles and a prior map of points (M, 2) with a standard deviation."""
 
     def __init__(self, start: np.ndarray, points: np.ndarray, std: float, n: int, rng: np.random.Generator) -> None:
         cov = std**2 * np.eye(2)
@@ -34,7 +34,7 @@ class PlainFastSlam:
         self.rng = rng
 
     def step(self, frame: Frame) -> None:
-        """Refine, weigh, resample when half of the effective sample size is lost, sample, correct, update."""
+        """Refine, weigh, resample if the effective sample size is below half, sample, correct, update."""
         root_q = np.linalg.cholesky(frame.control.cov)
         predicted = [moved(particle.pose, frame.control.delta) for particle in self.particles]
         proposals = [
@@ -82,7 +82,7 @@ def moved(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
 
 
 def linearised(pose: np.ndarray, point: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Innovation, and the Jacobians by a right perturbation of the pose and by the landmark."""
+    """Innovation, and Jacobians with respect to a right perturbation of the pose and to the landmark."""
     c, s = math.cos(pose[0]), math.sin(pose[0])
     dx, dy = point - pose[1:]
     x, y = c * dx + s * dy, c * dy - s * dx
@@ -116,7 +116,7 @@ def refined(
 
 
 def updated(particle: Particle, frame: Frame) -> float:
-    """Kalman updates of the landmarks seen; returns the log-likelihood."""
+    """Kalman updates of the observed landmarks; returns the log-likelihood."""
     total = 0.0
     for landmark, z, noise in zip(frame.ids, frame.z, frame.cov, strict=True):
         nu, _, jac_map = linearised(particle.pose, particle.means[landmark], z)

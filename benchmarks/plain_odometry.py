@@ -1,4 +1,4 @@
-"""Odometry of stereo features without a filter, to judge features by: three points and a vote, then least squares."""
+"""Plain odometry of stereo features, to evaluate features: RANSAC on three points, then least squares."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ WITHIN_PX, TRIALS, STEPS, HUBER = 2.0, 200, 12, 1.5
 
 
 def path(rig: RectifiedStereo, features: list[StereoFeatures], seed: int = 0) -> tuple[np.ndarray, float]:
-    """Poses (T, 7), the first the identity, and the mean number of features that agree with a motion."""
+    """Poses (T, 7), the first the identity, and the mean number of inliers of a motion."""
     cv2.setRNGSeed(seed)
     poses, agreeing = [SE3.identity()], []
     for before, after in pairwise(features):
@@ -26,7 +26,7 @@ def path(rig: RectifiedStereo, features: list[StereoFeatures], seed: int = 0) ->
 
 
 def motion(rig: RectifiedStereo, before: StereoFeatures, after: StereoFeatures) -> tuple[np.ndarray, int]:
-    """now_from_before (7,) of features seen twice, and how many agree."""
+    """now_from_before (7,) from features observed twice, and the number of inliers."""
     fx, fy, cx, cy = rig.camera.params[:4]
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     _, turn, shift, inliers = cv2.solvePnPRansac(
@@ -44,7 +44,7 @@ def motion(rig: RectifiedStereo, before: StereoFeatures, after: StereoFeatures) 
 
 
 def refined(rig: RectifiedStereo, before: StereoFeatures, after: StereoFeatures, pose: np.ndarray) -> np.ndarray:
-    """The motion of least squared error in both images, the earlier points' error included; large ones count less."""
+    """Robust least-squares motion in both images, including the earlier points' errors."""
     for _ in range(STEPS):
         turn = SE3.rotation(pose)
         local = SE3.transform(pose, before.points)

@@ -1,4 +1,4 @@
-"""What a benchmark returns, and how contestants are timed side by side."""
+"""Result rows of benchmarks, and interleaved timing of contestants."""
 
 import time
 from collections import deque
@@ -15,32 +15,32 @@ GENERATIONS_BACK = 20
 
 
 class SkippedError(Exception):
-    """A benchmark cannot run here; the message says why."""
+    """A benchmark cannot run here; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How much time a run may take; `quick` lowers repetitions, never sizes."""
+    """Extent of a run; `quick` reduces repetitions, never sizes."""
 
     quick: bool = False
 
     def repetitions(self, full: int) -> int:
-        """A third of the repetitions, at least 3, where the run is quick."""
+        """The repetitions; a third of them, at least 3, in a quick run."""
         return max(3, full // 3) if self.quick else full
 
 
 @dataclass(frozen=True)
 class Row:
-    """One figure beside the baseline measured in the same run.
+    """One figure with the baseline measured in the same run.
 
     Attributes:
         name: unique, the key in the committed baseline.
         figure: the measured value, in `unit`.
-        baseline: what it is compared with, a peer or a floor, in words;  baseline_figure: its value, in the same unit.
-        ratio: what the gate compares: it does not depend on how fast the machine is.
+        baseline: description of the peer or floor that it is compared with;  baseline_figure: its value, in the same unit.
+        ratio: the value checked by the gate, which does not depend on the machine's speed.
         higher: whether a higher ratio is better.
-        tolerance: relative change of the ratio that the gate lets pass.
-        optional: whether a machine without the peer may leave it out.
+        tolerance: relative change of the ratio that the gate accepts.
+        optional: whether the row may be missing on a machine without the peer.
     """
 
     name: str
@@ -79,13 +79,13 @@ class Timing:
 def interleaved(
     contestants: dict[str, Callable[[], Any]], repetitions: int, calls: dict[str, int] | None = None, warm_up: int = 2
 ) -> dict[str, Timing]:
-    """Times the contestants in turn, so that a change of the machine's load falls on all of them alike.
+    """Times the contestants in turn, so that changes of the machine's load affect all of them alike.
 
     Args:
-        contestants: what to call, by name.
-        repetitions: turns.
-        calls: calls that a contestant makes in each turn, timed one by one; by default 1.
-        warm_up: turns that are not timed.
+        contestants: functions by name.
+        repetitions: number of turns.
+        calls: number of calls per contestant and turn, timed individually; by default 1.
+        warm_up: number of turns that are not timed.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
     for repetition in range(-warm_up, repetitions):
@@ -99,7 +99,7 @@ def interleaved(
 
 
 class Diversity:
-    """Keeps the last generations of a filter, to count how many of their particles still have descendants."""
+    """Retains the last generations of a filter, to count their particles that still have descendants."""
 
     def __init__(self, filter_: Filter, back: int = GENERATIONS_BACK) -> None:
         self.filter = filter_
@@ -117,7 +117,7 @@ class Diversity:
             self._retain()
 
     def text(self) -> str:
-        """Rate of resampling, distinct ancestors and the fraction of the map that is stored."""
+        """Resampling rate, distinct ancestors and the stored fraction of the map."""
         lineage = self.filter.lineage
         age = lineage.generation - self._kept[0]
         landmark_map = self.filter.belief().map

@@ -14,10 +14,10 @@ REAL = 8
 
 
 def run(settings: Settings) -> list[Row]:
-    """Systematic resampling at every step by log-normal weights; what is in view is rewritten at every step.
+    """Systematic resampling at every step with log-normal weights; landmarks in view are rewritten at every step.
 
-    The map was made before; the view moves on by one landmark per step. The dispersion is chosen so that more than
-    20 particles of the first generation keep descendants. A quick run is the same: the size is the figure.
+    The map exists from the start; the view moves on by one landmark per step. The weights' dispersion is chosen so that
+    more than 20 particles of the first generation keep descendants. A quick run is the same, as the size is the figure.
     """
     rng = np.random.default_rng(0)
     lineage = Lineage(N)
@@ -36,13 +36,13 @@ def run(settings: Settings) -> list[Row]:
 
 
 def rewrite(store: SharedStore, columns: np.ndarray) -> None:
-    """What the kernel of an update does to the store, with the generation as the record."""
+    """Writes to the store like an update's kernel, with the generation as the record."""
     access, targets = store.rewrite(columns)
     access.pool[targets] = float(store.lineage.generation)
 
 
 def figure(store: SharedStore, written: np.ndarray) -> Row:
-    """What is stored against a copy per particle, and against one record per writer that has descendants."""
+    """Stored records against a copy per particle, and against one record per writer with descendants."""
     fraction, survivors = store.stored_bytes / store.dense_bytes, store.lineage.distinct(0)
     alive = {int(generation): store.lineage.distinct(int(generation)) for generation in np.unique(written)}
     least = sum(alive[generation] for generation in written.tolist()) * FIELDS * REAL / store.dense_bytes

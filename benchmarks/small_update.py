@@ -1,4 +1,4 @@
-"""A whole update of 50 particles that see 30 of 300 landmarks, against a plain loop and the NumPy twin."""
+"""A whole update of 50 particles that observe 30 of 300 landmarks, against a plain loop and the NumPy twin."""
 
 from itertools import islice
 
@@ -25,7 +25,7 @@ class LoopRun:
 
 
 def largest_difference(steps: int = 5) -> float:
-    """Between loop and filter, over a few steps: states and log-weights."""
+    """Largest difference of loop and filter in states and log-weights, over a few steps."""
     ours, loop = Run(planar(K, M), N, steps), LoopRun(steps)
     worst = 0.0
     for _ in range(steps):

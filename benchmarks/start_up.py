@@ -1,4 +1,4 @@
-"""How long one waits: for the help, for the first frame of a run, and for the kernels of a first run."""
+"""Start-up times: of the help, of a run's first frame, and of compiling the kernels at a first run."""
 
 import os
 import subprocess
@@ -27,7 +27,7 @@ main(sys.argv[1:])
 
 
 def run(settings: Settings) -> list[Row]:
-    """Medians of seconds by the clock, each beside what Python with the libraries that are needed takes."""
+    """Median wall-clock seconds, each against Python with the required libraries."""
     turns = settings.repetitions(9)
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -53,7 +53,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def python(*words: str, **environment: str) -> Callable[[], float]:
-    """Seconds of a process of its own."""
+    """Measures the seconds of a separate process."""
 
     def seconds() -> float:
         start = time.perf_counter()

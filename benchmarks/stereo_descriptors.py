@@ -1,9 +1,9 @@
-"""How many matches of stereo SIFT features are right: python -m benchmarks.stereo_descriptors FOLDER_OF_RECORDINGS.
+"""Fraction of correct matches of stereo SIFT features: python -m benchmarks.stereo_descriptors FOLDER_OF_RECORDINGS.
 
-Right is what the motion says on which most features agree (`plain_odometry`): a point, carried by it, falls where the
-feature is that it was matched with, up to noise (99.9 % of a Gaussian) and 2 px. The recordings' own truth is not exact
-enough: KITTI's rotations move all features by up to 2 px from frame to frame. Features are matched left to right by
-descriptors of 128; descriptors of 36 are formed of the same histograms. Prints the tables of the documentation.
+A match is correct if it agrees with the consensus motion (`plain_odometry`): the moved point projects to the matched
+feature, up to noise (99.9 % of a Gaussian) and 2 px. The recordings' ground truth is not accurate enough: errors of
+KITTI's rotations move all features by up to 2 px from frame to frame. Features are matched left to right by descriptors
+of 128; descriptors of 36 are computed from the same histograms. Prints the tables of the documentation.
 """
 
 import argparse
@@ -28,21 +28,21 @@ from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 
 NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
 SLACK_PX, RIGHT = 2.0, 16.3
-ELSEWHERE = -2  #: In place of the name of a landmark that is not of the recording.
+ELSEWHERE = -2  #: Name of landmarks that are not from the recording.
 REACH_PX = 5.0
-"""Standard deviation of the prediction that gates a map."""
+"""Standard deviation of the predicted pose for gating with a map."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Features of every pair, and where the camera was, (T, 7) from the first camera's place."""
+    """Features of every pair, and camera poses (T, 7) relative to the first."""
 
     rig: RectifiedStereo
     features: list[StereoFeatures]
     poses: np.ndarray
 
     def predicted(self, points: np.ndarray, cov: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (M, 3) and covariance (M, 3, 3) in the image of points in the world; NaN where they are not seen."""
+        """Predicted mean (M, 3) and covariance (M, 3, 3) in the image of world points; NaN if not visible."""
         pose = self.poses[frame]
         local = SE3.inverse_transform(pose, points)
         seen = self.rig.visible(local)
@@ -57,7 +57,7 @@ class Recording:
 
 
 def read(folder: Path, config: SiftConfig) -> Recording:
-    """All of a recording."""
+    """Reads a whole recording."""
     sequence = open_stereo(folder)
     sensor = StereoMatcher(sequence.rig, Sift(config))
     features = [sensor.measure(frame.image, frame.right) for frame in sequence.frames()]
@@ -65,7 +65,7 @@ def read(folder: Path, config: SiftConfig) -> Recording:
 
 
 def shortened(recording: Recording, length: int) -> Recording:
-    """The same with descriptors of another length, of the same histograms: squares of "root" descriptors are their shares."""
+    """The recording with shorter descriptors of the same histograms, whose fractions are squares of "root" descriptors."""
     return replace(
         recording,
         features=[
@@ -75,14 +75,14 @@ def shortened(recording: Recording, length: int) -> Recording:
 
 
 def agree(mean: np.ndarray, cov: np.ndarray, z: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Whether predictions (P, 3) and measurements (P, 3) are of one point."""
+    """Whether predictions (P, 3) and measurements (P, 3) agree."""
     total = cov + noise + SLACK_PX**2 * np.eye(3)
     nu = z - mean
     return np.einsum("pi,pi->p", nu, np.linalg.solve(total, nu[..., None])[..., 0]) <= RIGHT
 
 
 def frame_to_frame(recording: Recording, gap: int) -> tuple[int, int]:
-    """Matches between pairs `gap` apart, and how many are right."""
+    """Numbers of matches and of correct ones between pairs `gap` apart."""
     found = right = 0
     for frame in range(0, len(recording.features) - gap, 2):
         before, after = recording.features[frame], recording.features[frame + gap]
@@ -95,7 +95,7 @@ def frame_to_frame(recording: Recording, gap: int) -> tuple[int, int]:
 
 @dataclass
 class Tally:
-    """Matches with a map: how many, how many right, and the seconds that they took."""
+    """Matches with a map: their number, the correct ones, and the time taken."""
 
     found: int = 0
     right: int = 0
@@ -110,7 +110,7 @@ class Tally:
 
 
 def with_map(recording: Recording, gated: bool, others: np.ndarray) -> Tally:
-    """Goes through a recording with a map that grows as S05 has it, beside descriptors (D, d) of elsewhere."""
+    """Matches a recording with a map that grows as in S05, plus descriptors (D, d) from elsewhere."""
     length, tally = recording.features[0].descriptors.shape[1], Tally()
     limits, camera = MatchLimits(), recording.rig.camera
     manager = LandmarkManager(NewLandmarkConfig(), (camera.width, camera.height), length)

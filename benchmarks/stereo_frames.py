@@ -1,4 +1,4 @@
-"""Time of a whole pair of 640 × 480 in the stereo system, on images of the laboratory in memory; 400 particles."""
+"""Time per 640 × 480 pair of the stereo system, on laboratory images in memory; 400 particles."""
 
 import time
 from dataclasses import replace
@@ -23,7 +23,7 @@ STAGES = "features", "odometry", "matching", "filter"
 
 
 def rendered(pairs: int) -> ImageSequence:
-    """The start of the robot's tour, each second frame, with coarse texels."""
+    """The start of the robot's tour, every second frame, with coarse texels."""
     world, imaging = TexturedLab(LabDrive(frames=pairs, every=2), texel_m=0.01), Imaging(known=0)
     with TemporaryDirectory() as folder:
         lab = Path(folder) / "lab"
@@ -34,7 +34,7 @@ def rendered(pairs: int) -> ImageSequence:
 
 
 def run(settings: Settings) -> list[Row]:
-    """The system beside OpenCV's SIFT alone on both whole images, without matching, map or filter."""
+    """The system against only OpenCV's SIFT on both images, without matching, map or filter."""
     sequence = rendered(SETTLING + settings.repetitions(TIMED))
     log = filter_opened(open_pairs(sequence, StereoConfig.s05())).log
     whole = 1e3 * log["seconds"][SETTLING:]
@@ -57,7 +57,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def sift_alone(sequence: ImageSequence) -> float:
-    """Median seconds of a pair."""
+    """Median seconds per pair."""
     detector, seconds = cv2.SIFT.create(), []
     for frame in list(sequence.frames())[SETTLING::3]:
         start = time.perf_counter()

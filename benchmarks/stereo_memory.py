@@ -1,6 +1,6 @@
-"""Peak memory of a process that updates 400 particles, each with 11,000 landmarks of its own.
+"""Peak memory of a process that updates 400 particles with 11,000 landmarks each.
 
-The worst case: no landmark's estimate is shared between particles, as if none had ever been resampled.
+The worst case: particles share no landmark estimate, as without any resampling.
 """
 
 import json
@@ -10,11 +10,11 @@ import sys
 from benchmarks.rows import Row, Settings
 
 NUMBERS = 9
-"""Of a landmark's estimate: mean and covariance, six of it different."""
+"""Numbers of a landmark's estimate: mean and covariance, with six distinct entries."""
 
 
 def run(settings: Settings) -> list[Row]:
-    """In a process of its own, beside what the numbers of all estimates take."""
+    """Measures in a separate process, against the memory of all estimates' numbers."""
     turns = settings.repetitions(6)
     told = subprocess.run(
         [sys.executable, "-m", "benchmarks.stereo_memory", str(turns)], capture_output=True, text=True, check=True
@@ -35,7 +35,7 @@ def run(settings: Settings) -> list[Row]:
 
 
 def measure(turns: int) -> list[float]:
-    """Peak and start of this process in MiB, landmarks and particles."""
+    """Peak and initial memory of this process in MiB, landmarks and particles."""
     from benchmarks.stereo_step import LARGE, Drive
     from rbpf.runs.folder import peak_memory_mb
 

@@ -1,8 +1,8 @@
-"""How exact stereo features are, by scale: python -m benchmarks.stereo_noise FOLDER_OF_RECORDINGS.
+"""Noise of stereo features by scale: python -m benchmarks.stereo_noise FOLDER_OF_RECORDINGS.
 
-Features of consecutive pairs that agree with one motion (`plain_odometry`), less what that motion predicts: robust
-standard deviations of the place, per axis, and of the disparity, over √2 for the two pairs. Beside the recordings, a
-rendered room.
+Residuals of features in consecutive pairs that agree with one motion (`plain_odometry`): robust standard deviations of
+the position, per axis, and of the disparity, divided by √2 for the two pairs. For the recordings, and for a rendered
+room.
 """
 
 import argparse
@@ -28,7 +28,7 @@ FRAMES = 40
 
 
 def residuals(sequence: ImageSequence) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) pixels of (u_left, v, u_right) less their prediction, and scales (P,)."""
+    """Residuals (P, 3) of (u_left, v, u_right), px, and scales (P,)."""
     sensor, misses, scales = StereoMatcher(sequence.rig), [], []
     frames = [frame for frame, _ in zip(sequence.frames(), range(FRAMES), strict=False)]
     features = [sensor.measure(frame.image, frame.right) for frame in frames]
@@ -44,12 +44,12 @@ def residuals(sequence: ImageSequence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def deviation(values: np.ndarray) -> float:
-    """Robust standard deviation of one of the two."""
+    """Robust standard deviation per pair, of differences of two."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))) / np.sqrt(2.0))
 
 
 def lines(sequence: ImageSequence, name: str) -> Iterator[str]:
-    """One for each range of scales."""
+    """One line per range of scales."""
     miss, scale = residuals(sequence)
     for low, high in pairwise(BOUNDS):
         part = miss[(scale >= low) & (scale < high)]

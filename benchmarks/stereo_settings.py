@@ -1,7 +1,7 @@
-"""What settings of stereo SIFT cost and lose: python -m benchmarks.stereo_settings FOLDER_OF_RECORDINGS.
+"""Cost and accuracy of settings of stereo SIFT: python -m benchmarks.stereo_settings FOLDER_OF_RECORDINGS.
 
-For each setting: processor time per pair of images on one thread, features, features that agree with the motion between
-consecutive pairs, and the error of the path that a plain odometry makes of them (`plain_odometry`; no filter, no map).
+For each setting: processor time per image pair on one thread, features, inliers of the motion between consecutive
+pairs, and the error of a plain odometry's path (`plain_odometry`; no filter, no map).
 """
 
 import argparse
@@ -35,7 +35,7 @@ SETTINGS = {
 
 
 def measured(sequence: ImageSequence, sensor: StereoMatcher) -> tuple[list[StereoFeatures], np.ndarray]:
-    """Features of all pairs, and mean milliseconds of SIFT and of the matching."""
+    """Features of all pairs, and mean milliseconds of SIFT and of matching."""
     features, seconds = [], np.zeros(2)
     for frame in sequence.frames():
         start = time.process_time()
@@ -47,7 +47,7 @@ def measured(sequence: ImageSequence, sensor: StereoMatcher) -> tuple[list[Stere
 
 
 def errors(rig: RectifiedStereo, features: list[StereoFeatures], truth: np.ndarray) -> tuple[float, ...]:
-    """Medians over seeds: ATE after rigid and after similarity alignment [m], scale, features that agree."""
+    """Medians over seeds: ATE after rigid and after similarity alignment [m], scale, inliers."""
     rows = []
     for seed in range(SEEDS):
         poses, agreeing = path(rig, features, seed)
@@ -61,7 +61,7 @@ def errors(rig: RectifiedStereo, features: list[StereoFeatures], truth: np.ndarr
 
 
 def lines(folder: Path, names: list[str]) -> Iterator[str]:
-    """Of the report."""
+    """Lines of the report."""
     yield "recording           setting                      SIFT   match ms  features  agree  ATE rigid   sim3  scale"
     for name in names:
         sequence = open_stereo(folder / name)

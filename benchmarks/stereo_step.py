@@ -1,8 +1,8 @@
 """One update of stereo SLAM: 400 particles, about 60 observations, in a map of 11,000 landmarks and in a small one.
 
-What S05 Fig. 7 has above its base line: matching with the map, weights, resampling, updates, new landmarks. The large
-map lies all around the robot, as after 4,000 frames; a part of it is in view. Its landmarks were written in many
-generations, and are held by each particle.
+The costs above the base line in S05 Fig. 7: matching with the map, weights, resampling, updates, new landmarks. The large
+map surrounds the robot, as after 4,000 frames; part of it is in view. Its landmarks were written in many generations,
+and each particle has all of them.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ SETTLING = 8
 
 
 class Drive:
-    """A robot that turns on the spot among landmarks on all sides."""
+    """A robot that turns on the spot, surrounded by landmarks."""
 
     def __init__(self, landmarks: int, turns: int) -> None:
         rng, config = np.random.default_rng(0), StereoConfig.s05()
@@ -52,7 +52,7 @@ class Drive:
         self.turn += 1
 
     def _fill(self, landmarks: int) -> None:
-        """Every landmark in every particle's map, with counters of one often seen."""
+        """Adds every landmark to every particle's map, with counters of one often observed."""
         sensor, n = self.sensor, self.config.particles
         names = sensor.manager.add(self.descriptors)
         table = np.column_stack([names, np.full(landmarks, 5), np.zeros(landmarks, dtype=np.int64)])
@@ -66,7 +66,7 @@ class Drive:
             held.add_records(Records(mean, cov), sensor.landmark, ids=part)
 
     def _features(self, pose: np.ndarray) -> StereoFeatures:
-        """Of landmarks in view, and of things never seen."""
+        """Features of landmarks in view, and of unknown objects."""
         rng, length = self.rng, self.descriptors.shape[1]
         local = SE3.inverse_transform(pose, self.places)
         seen = np.flatnonzero(RIG.visible(local, 5.0))
@@ -84,12 +84,12 @@ class Drive:
 
 
 def turned(times: int) -> np.ndarray:
-    """World_from_camera (7,) after so many updates."""
+    """world_from_camera (7,) after a number of updates."""
     return SE3.exp(np.array([0.0, 0.02 * times, 0.0, 0.0, 0.0, 0.0]))
 
 
 def run(settings: Settings) -> list[Row]:
-    """The large map beside the small one."""
+    """The large map against the small one."""
     turns = settings.repetitions(40)
     contestants = {name: Drive(size, turns + 3) for name, size in (("large", LARGE), ("small", SMALL))}
     times = interleaved(contestants, turns)

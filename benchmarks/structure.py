@@ -1,8 +1,8 @@
-"""How much a newcomer has to read: lines, files, folders, circles, and the files that usual tasks open.
+"""Size of the code for a newcomer: lines, files, folders, import cycles, and the files opened in common tasks.
 
     python benchmarks/structure.py [FOLDER]     of the checkout in FOLDER, by default this one
 
-It reads the source as text and as syntax trees, and imports none of it, so that two checkouts can be set side by side.
+It reads the source as text and as syntax trees without importing it, so that two checkouts can be compared.
 """
 
 import ast
@@ -14,14 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOMS = ("rbpf", "sensors", "motion", "maps", "validation")
-"""The folders that are installed."""
+"""The installed folders."""
 
 TASKS = Path(__file__).with_name("tasks.json")
-"""Files that somebody opens who carries a task out, as found by doing it."""
+"""Files opened in the course of a task, as found by doing it."""
 
 
 def tracked(root: Path) -> list[Path]:
-    """The Python files that git knows, without links."""
+    """The Python files tracked by git, without links."""
     listed = subprocess.run(
         ["git", "-C", root, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.py"],
         capture_output=True, text=True, check=True,
@@ -43,7 +43,7 @@ def module_of(root: Path, path: Path) -> str:
 
 
 def called_once(trees: dict[str, ast.Module]) -> tuple[int, int]:
-    """Private functions that are named at one place beside their definition, and private functions in all."""
+    """Number of private functions named at one place besides their definition, and of all private functions."""
     named, defined = Counter(), []
     for module, tree in trees.items():
         for node in ast.walk(tree):
@@ -58,7 +58,7 @@ def called_once(trees: dict[str, ast.Module]) -> tuple[int, int]:
 
 
 def imports(module: str, tree: ast.Module, modules: set[str]) -> Iterator[str]:
-    """Modules of the package that it imports: at its top, late in functions, and for types alone."""
+    """Imported modules of the package: at the top, in functions, and for types only."""
     for node in ast.walk(tree):
         names = []
         if isinstance(node, ast.Import):
@@ -119,7 +119,7 @@ def public_names(trees: dict[str, ast.Module]) -> int:
 
 
 def measure(root: Path) -> dict[str, object]:
-    """All figures of a checkout."""
+    """Measures all figures of a checkout."""
     paths = tracked(root)
     package = installed(root, paths)
     tests = [path for path in paths if path.relative_to(root).parts[0] == "tests"]
@@ -156,7 +156,7 @@ def measure(root: Path) -> dict[str, object]:
 
 
 def main() -> None:
-    """Prints the figures, and how many files each task opens."""
+    """Prints the figures, and the number of files opened in each task."""
     root = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parents[1]).resolve()
     for name, value in measure(root).items():
         print(f"{name:42} {value}")

@@ -1,4 +1,4 @@
-"""Joining a finished sub-map to one that is far along, and closing a loop: round a circle, 50 new landmarks in each."""
+"""Joining a finished sub-map to a long chain, and loop closure: on a circle, with 50 new landmarks in each sub-map."""
 
 import time
 
@@ -14,7 +14,7 @@ STD = {"heading": 0.002, "place": 0.02, "landmark": 0.03}
 
 
 def circle(count: int) -> list[SubMap]:
-    """As many sub-maps as close a circle; the last one sees the landmarks of the first."""
+    """Sub-maps on a closed circle; the last one observes the landmarks of the first."""
     rng = np.random.default_rng(0)
     radius = LENGTH_M * count / (2.0 * np.pi)
     turns = np.linspace(0.0, 2.0 * np.pi, count + 1)
@@ -37,7 +37,7 @@ def circle(count: int) -> list[SubMap]:
 
 
 def run(settings: Settings) -> list[Row]:
-    """The last tenth of the way against the first; the closure is told, and nothing asked of it."""
+    """The last tenth of the joins against the first; the loop closure is reported without a limit."""
     count = 600 if settings.quick else 2000
     maps, seconds = SubMaps(SE2, 2, 2 * EACH), []
     for finished in circle(count):

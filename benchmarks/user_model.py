@@ -1,4 +1,4 @@
-"""What a user pays for writing `predict` and `residual` in plain NumPy, with numeric Jacobians, instead of a kernel."""
+"""Cost of a user's `predict` and `residual` in plain NumPy, with numeric Jacobians, compared with a kernel."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class UserRangeBearing(ObservationModel):
 
 
 def run(settings: Settings) -> list[Row]:
-    """Few particles, where calls cost, and many, where arithmetic does."""
+    """Few particles, dominated by calls, and many, dominated by arithmetic."""
     return [figure(50, settings.repetitions(90)), figure(1000, settings.repetitions(30))]
 
 

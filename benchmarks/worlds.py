@@ -1,4 +1,4 @@
-"""Filters of N particles that see K of M landmarks each step: a robot on a circle inside a ring of landmarks."""
+"""Filters of N particles that observe K of M landmarks per step: a robot on a circle inside a ring of landmarks."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Frame:
 
 
 class KnownLandmarks(Sensor):
-    """Hands a frame's measurements on."""
+    """Passes on a frame's measurements."""
 
     def __init__(self, model: ObservationModel) -> None:
         self.model = model
@@ -53,8 +53,8 @@ class World:
 
     Args:
         space: SE2 or SE3.
-        k: landmarks seen per step;  m: landmarks of the map.
-        dwell: steps after which one landmark leaves the view and another one enters.
+        k: landmarks observed per step;  m: landmarks of the map.
+        dwell: number of steps after which a landmark leaves the view and another one enters.
     """
 
     def __init__(self, space: SE2Group | SE3Group, k: int, m: int, dwell: int = 1, seed: int = 0) -> None:
@@ -80,7 +80,7 @@ class World:
         return pose
 
     def frames(self) -> Iterator[Frame]:
-        """Without end."""
+        """Frames without end."""
         pose, t, dim = self.start(), 0, self.sight.dim
         cov = STD_MOTION**2 * np.eye(self.space.dim)
         while True:
@@ -97,9 +97,9 @@ class Run:
     """A filter on a world, stepped frame by frame; the frames are simulated beforehand.
 
     Args:
-        world: what it sees; consumed by this run alone.
-        n: particles.
-        steps: how many there will be.
+        world: its world, which only this run consumes.
+        n: number of particles.
+        steps: number of steps.
         model: of the observations; by default the built-in one.
         compiled: use the fused kernels.
     """
@@ -122,16 +122,16 @@ class Run:
         self.diversity = Diversity(self.filter)
 
     def step(self) -> None:
-        """The next frame."""
+        """Processes the next frame."""
         frame = self.frames.pop()
         self.diversity.after(self.filter.step(frame, frame.control).resampled)
 
 
 def grow_map(filter_: Filter, points: np.ndarray, rng: np.random.Generator) -> None:
-    """Adds landmarks (M, D), a hundred per generation, so that their ages and sharing are those of a grown map.
+    """Adds landmarks (M, D), a hundred per generation, so that their ages and sharing match a grown map.
 
-    Few particles then resample `SETTLING` N times more, as a robot does that left these landmarks behind; many do
-    not, since nothing of what they measure depends on it.
+    Few particles then resample `SETTLING` N times more, like a robot that has left these landmarks behind; many do
+    not, as none of their figures depends on it.
     """
     n, dim = filter_.n, points.shape[1]
     landmark_map = filter_.belief().map

@@ -1,6 +1,6 @@
-"""A run beside the batch optimum of its own measurements: where they differ, by how many sigma, and who is too sure.
+"""Compares a run with the batch optimum of its measurements: differences, in metres and sigma, and overconfidence.
 
-Works for a run in memory (`compare_run`) and for a folder that `rbpf run` left (`compare_folder`), of any system.
+For a run in memory (`compare_run`) or a folder written by `rbpf run` (`compare_folder`), of any system.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 
 def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
-    """Prints how far the filter is from the optimum for few and many particles; `quick` takes a short log."""
+    """Prints the filter's distance from the optimum for few and many particles; `quick` uses a short log."""
     out.mkdir(parents=True, exist_ok=True)
     rows, figures = [], {}
     with TemporaryDirectory() as folder:

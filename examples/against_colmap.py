@@ -1,6 +1,6 @@
-"""An independent opinion: COLMAP reconstructs the images of a run from scratch.
+"""An independent reference: COLMAP reconstructs the images of a run from scratch.
 
-The reconstruction shares the images and the calibration with the filter and nothing else.
+The reconstruction shares only the images and the calibration with the filter.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 
 
 def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
-    """Renders a desk, filters it, and compares; leaves the run as a COLMAP model and PLY files in `out`."""
+    """Renders a desk, filters it, and compares; writes the run as a COLMAP model and PLY files to `out`."""
     width, frames, every = (320, 90, 9) if quick else (640, 300, 5)
     camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, width / 2 - 0.5, 3 * width / 8 - 0.5)
     with TemporaryDirectory() as folder:

@@ -1,7 +1,7 @@
-"""Stop a filter, save it, and go on in another one as if nothing had happened: the same bytes come out.
+"""Stop a filter, save it, and continue in another one: the results are the same bytes.
 
-A checkpoint is one `.npz` file of plain arrays with a digest. It holds the particles, the map, the history,
-the state of the random generator and whatever arrays the caller adds; not the models, which are code.
+A checkpoint is one `.npz` file of plain arrays with a digest. It holds the particles, the map, the history, the
+state of the random generator and any arrays that the caller adds; not the models, which are code.
 """
 
 from pathlib import Path
@@ -16,15 +16,15 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 
 
 def build(particles: int = 50) -> Filter:
-    """The filter; a checkpoint is read by a filter that was built in the same way."""
+    """The filter; a checkpoint is read by a filter built in the same way."""
     lamp_map = LandmarkMap(SE2)
-    lamp_map.register(Point(2))  # so that an empty map knows what the checkpoint holds
+    lamp_map.register(Point(2))  # so that an empty map knows the checkpoint's landmark type
     sensor = NamedLandmarkSensor(LampSensor(), Point(2))
     return Filter(OdometryMotion(SE2), sensor, lamp_map, n=particles, rng=np.random.default_rng(0))
 
 
 def main() -> dict[str, bool]:
-    """Runs through, and with a stop half-way; prints whether both end in the same state."""
+    """Runs without and with a stop halfway; prints whether both end in the same state."""
     frames, _, _ = simulate(np.random.default_rng(3), steps=80)
     through = build()
     for frame in frames:

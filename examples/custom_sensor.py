@@ -1,8 +1,8 @@
-"""A new sensor in one class: a robot sees equal lamps, and measures where they are and how bright they look.
+"""A custom sensor in one class: a robot observes equal lamps by bearing and apparent brightness.
 
-Brightness falls with the square of the distance, so that bearing and log-brightness together locate a lamp.
+Brightness decreases with the squared distance, so that bearing and log-brightness together locate a lamp.
 `LampSensor` is all that a user writes; the measurement-conditioned proposal (FastSLAM 2.0), the map and the
-derivatives come with the framework.
+derivatives are provided by the framework.
 """
 
 from types import SimpleNamespace
@@ -37,7 +37,7 @@ class LampSensor(ObservationModel):
 
 
 def simulate(rng: np.random.Generator, steps: int = 200) -> tuple[list[SimpleNamespace], np.ndarray, np.ndarray]:
-    """Frames of a robot that drives twice round a circle, its true poses (T, 3), and the lamps (M, 2)."""
+    """Frames of a robot that drives two laps of a circle, its true poses (T, 3), and the lamps (M, 2)."""
     lamps = rng.uniform([-8.0, -4.0], [8.0, 12.0], (40, 2))
     increment = SE2.exp(4 * np.pi / (steps - 1) * np.array([1.0, 4.0, 0.0]))
     model, pose, frames, poses = LampSensor(), SE2.identity(), [], []
@@ -56,7 +56,7 @@ def simulate(rng: np.random.Generator, steps: int = 200) -> tuple[list[SimpleNam
 
 
 def main() -> dict[str, float]:
-    """Checks the model, runs the filter and prints what it gained over odometry."""
+    """Checks the model, runs the filter and prints its errors and those of odometry alone."""
     findings = check_model(LampSensor(), SE2)
     print("check_model:", "; ".join(findings) or "LampSensor is sound")
 

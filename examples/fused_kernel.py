@@ -1,7 +1,7 @@
-"""Speed for a model of one's own: a compiled kernel beside the NumPy methods.
+"""Speed for a custom model: a compiled kernel beside the NumPy methods.
 
-The kernel gives innovation and Jacobians of one measurement for a block of particles. Nothing else changes:
-the same filter picks it up, `check_model` compares it with the NumPy methods, and both give the same
+The kernel computes innovation and Jacobians of one measurement for a block of particles. Nothing else changes:
+the same filter uses it, `check_model` compares it with the NumPy methods, and both give the same
 estimate.
 """
 
@@ -21,7 +21,7 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 
 @njit(cache=True)
 def _store(row, d0, d1, x, y, c, s, jac_state, jac_landmark, i):
-    """A row (d0, d1) by the point in the robot's frame, as derivatives by the tangent and by the landmark."""
+    """Stores a row (d0, d1), ∂z/∂point in the robot's frame, as ∂z/∂tangent and ∂z/∂landmark."""
     jac_state[row, 0, i] = d0 * y - d1 * x
     jac_state[row, 1, i] = -d0
     jac_state[row, 2, i] = -d1
@@ -51,7 +51,7 @@ class FastLampSensor(LampSensor):
 
 
 def filtered(model: LampSensor, particles: int) -> tuple[np.ndarray, float]:
-    """Last estimate (3,), and milliseconds per step."""
+    """Final estimate (3,), and milliseconds per step."""
     frames, _, _ = simulate(np.random.default_rng(3), steps=60)
     sensor = NamedLandmarkSensor(model, Point(2))
     filter_ = Filter(OdometryMotion(SE2), sensor, LandmarkMap(SE2), n=particles, rng=np.random.default_rng(0))
@@ -62,7 +62,7 @@ def filtered(model: LampSensor, particles: int) -> tuple[np.ndarray, float]:
 
 
 def main() -> dict[str, float]:
-    """Prints what check_model says, the difference of the estimates, and the times per step."""
+    """Prints the result of check_model, the difference of the estimates, and the times per step."""
     findings = check_model(FastLampSensor(), SE2)
     print("check_model:", "; ".join(findings) or "kernel and NumPy methods agree")
     plain, slow = filtered(LampSensor(), particles=1000)

@@ -1,7 +1,7 @@
-"""GPS, wheels and a gyroscope with a bias: what comes at 50 Hz is summed up between the fixes, which come at 1 Hz.
+"""GPS, wheels and a biased gyroscope: preintegration of 50 Hz odometry between position fixes at 1 Hz.
 
-A particle that draws noise fifty times between two measurements wanders off, and a bias that is sampled becomes a copy in all
-particles. So the increments of a second are composed to one, with its covariance, and the bias, which turns it, is held in
+Particles that sample noise fifty times between two measurements disperse, and a sampled bias degenerates to copies of one
+value. So the increments of a second are composed into one, with its covariance, and the bias, which rotates it, is part of
 one Gaussian with the frame of the last few steps. For 25 s there is no fix.
 """
 
@@ -23,13 +23,13 @@ from rbpf.gaussian import psd_factor
 from rbpf.motion.odometry import Odometry, preintegrate
 
 RATE, SECONDS, OUTAGE = 50, 120, range(60, 85)
-STD_TICK = np.array([0.002, 0.01, 0.002])  # of an increment: turn [rad], forward [m], to the left [m]
+STD_TICK = np.array([0.002, 0.01, 0.002])  # increment: turn [rad], forward [m], to the left [m]
 STD_BIAS, WALK_BIAS, STD_FIX = 0.05, 0.0002, 0.5  # rad/s, rad/s per √s, m
-BY_BIAS = np.array([[-1.0 / RATE], [0.0], [0.0]])  # of an increment
+BY_BIAS = np.array([[-1.0 / RATE], [0.0], [0.0]])  # ∂increment/∂bias
 
 
 class Driven(MotionModel):
-    """x' = x · delta · Exp(B bias + w); the control is what `preintegrate` gives."""
+    """x' = x · delta · Exp(B bias + w); the control is the result of `preintegrate`."""
 
     space = SE2
 
@@ -42,7 +42,7 @@ class Driven(MotionModel):
 
 
 class Position(ObservationModel):
-    """z = (x, y) of the robot [m]; reads the sampled state and nothing else."""
+    """z = (x, y) of the robot [m]; observes only the sampled state."""
 
     dim = 2
     reads = frozenset({Part.STATE})
@@ -52,7 +52,7 @@ class Position(ObservationModel):
 
 
 class Receiver(Sensor):
-    """A frame is a fix (2,), or None where there is none."""
+    """A frame is a fix (2,), or None without one."""
 
     def observe(self, frame, belief):
         if frame is None:
@@ -90,7 +90,7 @@ def track(world: list, seed: int) -> tuple[np.ndarray, np.ndarray, Filter]:
 
 
 def main() -> dict[str, float]:
-    """Four worlds, with the default number of particles."""
+    """Tracks in four worlds, with the default number of particles."""
     figures = []
     for seed in range(4):
         world = simulate(np.random.default_rng(seed))

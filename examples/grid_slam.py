@@ -1,8 +1,8 @@
-"""Grid SLAM: an occupancy grid in every particle, a part of one's own, beside the exact answer.
+"""Grid SLAM with a custom conditional part, an occupancy grid in every particle, compared with the exact posterior.
 
-A robot goes round a ring of cells, some of which have a door. It slips now and then, and its sensor errs. Given its path the
-cells are independent of each other, each a probability: where Rao-Blackwellised SLAM began (K. Murphy 1999). The exact answer
-sums over all maps and all places. A scanner's grid in the plane is such a part, too: `rbpf.maps.grid.GridMap`.
+A robot moves round a ring of cells, some of which have a door. Steps may fail, and the sensor has errors. Given the path,
+the cells are independent probabilities, as in the first Rao-Blackwellised SLAM (K. Murphy 1999). The exact posterior sums
+over all maps and all positions. A laser scanner's grid in the plane is such a part, too: `rbpf.maps.grid.GridMap`.
 """
 
 import numpy as np
@@ -12,11 +12,11 @@ from rbpf.gaussian import mixture_moments
 
 DOORS = Part("doors")
 CELLS, STEPS, PARTICLES = 8, 40, 1000
-ADVANCES, RIGHT = 0.8, 0.9  # chance that a step succeeds, that the sensor says what is there
+ADVANCES, RIGHT = 0.8, 0.9  # probability that a step succeeds, that the sensor is right
 
 
 class Robot(MotionModel):
-    """The cell where it is; a step leads to the next one, or fails."""
+    """The state is the robot's cell; a step leads to the next one, or fails."""
 
     space = Finite(CELLS)
 
@@ -25,7 +25,7 @@ class Robot(MotionModel):
 
 
 class Grid(Conditional):
-    """Log-odds (N, CELLS) that there is a door."""
+    """Log-odds (N, CELLS) of a door."""
 
     supplies, takes_raw = DOORS, True
 
@@ -56,14 +56,14 @@ class Grid(Conditional):
 
 
 class DoorSensor(Sensor):
-    """A frame is True or False: a door where the robot is, or none."""
+    """A frame is True or False: a door at the robot's cell, or none."""
 
     def observe(self, frame, belief):
         return [Observations.raw(frame, DOORS)]
 
 
 def simulate(rng: np.random.Generator) -> tuple[np.ndarray, list[bool], int]:
-    """The map (CELLS,), what is seen in each step, and the cell where the robot is at last."""
+    """The map (CELLS,), the observation of each step, and the robot's final cell."""
     doors, cell, seen = np.array([1, 0, 0, 1, 0, 1, 1, 0]), 0, []
     for t in range(STEPS):
         cell = (cell + int(t > 0 and rng.random() < ADVANCES)) % CELLS
@@ -86,7 +86,7 @@ def summed(seen: list[bool]) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def main() -> dict[str, float]:
-    """Prints how probable a door is in each cell, and what all maps together say."""
+    """Prints the probability of a door in each cell, and the exact one."""
     doors, seen, cell = simulate(np.random.default_rng(2))
     filter_ = Filter(Robot(), DoorSensor(), Grid(), n=PARTICLES, rng=np.random.default_rng(0))
     for frame in seen:

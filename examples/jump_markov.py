@@ -1,15 +1,15 @@
-"""A jump Markov system: the mode is drawn, what is linear given the modes is marginalised, beside the exact answer.
+"""A jump Markov system: modes are sampled, the linear state given the modes is marginalised; with the exact posterior.
 
-A tank's level rises while its valve is closed and falls while it is open; nobody sees the valve, and the level is
-measured badly. Given the valve's history the level is Gaussian, a Kalman filter in each particle; the exact answer sums
-over all histories.
+A tank's level rises while its valve is closed and falls while it is open; the valve is not observed, and measurements
+of the level are noisy. Given the valve's history the level is Gaussian, a Kalman filter in each particle; the exact
+posterior sums over all histories.
 """
 
 import numpy as np
 
 from rbpf import Filter, Finite, KalmanSubstate, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 
-STAYS = np.array([0.9, 0.8])  # chance that the valve stays closed, open
+STAYS = np.array([0.9, 0.8])  # probability that the valve stays closed, open
 RISE, STD_RISE = np.array([0.5, -1.5]), np.array([0.1, 0.3])  # per step
 STD_LEVEL, STD_START = 1.0, 2.0
 STEPS, PARTICLES = 14, 200
@@ -21,7 +21,7 @@ class Tank(MotionModel):
     space = Finite(2)
 
     def sample(self, state, control, dt, rng):
-        stays = np.where(dt > 0, STAYS[state.astype(int)], 1.0)  # no time has passed before the first step
+        stays = np.where(dt > 0, STAYS[state.astype(int)], 1.0)  # no time passes before the first step
         return np.where(rng.random(state.shape) < stays, state, 1.0 - state)
 
     def transition(self, state, control, dt):
@@ -50,7 +50,7 @@ def enumerated(levels: np.ndarray) -> tuple[np.ndarray, float]:
     is_open, first = [], True
     for z in levels:
         if not first:
-            # Every history goes on in two ways.
+            # Every history branches into two.
             before, valve = np.repeat(valve, 2), np.tile([0, 1], valve.size)
             chance = np.where(valve == before, STAYS[before], 1 - STAYS[before])
             log_p = np.repeat(log_p, 2) + np.log(chance)
@@ -64,7 +64,7 @@ def enumerated(levels: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def main() -> dict[str, float]:
-    """Prints how probable it is that the valve is open, and what all histories together say."""
+    """Prints the probability that the valve is open, and the exact one."""
     rng, valve, level, levels = np.random.default_rng(5), 0, 0.0, []
     for t in range(STEPS):
         if t:

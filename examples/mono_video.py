@@ -1,7 +1,7 @@
-"""Monocular SLAM on any sequence of images, in ten lines; without one of your own, on a desk that is rendered first.
+"""Monocular SLAM on any image sequence, in ten lines; by default on a rendered desk.
 
-Results lie in the run's folder: the path, the map with its covariances, pictures, and the video with what was looked
-for in every frame.
+Results are in the run's folder: the path, the map with its covariances, plots, and the video with the features searched
+in every frame.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ def slam(images: Path, known_points: Path | None, particles: int, out: Path) -> 
 
 
 def render(folder: Path, frames: int, width: int) -> Path:
-    """A desk, unless it has been rendered before."""
+    """Renders a desk, unless it exists already."""
     camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, 0.5 * width - 0.5, 0.375 * width - 0.5)
     if not folder.exists():
         simulate_images(TexturedDesk(frames=frames), Imaging(), camera, folder, seed=0)
@@ -40,7 +40,7 @@ def main(
     out: Path = Path("demo/mono_video"),
     quick: bool = False,
 ) -> dict[str, float]:
-    """Runs and prints the main figures.
+    """Runs monocular SLAM and prints the main figures.
 
     Args:
         images: a folder of images or a video, with its camera.yaml; by default a desk is rendered.

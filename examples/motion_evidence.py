@@ -1,9 +1,9 @@
-"""Does it turn or go straight on? Two motion models compared by their evidence.
+"""Model comparison by evidence: does a vessel turn or go straight?
 
-The vessels of `target_tracking` are watched by radar; some keep turning, some go straight on but for disturbances. One
-model has a turn rate, the other one does not. The evidence p(z_1:T) of a model needs no truth and no penalty for the
-number of its parameters: a turn rate that is not needed spreads the predictions, and costs. The picture has the
-difference of the log-evidences as it grows with the recording, one line per seed of the filters.
+Radar tracks the vessels of `target_tracking`; some keep turning, some go straight except for disturbances. One model
+has a turn rate, the other one does not. The evidence p(z_1:T) of a model needs no ground truth and no penalty for the
+number of parameters: an unnecessary turn rate spreads the predictions, which lowers the evidence. The plot shows the
+difference of the log-evidences over time, one line per seed of the filters.
 """
 
 from pathlib import Path
@@ -33,7 +33,7 @@ SPEED = 4.0  # [m/s]
 
 
 class Straight(MotionModel):
-    """The vessel without a turn rate: the speed alone drives it, and is marginalised."""
+    """The vessel without a turn rate: only the speed drives it, and is marginalised."""
 
     space = SE2
 
@@ -54,7 +54,7 @@ MODELS = {
 
 
 def simulate(rng: np.random.Generator, turn_rate: float, steps: int) -> np.ndarray:
-    """Radar measurements (T, 2) of a vessel of a given turn rate [rad/s]."""
+    """Radar measurements (T, 2) of a vessel with a given turn rate [rad/s]."""
     pose, poses = START, []
     for t in range(steps):
         dt = 1.0 if t else 0.0
@@ -64,7 +64,7 @@ def simulate(rng: np.random.Generator, turn_rate: float, steps: int) -> np.ndarr
 
 
 def log_evidence(measurements: np.ndarray, model: str, particles: int, seed: int) -> np.ndarray:
-    """Of the recording so far, after each step (T,)."""
+    """Log-evidence of the measurements so far, after each step (T,)."""
     motion, mean, cov = MODELS[model]
     substate, rng = KalmanSubstate(SE2, mean, cov), np.random.default_rng(seed)
     filter_ = Filter(motion, RadarSensor(), substate, n=particles, rng=rng, start=START)
@@ -72,7 +72,7 @@ def log_evidence(measurements: np.ndarray, model: str, particles: int, seed: int
 
 
 def draw(curves: dict[str, np.ndarray], path: Path) -> None:
-    """Differences (S, T) of the log-evidences over the recordings."""
+    """Plots differences (S, T) of the log-evidences over time."""
     figure = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = figure.subplots()
     for number, (name, lines) in enumerate(curves.items()):
@@ -90,10 +90,10 @@ def main(
     """Compares both models on both recordings.
 
     Args:
-        steps: of each recording, seconds.
-        particles: of each filter.
-        seeds: filters per model and recording.
-        out: folder for table and picture.
+        steps: number of steps of each recording, of one second.
+        particles: number of particles of each filter.
+        seeds: number of filters per model and recording.
+        out: folder for table and plot.
         quick: few seeds.
     """
     seeds = 4 if quick else seeds

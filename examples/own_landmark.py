@@ -1,9 +1,9 @@
-"""A landmark parametrisation of one's own: bearing-only mapping in the plane by inverse range.
+"""A custom landmark parametrisation: bearing-only mapping in the plane by inverse range.
 
-A bearing says nothing about distance, and a Gaussian in (x, y) cannot hold that. A Gaussian in (bearing,
-inverse range) as seen from the pose of the first observation can: E06 (12)-(13) in the plane. The anchor pose
-is a constant of the record. Store, filter and sensor stay as they are; what has been located well enough
-turns into a point.
+A bearing does not constrain range, which a Gaussian in (x, y) cannot represent. A Gaussian in (bearing,
+inverse range) relative to the pose of the first observation can: E06 (12)-(13) in the plane. The anchor pose
+is a constant of the record. Store, filter and sensor are unchanged; landmarks that are located well enough
+become points.
 """
 
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 
 STD_BEARING = 0.01  # [rad]
 STD_ODOMETRY = np.array([0.002, 0.01, 0.005])  # turn [rad], forward [m], to the left [m]
-MEAN_INVERSE, STD_INVERSE = 0.15, 0.1  # of a landmark never seen before [1/m]
+MEAN_INVERSE, STD_INVERSE = 0.15, 0.1  # prior of a new landmark [1/m]
 
 
 def _direction(angle: np.ndarray) -> np.ndarray:
@@ -40,7 +40,7 @@ class InverseRange(Landmark):
 
 
 class Bearing(ObservationModel):
-    """z = (bearing,) [rad] of a landmark: of an InverseRange (with constant) or of a point."""
+    """z = (bearing,) [rad] of a landmark: an InverseRange (with constant) or a point."""
 
     dim = 1
 
@@ -84,7 +84,7 @@ def simulate(rng: np.random.Generator, steps: int = 150) -> tuple[list[SimpleNam
 
 
 def main() -> dict[str, float]:
-    """Checks both classes, runs the filter, and prints how many landmarks were located and how well."""
+    """Checks both classes, runs the filter, and prints the number of located landmarks and their errors."""
     findings = check_model(InverseRange(), SE2) + check_model(Bearing(), SE2, example=Example(landmark=InverseRange()))
     print("check_model:", "; ".join(findings) or "InverseRange and Bearing are sound")
     frames, truth, points = simulate(np.random.default_rng(5))

@@ -1,8 +1,8 @@
-"""A proposal of one's own: FastSLAM 2.0's refined Gaussian, made wider.
+"""A custom proposal: FastSLAM 2.0's refined Gaussian, widened.
 
-S05 §V finds the measurement-conditioned proposal over-confident and injects noise into it. Here the samples
-are drawn from a wider Gaussian, and the exact importance ratio takes the widening out again: the estimate
-stays right, and the weights tell what the widening costs.
+S05 §V finds the measurement-conditioned proposal overconfident and injects noise into it. Here samples are
+drawn from a wider Gaussian, and the exact importance ratio corrects for the widening: the estimate remains
+correct, and the effective sample size shows the cost of the widening.
 """
 
 from dataclasses import replace

@@ -1,8 +1,8 @@
-"""A robot among landmarks: from a log to a path, a map and a verdict, in a few lines.
+"""Range-bearing SLAM from a log to a path, a map and a verdict, in a few lines.
 
-The robot drives twice round a circle and sees range and bearing of what is near. FastSLAM 2.0 filters its log; GTSAM
-solves the same measurements at once. The picture has both paths, that of the odometry alone, the truth, and the
-landmarks with 3σ ellipses.
+The robot drives two laps of a circle and measures range and bearing of nearby landmarks. FastSLAM 2.0 filters its log;
+GTSAM computes the batch optimum of the same measurements. The plot shows both paths, odometry alone, the ground truth,
+and the landmarks with 3σ ellipses.
 """
 
 import shutil
@@ -29,11 +29,11 @@ def main(
     """Simulates, filters, and prints the main figures.
 
     Args:
-        steps: of the log.
-        particles: of the filter.
-        seed: of world and filter.
-        out: folder for log, run, table and picture.
-        quick: a short log.
+        steps: number of steps of the log.
+        particles: number of particles.
+        seed: seed of world and filter.
+        out: folder for log, run, table and plot.
+        quick: uses a short log.
     """
     steps = 40 if quick else steps
     simulate_robot(RobotWorld(steps=steps, landmarks=60), out / "log", seed)

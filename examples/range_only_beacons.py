@@ -1,7 +1,7 @@
-"""Range-only beacons: a landmark that starts as a ring of Gaussians and ends as one.
+"""Range-only SLAM: a landmark starts as a ring of Gaussians and becomes a point.
 
-One range says that a beacon lies on a circle. Every particle keeps that circle as a mixture; later ranges
-raise the weights of the components near the beacon, until one of them dominates and takes over as a point.
+One range constrains a beacon to a circle, which every particle represents by a mixture; later ranges raise
+the weights of the components near the beacon, until one of them dominates and becomes a point.
 """
 
 from types import SimpleNamespace
@@ -16,12 +16,12 @@ from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 
 STD_RANGE = 0.1  # [m]
 STD_ODOMETRY = np.array([0.005, 0.01, 0.005])  # turn [rad], forward [m], to the left [m]
-COMPONENTS = ring_components(20.0, STD_RANGE)  # enough for beacons up to 20 m away
+COMPONENTS = ring_components(20.0, STD_RANGE)  # for beacons up to 20 m away
 BEACONS = np.array([[6.0, 5.0], [-4.0, 6.0], [3.0, -5.0], [10.0, -1.0], [-5.0, -3.0]])
 
 
 class Range(ObservationModel):
-    """z = (distance,) to a beacon [m]; a first observation starts a ring around the robot."""
+    """z = (distance,) to a beacon [m]; a first observation initialises a ring around the robot."""
 
     dim = 1
 
@@ -50,7 +50,7 @@ def simulate(rng: np.random.Generator, steps: int = 200) -> list[tuple[np.ndarra
 
 
 def optimum(frames: list[SimpleNamespace], poses: np.ndarray, beacons: np.ndarray) -> np.ndarray:
-    """The beacons (M, 2) by least squares over the whole path at once, started from poses (T, 3) and beacons (M, 2)."""
+    """Beacons (M, 2) by batch least squares over the whole path, initialised at poses (T, 3) and beacons (M, 2)."""
 
     def residuals(unknown):
         path = np.concatenate([poses[:1], unknown[: 3 * len(frames) - 3].reshape(-1, 3)])
@@ -64,7 +64,7 @@ def optimum(frames: list[SimpleNamespace], poses: np.ndarray, beacons: np.ndarra
 
 
 def main() -> dict[str, float]:
-    """Prints when each beacon becomes a point, and how far off it is in the end."""
+    """Prints when each beacon becomes a point, and its final error."""
     beacon_map = LandmarkMap(SE2)
     sensor = NamedLandmarkSensor(Range(), MixturePoint(COMPONENTS))
     filter_ = Filter(OdometryMotion(SE2), sensor, beacon_map, n=50, rng=np.random.default_rng(0))

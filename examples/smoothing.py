@@ -1,8 +1,8 @@
-"""After the last step: what does the whole recording say about an early one?
+"""Smoothing: the posterior of early states given the whole recording.
 
-A point on a line moves at random, and only its distance from a post beside the line is measured, so that
-left and right of the post look alike until a late measurement of the position settles it. The filter cannot
-know early on; smoothing does.
+A point on a line moves at random, and only its distance from a post beside the line is measured, so that the side
+of the post is ambiguous until a late measurement of the position. The filter cannot resolve early ambiguity;
+smoothing does.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ class Walk(MotionModel):
 
 
 class PostRange(ObservationModel):
-    """z = (distance,) from a post one metre beside the line."""
+    """z = (distance,) from a post at one metre from the line."""
 
     dim = 1
     reads = frozenset({Part.STATE})
@@ -43,7 +43,7 @@ class Fix(ObservationModel):
 
 
 class Surveyor(Sensor):
-    """A frame is a range, and a fix or None: two groups of observations with a model each."""
+    """A frame is a range, and a fix or None: two groups of observations, each with its own model."""
 
     def __init__(self):
         self.range, self.fix = PostRange(), Fix()
@@ -57,7 +57,7 @@ class Surveyor(Sensor):
 
 
 def simulate(rng: np.random.Generator) -> tuple[np.ndarray, list[tuple[float, float | None]]]:
-    """True positions (T,), and frames: a range each, and a fix in the last one."""
+    """True positions (T,), and frames: a range in each, and a fix in the last one."""
     truth = 2.0 + np.cumsum(STD_STEP * rng.normal(size=STEPS))
     ranges = np.sqrt(1.0 + truth**2) + STD_RANGE * rng.normal(size=STEPS)
     fixes = [None] * (STEPS - 1) + [truth[-1] + STD_FIX * rng.normal()]
@@ -65,7 +65,7 @@ def simulate(rng: np.random.Generator) -> tuple[np.ndarray, list[tuple[float, fl
 
 
 def main() -> dict[str, float]:
-    """Prints the error of the filter and of both smoothers over the whole recording."""
+    """Prints the errors of the filter and of both smoothers over the whole recording."""
     truth, frames = simulate(np.random.default_rng(4))
     rng = np.random.default_rng(0)
     start = rng.normal(0.0, 3.0, (500, 1))

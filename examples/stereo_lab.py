@@ -1,8 +1,8 @@
-"""A robot with two cameras drives through a laboratory: stereo SLAM beside its own visual odometry.
+"""Stereo SLAM of a robot in a laboratory, compared with its own visual odometry.
 
-A short piece of the tour is rendered, thinned out as the robot is slow, and filtered with 400 particles (S05). The
-picture has the map and the path from above; the table has what the map gains over the odometry of the same run.
-`reproduce_s05.py` does the whole tour.
+A short part of the tour is rendered, subsampled as the robot is slow, and filtered with 400 particles (S05). The plot
+shows the map and the path from above; the table compares the errors of SLAM and of the same run's odometry.
+`reproduce_s05.py` covers the whole tour.
 """
 
 import shutil
@@ -22,7 +22,7 @@ FIGURES = ("ate_rmse_m", "vo_ate_rmse_m", "landmarks_mean_per_particle", "update
 
 
 def render(folder: Path, frames: int, width: int) -> Path:
-    """The first pairs of the tour, unless they have been rendered before."""
+    """Renders the first pairs of the tour, unless they exist already."""
     if not folder.exists():
         height, focal = 3 * width // 4, 0.78125 * width
         camera = Pinhole(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
@@ -34,12 +34,12 @@ def render(folder: Path, frames: int, width: int) -> Path:
 def main(
     frames: int = 240, particles: int = 50, out: Path = Path("demo/stereo_lab"), quick: bool = False
 ) -> dict[str, float]:
-    """Renders, filters, and prints the main figures.
+    """Renders and filters the tour, and prints the main figures.
 
     Args:
-        frames: pairs of images.
-        particles: of the filter.
-        out: folder for images, run, table and picture.
+        frames: number of image pairs.
+        particles: number of particles.
+        out: folder for images, run, table and plot.
         quick: few small pairs and few particles.
     """
     frames, particles, width = (12, 20, 320) if quick else (frames, particles, 640)

@@ -1,7 +1,7 @@
-"""Weights of any form: the volatility of returns, which no Gaussian observation describes, beside the exact answer on a grid.
+"""Likelihoods of any form: stochastic volatility, without a Gaussian observation, compared with numerical integration.
 
-The log-variance x of a price's daily returns y is an autoregression, and y = β exp(x / 2) ε: what is measured is a
-noise whose size is the state. Nothing can be linearised, so that particles are weighed by the log-likelihood as it is.
+The log-variance x of a price's daily returns y is autoregressive, and y = β exp(x / 2) ε: the measurement is noise
+whose variance depends on the state. It cannot be linearised, so particles are weighed by the log-likelihood itself.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ def on_a_grid(
 ) -> tuple[np.ndarray, float]:
     """Filtered means (T,) and log-evidence by numerical integration (G. Kitagawa 1987).
 
-    On places `grid` (G,) of densities `start` (G,), with densities moves(t) (G, G) from each to each and log_p(z, x) (G,).
+    On points `grid` (G,) of prior density `start` (G,), with transition densities moves(t) (G, G) and log_p(z, x) (G,).
     """
     p, means, log_evidence = start / start.sum(), [], 0.0
     for t, z in enumerate(data):
@@ -59,7 +59,7 @@ def on_a_grid(
 
 
 def exact(returns: np.ndarray) -> tuple[np.ndarray, float]:
-    """`on_a_grid` of this model."""
+    """`on_a_grid` for this model."""
     grid = np.linspace(-6.0, 6.0, 1201)
     moves = np.exp(-0.5 * np.square((grid - PHI * grid[:, None]) / SIGMA))
     start = np.exp(-0.5 * np.square(grid) * (1 - PHI**2) / SIGMA**2)
@@ -67,7 +67,7 @@ def exact(returns: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def main() -> dict[str, float]:
-    """Prints the filtered log-variance and the evidence beside those on the grid."""
+    """Prints the filtered log-variance and the evidence, and those on the grid."""
     truth, returns = simulate(np.random.default_rng(1))
     rng = np.random.default_rng(0)
     start = SIGMA / np.sqrt(1 - PHI**2) * rng.standard_normal((PARTICLES, 1))

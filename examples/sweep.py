@@ -1,8 +1,8 @@
-"""How many particles, and how many linearisations? A sweep over both, in parallel, to one table.
+"""A sweep over numbers of particles and of linearisations, in parallel, into one table.
 
-The same as `rbpf sweep CONFIG.yaml`: particles × seeds × sequences × options. Finished runs are kept in `rows.jsonl`,
-so that a sweep that was stopped goes on where it was. The picture has the error of the path by number of particles,
-the median over the seeds and all of them.
+The same as `rbpf sweep CONFIG.yaml`: particles × seeds × sequences × options. Finished runs are stored in `rows.jsonl`,
+so that an interrupted sweep continues from them. The plot shows the path's error by number of particles, for all seeds
+and their median.
 """
 
 from pathlib import Path
@@ -34,12 +34,12 @@ def main(
     """Runs the sweep and prints the medians.
 
     Args:
-        seeds: of the filter.
-        steps: of the recording.
-        particles: numbers of them.
-        workers: processes.
+        seeds: number of seeds of the filter.
+        steps: number of steps of the recording.
+        particles: numbers of particles.
+        workers: number of processes.
         scheduler: address of a Dask scheduler whose workers run instead.
-        out: folder for recording, table and picture.
+        out: folder for recording, table and plot.
         quick: few seeds, steps and particles, in this process.
     """
     if quick:
@@ -60,7 +60,7 @@ def main(
 
 
 def draw(errors: dict[tuple[str, int], list[float]], particles: tuple[int, ...], path: Path) -> None:
-    """Error by number of particles and option."""
+    """Plots the error by number of particles and option."""
     figure = Figure(figsize=(7.0, 5.0), layout="constrained")
     axes = figure.subplots()
     for option in OPTIONS:

@@ -1,8 +1,8 @@
-"""Tracking without a map: sample what is nonlinear, marginalise what is linear.
+"""Tracking without a map: the nonlinear state is sampled, the linear one marginalised.
 
-A vessel is watched by a radar that measures range and bearing. Its pose is sampled. Its turn rate and speed
-drive the pose linearly, in the chart of the pose, and are kept as a Gaussian in every particle. The same
-number of particles then goes further than in a bootstrap filter that samples all five numbers.
+A radar measures range and bearing of a vessel. Its pose is sampled. Its turn rate and speed drive the pose
+linearly, in the chart of the pose, and are a Gaussian in every particle. The same number of particles is then
+more accurate than in a bootstrap filter that samples all five numbers.
 """
 
 import numpy as np
@@ -90,7 +90,7 @@ def simulate(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """True poses (T, 3) and measurements (T, 2), drawn from the model."""
     pose, rates, poses = START, rng.multivariate_normal(MEAN_RATES, COV_RATES), []
     for t in range(STEPS):
-        dt = 1.0 if t else 0.0  # nothing has passed before the first step
+        dt = 1.0 if t else 0.0  # no time passes before the first step
         pose = SE2.retract(pose, dt * DRIVES @ rates + STD_POSE * rng.normal(size=3))
         rates = rates + STD_RATES * rng.normal(size=2)
         poses.append(pose)
@@ -98,20 +98,20 @@ def simulate(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def marginalised(rng: np.random.Generator, proposal: EkfProposal | PriorProposal) -> Filter:
-    """Samples the pose."""
+    """A filter that samples only the pose."""
     rates = KalmanSubstate(SE2, MEAN_RATES, COV_RATES)
     return Filter(Vessel(), RadarSensor(), rates, proposal, n=PARTICLES, rng=rng, start=START)
 
 
 def bootstrap(rng: np.random.Generator) -> Filter:
-    """Samples everything, from the motion model."""
+    """A filter that samples everything, from the motion model."""
     rates = rng.multivariate_normal(MEAN_RATES, COV_RATES, PARTICLES)
     start = np.concatenate([np.tile(START, (PARTICLES, 1)), rates], axis=1)
     return Filter(SampledVessel(), RadarSensor(), (), PriorProposal(), n=PARTICLES, rng=rng, start=start)
 
 
 def main() -> dict[str, dict[str, float]]:
-    """Tracks the same vessels with three filters of one size; prints how far off and how steady they are."""
+    """Tracks the same vessels with three filters of one size; prints their errors and the spread of their evidence."""
     filters = {
         "bootstrap, all five numbers sampled": bootstrap,
         "rates marginalised, prior proposal": lambda rng: marginalised(rng, PriorProposal()),

@@ -1,7 +1,7 @@
-"""Is this run good, and does it know how good? A run's folder against the truth and against its batch optimum.
+"""Accuracy and consistency of a run: its folder compared with ground truth and with its batch optimum.
 
-The same as `rbpf validate RUN --against groundtruth` and `--against gtsam`: each comparison leaves a JSON file, its
-pictures, and the two lights on top of RUN/report.html.
+The same as `rbpf validate RUN --against groundtruth` and `--against gtsam`: each comparison writes a JSON file, plots,
+and the two lights on top of RUN/report.html.
 """
 
 from pathlib import Path
@@ -19,14 +19,14 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 def main(
     steps: int = 200, particles: int = 500, seed: int = 1, out: Path = Path("demo/validate_run"), quick: bool = False
 ) -> dict[str, str]:
-    """Simulates, filters, compares and prints what was found.
+    """Simulates, filters, compares and prints the results.
 
     Args:
-        steps: of the recording.
-        particles: of the filter.
-        seed: of the world and of the filter.
+        steps: number of steps of the recording.
+        particles: number of particles.
+        seed: seed of the world and of the filter.
         out: folder for recording and run.
-        quick: a short run.
+        quick: uses a short run.
     """
     steps, particles = (40, 50) if quick else (steps, particles)
     log, run = out / "log", out

@@ -1,6 +1,6 @@
-"""Rao-Blackwellised particle filters: bring a motion model and an observation model, get FastSLAM-2.0 inference.
+"""Rao-Blackwellised particle filters: FastSLAM-2.0 inference for any motion and observation model.
 
-The public names are in `__init__.pyi`. They are imported on first use, so that `import rbpf` is fast.
+The public names are in `__init__.pyi`. They are imported on first use to keep `import rbpf` fast.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
-"""Shapes of arrays in signatures: `Float[np.ndarray, "N K p"]`, `Like[ArrayLike, "... E"]`; arrays as kernels take them.
+"""Shapes of arrays in signatures: `Float[np.ndarray, "N K p"]`, `Like[ArrayLike, "... E"]`; arrays for kernels.
 
 For a type checker, and at run time, these are `typing.Annotated`. The tests import jaxtyping (P. Kidger) before the
-package, get its types here, and check every call against them. The strings are in its notation: a letter is an axis, the
-same letter the same length in one call; `...` and `*name` any number of axes; `#` in front of an axis: it may be 1.
+package, so that these become its types, and check calls against them. The strings are in its notation: a letter is an
+axis, of the same length throughout a call; `...` and `*name` are any number of axes; an axis with `#` may also be 1.
 
 Letters: N particles, K observations, E state storage, d its tangent, m linear substate, D landmark, A its constants,
 C components, p measurement, r noise rank.
@@ -48,7 +48,7 @@ class RowByRow:
 
 
 def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:
-    """Float64 of this machine, in C order, writable; copied only if necessary. Raises InputError: not real numbers."""
+    """Float64 in native byte order and C order, writable; copied only if necessary. Raises InputError: not real numbers."""
     if type(array) is np.ndarray and array.dtype == np.float64 and array.flags.carray:
         return array
     given = np.asarray(array)

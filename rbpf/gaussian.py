@@ -1,10 +1,10 @@
 """Batched small Gaussians: Cholesky and semi-definite factors, triangular solves, log-density, unscented transform.
 
 Every function broadcasts over leading axes and is meant for n up to about twelve. Covariances are full symmetric matrices
-(..., n, n); a chol_* is lower triangular (..., n, n), a factor L is any matrix with L L^T = covariance. A result may lie in
-memory entry by entry, so that what is computed from it runs along the batch: code that insists on C order takes its
-`numpy.ascontiguousarray`. But for LAPACK's factors, of a few matrices or large ones, the loops run over the entries of a
-matrix and the arithmetic along the batch. Sums use no BLAS: equal input gives equal bytes.
+(..., n, n); a chol_* is lower triangular (..., n, n), a factor L is any matrix with L L^T = covariance. Results may be
+stored entry by entry, so that further arithmetic runs along the batch: for C order use `numpy.ascontiguousarray`. Except
+for few or large matrices, which are factored by LAPACK, loops run over the entries of a matrix and arithmetic along the
+batch. Sums use no BLAS: equal input gives equal bytes.
 """
 
 from collections.abc import Callable
@@ -23,9 +23,9 @@ _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
-_NO_PIVOT = 5e-324  #: Times a variance: nothing, but infinite if that is.
-_UNROLLED, _MANY = 8, 200  #: Up to this size and from so many matrices on, loops take less time than LAPACK.
-_KEPT = 512  #: Entries of what is small enough for its factor to be looked up.
+_NO_PIVOT = 5e-324  #: Factor on a variance: the product is zero, but infinite for an infinite variance.
+_UNROLLED, _MANY = 8, 200  #: Up to this size and from this many matrices on, loops are faster than LAPACK.
+_KEPT = 512  #: Maximum number of entries of matrices whose factors are cached.
 
 
 def symmetrise(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
@@ -39,7 +39,7 @@ def mixture_moments(
 ) -> tuple[Float[np.ndarray, "... D"], Float[np.ndarray, "... D D"]]:
     """Mean (…, D) and covariance (…, D, D), within + between, of mixtures of Gaussians along the first axis.
 
-    Weights (N, …) that sum to one, or (N,) for all alike.
+    Weights (N, …) that sum to one, or (N,) common to all.
     """
     weights = weights.reshape(*weights.shape, *(1,) * (mean.ndim - weights.ndim))
     centre = (weights * mean).sum(axis=0)
@@ -76,7 +76,7 @@ def entries_first(matrix: Array, ndim: int = 0) -> Array:
 
 
 def entries_last(entries: Array) -> Array:
-    """Inverse of `entries_first`, (n, m, ...) -> (..., n, m): a view, so that the way back copies nothing either."""
+    """Inverse of `entries_first`, (n, m, ...) -> (..., n, m): a view, without a copy."""
     return entries.transpose(*range(2, entries.ndim), 0, 1)
 
 
@@ -107,8 +107,8 @@ def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n 
 def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Square factor L with L L^T = cov of positive semi-definite, possibly singular matrices.
 
-    A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors; each matrix is treated alike
-    whatever else is in the batch. Raises InputError: NaN, not symmetric, or an eigenvalue below -1e-9 times the largest.
+    A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors, each independently of the
+    rest of the batch. Raises InputError: NaN, not symmetric, or an eigenvalue below -1e-9 times the largest.
     """
     return _looked_up(_semidefinite_factor, cov)
 
@@ -137,14 +137,14 @@ def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n
     """Inverse of positive definite matrices, exactly symmetric. Raises InputError: one is not positive definite."""
     chol = cholesky(cov)
     if chol.ndim == 2 and len(chol) > _UNROLLED:
-        lower = dpotri(chol.T, overwrite_c=True)[0].T  # of the transposed, the upper triangle
+        lower = dpotri(chol.T, overwrite_c=True)[0].T  # the upper triangle of the transpose
         return np.asarray(lower + np.tril(lower, -1).T)
     half = solve_lower_matrix(chol, np.eye(chol.shape[-1]))
     return gram(np.swapaxes(half, -1, -2))
 
 
 def log_det(chol: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
-    """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...); of a single matrix a number."""
+    """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...); a number for a single matrix."""
     return _looked_up(_log_det, chol)[()]
 
 
@@ -156,7 +156,7 @@ def log_density(
     Raises InputError: cov is not positive definite.
     """
     cov = np.asarray(cov, dtype=float)
-    # One of each axis of the batch along which all are the same entries in memory: they are factored once.
+    # One matrix along batch axes of stride 0, which repeat the same memory: it is factored once.
     chol = cholesky(cov[tuple(slice(None) if stride else slice(1) for stride in cov.strides[:-2])])
     white = solve_lower(chol, residual)
     return -0.5 * (np.square(white).sum(-1) + log_det(chol) + white.shape[-1] * _LOG_2PI)
@@ -169,9 +169,9 @@ def unscented_transform(
 
     x_0 = mean with the weight kappa / (n + kappa), and mean +- sqrt(n + kappa) times each column of a factor of cov (..., n,
     n), which may be singular, with the weights 1 / (2 (n + kappa)); Julier and Uhlmann, "Unscented Filtering and Nonlinear
-    Estimation" (2004). No weight is negative, so the covariance is semi-definite. `function` takes (2n + 1, ..., n) to
-    (2n + 1, ..., m): the sigma points are the first axis, so that arguments of its own which differ along the batch broadcast.
-    Raises InputError: cov is no covariance.
+    Estimation" (2004). No weight is negative, so the covariance is semi-definite. `function` maps (2n + 1, ..., n) to
+    (2n + 1, ..., m): sigma points are the first axis, so that other arguments of it that vary along the batch broadcast.
+    Raises InputError: cov is not a covariance.
     """
     mean = np.asarray(mean, dtype=float)
     n = mean.shape[-1]
@@ -197,7 +197,7 @@ def _looked_up(factor: Callable[[Array], Array], cov: Like[ArrayLike, "*batch n 
 
 @lru_cache(maxsize=64)
 def _kept_factor(factor: Callable[[Array], Array], cov: bytes, shape: tuple[int, ...]) -> Array:
-    # A sensor's noise is the same at every step.
+    # A sensor's noise is the same at every step, so its factor is cached.
     return factor(np.frombuffer(cov).reshape(shape))
 
 
@@ -209,7 +209,7 @@ def _definite_factor(cov: Array) -> Array:
 
 def _semidefinite_factor(cov: Array) -> Array:
     swapped = np.swapaxes(cov, -1, -2)
-    # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
+    # Reductions per matrix cost more than the factorisation, so they are made only if in doubt.
     if not (cov == swapped).all():
         _require_finite(cov)
         skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
@@ -227,19 +227,19 @@ def _semidefinite_factor(cov: Array) -> Array:
 def _factors(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
     n = cov.shape[-1]
     if n > _UNROLLED or cov.size <= _MANY * n * n:
-        # An error does not say which one of the batch failed: the loops do.
+        # LAPACK's error does not tell which matrix of the batch failed: the loops do.
         with suppress(np.linalg.LinAlgError):
             chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
             pivots = chol.diagonal(axis1=-2, axis2=-1)
-            # What is not finite leaves its row a pivot that is not.
+            # An entry that is not finite makes its row's pivot not finite.
             if (pivots * pivots > floor * cov.diagonal(axis1=-2, axis2=-1)).all():
                 return chol, np.ones(cov.shape[:-2], dtype=bool)
-    with np.errstate(invalid="ignore"):  # from entries that are infinite, which complaints cover
+    with np.errstate(invalid="ignore"):  # from infinite entries, which the callers report
         return _cholesky_batch(cov, floor)
 
 
 def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
-    # A pivot that is not above floor times its variance, be it infinite or NaN, means: not definite.
+    # A pivot that is not above `floor` times its variance, including infinite and NaN, means not definite.
     entries = entries_first(cov)
     chol = np.zeros(entries.shape)
     definite = np.ones(cov.shape[:-2], dtype=bool)
@@ -255,16 +255,16 @@ def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]
 
 
 def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
-    # The factor, and whether the matrix is not semi-definite.
+    # The factor, and whether the matrix fails to be semi-definite.
     plain_values, plain_vectors = np.linalg.eigh(cov)
     negative = plain_values[..., 0] < -_NEGATIVE * np.abs(plain_values).max(-1)
     plain = plain_vectors * np.sqrt(np.maximum(plain_values, 0.0))[..., None, :]
-    # That of the correlation matrix, so that radians beside metres keep all their digits.
+    # Factor of the correlation matrix, to keep all digits with mixed units such as radians and metres.
     scale = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
     reciprocal = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > _NO_SCALE)
     values, vectors = np.linalg.eigh(symmetrise(cov) * reciprocal[..., :, None] * reciprocal[..., None, :])
     scaled = scale[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    # Beside a variance that is rounding itself, correlations exceed one: there the plain one is nearer.
+    # With a variance of the order of rounding, correlations exceed one: there the covariance's own factor is closer.
     sound = values[..., :1, None] >= -_NEGATIVE * values[..., -1:, None]
     return np.where(sound, scaled, plain), negative
 

@@ -1,11 +1,11 @@
-"""Ranges of settings and options, declared at the field and checked when the object is made.
+"""Ranges of settings and options, declared at the field and checked when the object is created.
 
     @dataclass(frozen=True)
     class Config(Ranged):
         noise_px: Positive = 1.0
         cells: Annotated[int, Range(ge=1, le=1000)] = 6
 
-Every number has a range: where none is declared, no number is infinite or larger than `LARGEST`.
+Every number has a range: by default it must be finite and at most `LARGEST` in magnitude.
 """
 
 import math
@@ -18,14 +18,14 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from rbpf.errors import InputError
 
-#: Default upper limit of numbers: larger ones are mistakes, and their squares could overflow.
+#: Default limit of numbers: larger ones are mistakes, and their squares could overflow.
 LARGEST = 1e9
-MOST = 10**7  #: Particles, landmarks or images: more than any machine holds.
+MOST = 10**7  #: Limit of particles, landmarks or images: more than any machine holds.
 
 
 @dataclass(frozen=True)
 class Range:
-    """The range of a number: at least `ge`, above `gt`, at most `le`, below `lt`, perhaps odd."""
+    """The range of a number: at least `ge`, above `gt`, at most `le`, below `lt`, and odd if so declared."""
 
     ge: float = -LARGEST
     gt: float = -math.inf
@@ -34,7 +34,7 @@ class Range:
     odd: bool = False
 
     def holds(self, value: float) -> bool:
-        """Whether a number is in it; NaN is not."""
+        """Whether a number is in the range; NaN is not."""
         inside = self.ge <= value <= self.le and self.gt < value < self.lt
         return inside and (not self.odd or value % 2 == 1)
 
@@ -48,7 +48,7 @@ class Range:
 class Formerly:
     """Former name of a field: `load_settings` refuses it and names the current one."""
 
-    name: str = field(repr=False)  # not in the annotation, where Sphinx would take it for a reference
+    name: str = field(repr=False)  # hidden from the annotation, where Sphinx would take it for a reference
 
 
 ANY = Range()
@@ -57,7 +57,7 @@ NotNegative = Annotated[float, Range(ge=0.0)]
 Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
 Rate = Annotated[float, Range(ge=0.0, lt=1.0)]
 Probability = Annotated[float, Range(gt=0.0, lt=1.0)]
-Ratio = Annotated[float, Range(ge=1.0)]  #: Of the larger to the smaller.
+Ratio = Annotated[float, Range(ge=1.0)]  #: Ratio of the larger to the smaller.
 Angle = Annotated[float, Range(ge=0.0, le=180.0)]  #: Degrees.
 Count = Annotated[int, Range(ge=1, le=MOST)]
 CountOrNone = Annotated[int, Range(ge=0, le=MOST)]
@@ -80,9 +80,9 @@ class SettingError(InputError):
 
 
 def check_ranges(settings: Any, whose: str = "") -> None:
-    """Refuses, by a SettingError, a field of another type than declared, or a number that is out of its range.
+    """Raises SettingError: a field has another type than declared, or a number is out of its range.
 
-    `whose` comes before the field's name in the message, as "the camera's ".
+    `whose` precedes the field's name in the message, such as "the camera's ".
     """
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():
@@ -133,11 +133,11 @@ def _expected(hint: Any, value: Any, allowed: Range) -> str | None:
     if hint is NoneType:
         return None if value is None else "none"
     if hint is bool:
-        # NumPy's, too, which is not imported.
+        # Also NumPy's, which is not imported.
         boolean = isinstance(value, bool) or str(getattr(value, "dtype", "")) == "bool"
         return None if boolean else "true or false"
     if hint in (int, float):
-        # NumPy's numbers are such numbers, too.
+        # This includes NumPy's numbers.
         fits = isinstance(value, numbers.Integral if hint is int else numbers.Real) and not isinstance(value, bool)
         what = "a whole number, " if hint is int else ""
         return None if fits and allowed.holds(value) else f"{what}{allowed.words()}"

@@ -1,4 +1,4 @@
-"""A run folder in the formats of other programs.
+"""Export of a run folder to the formats of other programs.
 
 tum      trajectory.tum: a line `time tx ty tz qx qy qz qw` per pose
 kitti    trajectory_kitti.txt: the upper 3 × 4 block of each pose's matrix, without times
@@ -47,9 +47,9 @@ _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
-    """Writes a run, the folder that `rbpf run` left, in some of the `FORMATS` to a folder; returns the files.
+    """Writes a run, a folder written by `rbpf run`, in some of the `FORMATS` to a folder; returns the files.
 
-    Raises InputError: it is not a run folder, a format is unknown, or its library is not installed.
+    Raises InputError: not a run folder, a format is unknown, or its library is not installed.
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
@@ -91,7 +91,7 @@ def _rerun(run: Path, estimate: PathAndMap, path: Path) -> None:
             stream.log("world/body", rr.TransformAxes3D(AXIS_M))
 
 
-#: The files of each, and how they are written: from the run's folder, its path and map, to the first of them.
+#: Files of each format, and the function that writes them from the run's folder, path and map, given the first file.
 FORMATS: dict[str, tuple[tuple[str, ...], Callable[[Path, PathAndMap, Path], object]]] = {
     "tum": (("trajectory.tum",), lambda _run, estimate, path: write_tum(path, estimate.trajectory)),
     "kitti": (("trajectory_kitti.txt",), lambda _run, estimate, path: write_kitti(path, estimate.trajectory)),
@@ -111,9 +111,9 @@ def export_colmap(
 ) -> Any:
     """Writes a run as a COLMAP model, binary or text, and returns the `pycolmap.Reconstruction`.
 
-    Without `names`, as `lay_out` gives them, the images of a camera are named by their frame; those that it lacks are left
-    out. Without a camera the poses are those of `NOMINAL` on the robot; without a problem, which has the camera and the
-    tracks, points have no tracks.
+    Without `names`, see `lay_out`, a camera's images are named by their frame; images missing in `names` are left out.
+    Without a camera the poses are those of `NOMINAL` on the robot; without a problem, which has the camera and the tracks,
+    points have no tracks.
 
     Raises InputError: path and measurements are not of one run.
     """
@@ -173,7 +173,7 @@ def write_ply(
 ) -> None:
     """Writes finite points (M, 3) [m] with colours (M, 3) uint8, and lines between them; writes atomically.
 
-    `sigmas` (M,) are a further property sigma_m of each point, `edges` (L, 2) rows of the points that a line connects.
+    `sigmas` (M,) are a further property sigma_m of each point, `edges` (L, 2) rows of points connected by lines.
     """
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(axis=1)))

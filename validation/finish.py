@@ -1,10 +1,10 @@
 """From a run to its report: files, batch optimum, scores, pictures, video, verdict; and the comparisons of a run.
 
-Everything after the files of the run itself is made from its folder, so that it can be made again without the recording;
-only the annotated video needs the images once more.
+Everything after the files of the run itself is computed from its folder, so that it can be repeated without the recording;
+only the annotated video needs the images again.
 
-A new comparison is one function from a run to a `Comparison`, entered into `COMPARISONS`; one that needs a file besides
-takes its path, too, and is entered into `WITH_A_FILE`.
+A new comparison is a function from a run to a `Comparison`, entered into `COMPARISONS`; one that also needs a file
+takes its path, and is entered into `WITH_A_FILE`.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,8 +33,8 @@ from rbpf.validation.report.video import PICTURES, annotated_frames, write_video
 if TYPE_CHECKING:
     from rbpf.validation.gtsam.batch_problem import Optimum
 
-#: Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
-#: who asks for it.
+#: Maximum number of a stereo run's observations adjusted after the run: more take minutes and gigabytes, and are adjusted
+#: only on request.
 MOST = 300_000
 
 
@@ -60,7 +60,7 @@ def finish_run(
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
     if run.system.name not in COMPARISONS["gtsam"]:  # no measurements for a batch optimiser
         wanted, batch = {}, False
-    # What is not made is an entry of config.yaml, so that a repetition does not make it either.
+    # Omitted results are an entry of config.yaml, so that a repetition omits them, too.
     entries = write_run(run, out, dict(sources) | {name: False for name, asked in wanted.items() if not asked})
     (out / BATCH).unlink(missing_ok=True)
     for path in out.glob(f"{COMPARISON}*.json"):  # of an earlier run, with their pictures
@@ -88,9 +88,9 @@ def finish_run(
 
 
 def add_batch(found: RunFolder, most: int | None, on_iteration: Callable[[int, float], None] | None) -> dict[str, Any]:
-    """Solves for a run's batch optimum, writes batch.tum and the comparison with it; returns entries of summary.json.
+    """Computes a run's batch optimum, writes batch.tum and the comparison with it; returns entries of summary.json.
 
-    An InputError says that there are too many observations, or what `solve_problem` says.
+    Raises InputError: too many observations, or as of `solve_problem`.
     """
     from rbpf.validation.consistency.against_batch import solve_run
 
@@ -121,7 +121,7 @@ def add_batch(found: RunFolder, most: int | None, on_iteration: Callable[[int, f
 
 #: Maximum frames for COLMAP: matching takes minutes for this many, and grows faster than linearly.
 KEY_FRAMES = 60
-Compare = Callable[[RunFolder], Comparison]  #: With pictures in the run's folder.
+Compare = Callable[[RunFolder], Comparison]  #: Also draws plots into the run's folder.
 
 
 def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Comparison:
@@ -177,12 +177,12 @@ def _path(record: RunFolder, file: Path) -> Comparison:
     return Comparison("path", said, figures)
 
 
-#: By what a run is compared with, besides the truth, then by the run's system.
+#: Comparisons by reference, other than the truth, then by the run's system.
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "gtsam": dict.fromkeys(("range-bearing", "mono", "stereo"), compare_gtsam),
     "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
-#: By what a file holds that a run of any system is compared with.
+#: Comparisons of any system's run with a file, by its content.
 WITH_A_FILE: dict[str, Callable[[RunFolder, Path], Comparison]] = {"relations": _relations, "path": _path}
 
 
@@ -192,8 +192,8 @@ def validate(
     """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again; returns the verdict.
 
     `against` is "groundtruth" or a name in `COMPARISONS`, or with a file one in `WITH_A_FILE`; `out` is a further folder for
-    the JSON; `truth` is how precise the ground truth is, by default exact. An InputError says that it is not possible; the
-    report is written all the same, and says why.
+    the JSON; `truth` is the precision of the ground truth, by default exact. Raises InputError: the comparison is not
+    possible; the report is written nevertheless, with the reason.
     """
     record = RunFolder.open(folder)
     try:

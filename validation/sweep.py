@@ -39,31 +39,31 @@ Named = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class SweepFile:
-    """The content of the YAML file."""
+    """Content of the YAML file."""
 
-    system: str  #: which one is run.
+    system: str  #: name of the system.
     sequences: list[str | dict[str, str]]  #: paths, or mappings of the system's fields to paths.
-    particles: list[int] = field(default_factory=list)  #: numbers of particles; empty for the system's own.
-    seeds: int | list[int] = 1  #: how many, or which.
+    particles: list[int] = field(default_factory=list)  #: numbers of particles; empty for the system's default.
+    seeds: int | list[int] = 1  #: number of seeds, or the seeds.
     #: named options, each a mapping of settings.
     options: dict[str, dict[str, Value]] = field(default_factory=lambda: {"as it is": {}})
-    settings: dict[str, Value] = field(default_factory=dict)  #: of all runs.
+    settings: dict[str, Value] = field(default_factory=dict)  #: settings of all runs.
 
 
 @dataclass(frozen=True)
 class Job:
     """One run of a sweep."""
 
-    system: str  #: which one.
+    system: str  #: name of its system.
     sequence: Named  #: the system's fields and their paths, as (name, path).
     option: str  #: name of the option.
     settings: tuple[str, ...]  #: as key=value, the option's after those of all runs.
-    particles: int | None  #: how many; None for the system's own.
+    particles: int | None  #: number of particles; None for the system's default.
     seed: int  #: of the filter.
 
     @property
     def key(self) -> str:
-        """Name of the run that does not change from one call of the program to the next."""
+        """Name of the run, which is the same in repeated calls of the program."""
         facts = [__version__, self.system, self.sequence, self.settings, self.particles, self.seed]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
@@ -73,7 +73,7 @@ class Job:
         return ({} if self.particles is None else {"particles": self.particles}) | {"seed": self.seed}
 
     def config(self) -> Any:
-        """All settings of the run. An InputError says which one is wrong."""
+        """All settings of the run. Raises InputError: one is invalid."""
         return load_settings(SYSTEMS[self.system].config, self.system, None, self.settings, self.given)
 
     def facts(self) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     if file.system not in SYSTEMS:
         raise InputError(f"a sweep runs one of the systems {', '.join(SYSTEMS)}, not {file.system!r}")
     sequences = [_sequence(given, SYSTEMS[file.system].paths, folder, where) for given in file.sequences]
-    seeds: Sequence[int] = range(file.seeds) if isinstance(file.seeds, int) else file.seeds  # a range takes no room
+    seeds: Sequence[int] = range(file.seeds) if isinstance(file.seeds, int) else file.seeds  # a range takes no memory
     for what, values in (("sequences", sequences), ("seeds", seeds), ("options", list(file.options))):
         if not values:
             raise InputError(f"{where}: {what} is empty, name at least one")
@@ -146,7 +146,7 @@ def sweep(
 ) -> list[Row]:
     """Runs the jobs of `read_plan` that are not done yet, writes rows and table; returns the rows in the order of the jobs.
 
-    A run that was not possible has its `failure` in words. `workers` are processes of this machine, −1 for one per
+    A run that was not possible has a message `failure`. `workers` are processes of this machine, −1 for one per
     core; `scheduler` is the address of a Dask scheduler whose workers run the jobs instead; they need the same paths.
     `on_run` is called with the runs done and their number.
 
@@ -167,7 +167,7 @@ def sweep(
                 report(sum(job.key in done for job in jobs), len(jobs))
     finally:
         rows = [job.facts() | done[job.key]["figures"] for job in jobs if job.key in done]
-        # One line per row, figures within figures as NAME.INNER; one that a run does not have is left empty.
+        # One line per row, nested figures as NAME.INNER; figures that a run does not have are empty.
         flat: list[Row] = [{} for _ in rows]
         for out_row, row in zip(flat, rows, strict=True):
             for name, value in row.items():
@@ -203,7 +203,7 @@ def read_rows(path: Path) -> dict[str, Row]:
 
 
 def run_job(job: Job) -> Row:
-    """One run, with one thread: the processes keep the machine busy."""
+    """Performs one run with one thread, as the processes keep the machine busy."""
     import numba
 
     system, paths = SYSTEMS[job.system], {name: Path(path) for name, path in job.sequence}
@@ -227,7 +227,7 @@ def _figures(run: Run) -> Row:
             others[ODOMETRY_PREFIX.get(run.system.name, "odometry_")] = in_space(log.stamps_ns, log["odometry"])
         figures |= score_estimate(PathAndMap.of_run(run), truth, anonymous, others)
     if truth is not None and truth.alignment == "none":
-        # Mean over the steps, of d degrees of freedom; nothing where the truth is not given in the filter's world.
+        # Mean over the steps, of d degrees of freedom; none if the truth is not in the filter's world.
         errors = whitened_errors(run.system.space, log.poses[truth.rows], log.covs[truth.rows], truth.poses)
         if (known := errors.ranks > 0).any():
             figures["pose_nees_mean"] = float(errors.nees[known].mean())

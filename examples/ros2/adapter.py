@@ -1,8 +1,8 @@
-"""Messages of ROS 2 to what the systems track, and what they say back to messages; it needs no ROS.
+"""Converts ROS 2 messages to the systems' frames, and their results to messages, without ROS itself.
 
-A tracker has one callback per topic, which takes a message and returns what is to be published, as (topic, message).
-Messages are read by their fields alone and made by `make(kind, **fields)`: of `rclpy` in node.py, of the types of
-`rosbags` in the tests.
+A tracker has one callback per topic, which takes a message and returns messages to publish, as (topic, message).
+Messages are read only by their fields and created by `make(kind, **fields)`: with `rclpy` in node.py, with the types
+of `rosbags` in the tests.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,18 +17,18 @@ from rbpf.sensors.readers.images.bag import CameraInfo, image_of, numbers_of
 from rbpf.systems.laser.config import LaserConfig
 from rbpf.systems.laser.slam import LaserSlam
 
-Make = Callable[..., Any]  #: The kind of a message, as "nav_msgs/msg/Odometry", and its fields by name.
+Make = Callable[..., Any]  #: Takes a message's type, such as "nav_msgs/msg/Odometry", and its fields by name.
 Published = list[tuple[str, Any]]
-MAP_EVERY = 20  #: Frames from one map and path to the next.
+MAP_EVERY = 20  #: Frames between published maps and paths.
 
 
 def stamp_of(message: Any) -> int:
-    """Of a message's header [ns]."""
+    """The stamp of a message's header [ns]."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 class Messages:
-    """What a system says, as messages in the frame `world`."""
+    """A system's results as messages in the frame `world`."""
 
     def __init__(self, make: Make, world: str = "map") -> None:
         self.make, self.world = make, world
@@ -48,7 +48,7 @@ class Messages:
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
     def pose(self, pose: np.ndarray) -> Any:
-        """Of a pose (7,)."""
+        """The message of a pose (7,)."""
         position, orientation = self.vector(pose[4:], "Point"), self.rotation(pose)
         return self.make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
 
@@ -57,7 +57,7 @@ class Messages:
         return self.make("geometry_msgs/msg/PoseStamped", header=header, pose=self.pose(pose))
 
     def odometry(self, stamp_ns: int, pose: np.ndarray, cov: np.ndarray, body: str) -> Any:
-        """The pose (7,) of a body with its covariance (d, d), which ROS tells along the world's axes, the position first."""
+        """The pose (7,) of a body with its covariance (d, d), which in ROS is along the world's axes, position first."""
         told = self.make("geometry_msgs/msg/PoseWithCovariance", pose=self.pose(pose), covariance=in_world(pose, cov))
         still = self.vector((0.0, 0.0, 0.0))
         twist = self.make("geometry_msgs/msg/Twist", linear=still, angular=still)
@@ -81,7 +81,7 @@ class Messages:
         return self.make("nav_msgs/msg/Path", header=self.header(stamp_ns, self.world), poses=list(self.poses))
 
     def cloud(self, stamp_ns: int, points: np.ndarray) -> Any:
-        """Points (M, 3)."""
+        """The message of points (M, 3)."""
         fields = [
             self.make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=7, count=1)
             for k, name in enumerate("xyz")
@@ -93,7 +93,7 @@ class Messages:
         )  # fmt: skip
 
     def grid(self, stamp_ns: int, log_odds: np.ndarray, cell_m: float, corner: np.ndarray) -> Any:
-        """Cells: 0 to 100 per cent occupied, -1 where no beam has been."""
+        """The message of a grid: occupancy from 0 to 100 per cent, -1 for cells without any beam."""
         percent = np.where(log_odds == 0.0, -1, np.round(100.0 / (1.0 + np.exp(-log_odds)))).astype(np.int8)
         corner_pose = np.array([0.0, 0.0, 0.0, 1.0, *corner, 0.0])
         header, (rows, columns) = self.header(stamp_ns, self.world), log_odds.shape
@@ -105,7 +105,7 @@ class Messages:
 
 
 def in_world(pose: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """(36,) as in a PoseWithCovariance, of a covariance in the right chart at the pose, [ω, v]; of the plane the rest is 0."""
+    """Converts a covariance in the right chart, [ω, v], to (36,) of PoseWithCovariance; in the plane the rest is 0."""
     whole = np.zeros((6, 6))
     rows = np.arange(6) if len(cov) == 6 else np.array([2, 3, 4])
     whole[np.ix_(rows, rows)] = cov
@@ -115,7 +115,7 @@ def in_world(pose: np.ndarray, cov: np.ndarray) -> np.ndarray:
 
 
 class Tracker:
-    """What all trackers share: from a tracked frame to messages."""
+    """Common to all trackers: conversion of a tracked frame to messages."""
 
     def __init__(self, make: Make, body: str) -> None:
         self.messages, self.body = Messages(make), body
@@ -123,11 +123,11 @@ class Tracker:
         self.frames = 0
 
     def said(self, tracked: Tracked) -> Published:
-        """Pose and transform of every frame; path and map of some."""
+        """Pose and transform of every frame; path and map of every `MAP_EVERY`-th."""
         stamp_ns, told = tracked.stamp_ns, self.messages
         pose = in_space(np.array([stamp_ns]), tracked.pose[None]).world_from_body[0]
         told.poses.append(told.stamped(stamp_ns, pose))
-        if (revision := tracked.revision) is not None:  # earlier poses are known better now
+        if (revision := tracked.revision) is not None:  # earlier poses have been revised
             poses = in_space(revision.stamps_ns, revision.poses).world_from_body
             told.poses[-len(poses) :] = map(told.stamped, revision.stamps_ns.tolist(), poses)
         out = [
@@ -168,14 +168,14 @@ class MonoTracker(Tracker):
 
     def image(self, message: Any) -> Published:
         if not isinstance(self.system, MonoSlam):
-            return []  # nothing is known of the camera yet
+            return []  # no camera_info yet
         camera = self.system.camera
         image = image_of(message, "image", (camera.height, camera.width))
         return self.said(self.system.track(image, stamp_of(message)))
 
 
 class StereoTracker(Tracker):
-    """Rectified pairs: topics `left/image`, `left/camera_info`, and `right`; images of one stamp belong together."""
+    """Rectified pairs: topics `left/image`, `left/camera_info`, and `right`; images with equal stamps are a pair."""
 
     def __init__(self, make: Make, body: str = "camera", config: StereoConfig | None = None) -> None:
         super().__init__(make, body)
@@ -202,14 +202,14 @@ class StereoTracker(Tracker):
         if not isinstance(self.system, StereoSlam) or not all(stamp_ns in images for images in both.values()):
             return []
         left, right = both["left"].pop(stamp_ns), both["right"].pop(stamp_ns)
-        for images in both.values():  # what is older has lost its partner
+        for images in both.values():  # older images have lost their partner
             for old in [old for old in images if old < stamp_ns]:
                 del images[old]
         return self.said(self.system.track(left, right, stamp_ns))
 
 
 class LaserTracker(Tracker):
-    """Topics `scan` and `odom`; a scan waits for the odometry after it. The transform is that from the map to `odom`."""
+    """Topics `scan` and `odom`; a scan waits for later odometry. The transform is from the map to `odom`."""
 
     def __init__(
         self, make: Make, body: str = "base_link", config: LaserConfig | None = None, mount: np.ndarray | None = None
@@ -231,7 +231,7 @@ class LaserTracker(Tracker):
         return self.take()
 
     def take(self) -> Published:
-        """Tracks the scans that the odometry has come past."""
+        """Tracks the scans that precede the latest odometry."""
         out: Published = []
         while self.scans and self.odometry and stamp_of(self.scans[0]) <= self.odometry[-1][0]:
             message = self.scans.pop(0)
@@ -256,7 +256,7 @@ class LaserTracker(Tracker):
         return self.system
 
     def ranges(self, message: Any) -> np.ndarray:
-        """(B,): infinity where nothing came back, NaN where a reading is not valid."""
+        """Ranges (B,): infinite without a return, NaN for invalid readings."""
         ranges = np.asarray(message.ranges, dtype=float)
         valid = (ranges > 0.0) & (ranges >= message.range_min)
         ranges = np.where(valid, np.where(ranges >= message.range_max, np.inf, ranges), np.nan)
@@ -278,4 +278,4 @@ KINDS = {
     "odom": "nav_msgs/msg/Odometry", "rbpf/odometry": "nav_msgs/msg/Odometry", "rbpf/path": "nav_msgs/msg/Path",
     "/tf": "tf2_msgs/msg/TFMessage",
 }  # fmt: skip
-"""Of each topic, by its last part; a map is a PointCloud2, or of a laser scanner an OccupancyGrid."""
+"""Message type of each topic, by its last part; a map is a PointCloud2, or an OccupancyGrid for a laser scanner."""

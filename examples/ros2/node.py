@@ -1,7 +1,7 @@
-"""A node of ROS 2 for mono, stereo or laser: `python examples/ros2/node.py mono --ros-args -r image:=/camera/image_raw …`.
+"""A ROS 2 node for mono, stereo or laser: `python examples/ros2/node.py mono --ros-args -r image:=/camera/image_raw …`.
 
-It subscribes what the trackers of adapter.py name, and publishes rbpf/odometry, rbpf/path, rbpf/map and the transform.
-All that needs ROS is on this page.
+It subscribes to the topics of the trackers in adapter.py, and publishes rbpf/odometry, rbpf/path, rbpf/map and the
+transform. Only this file needs ROS.
 """
 
 import sys
@@ -20,13 +20,13 @@ MAPS = {"laser": "nav_msgs/msg/OccupancyGrid"}
 
 
 def kind_of(name: str) -> Any:
-    """The class of a message such as nav_msgs/msg/Odometry."""
+    """The class of a message type such as nav_msgs/msg/Odometry."""
     package, _, message = name.split("/")
     return getattr(import_module(f"{package}.msg"), message)
 
 
 def make(kind: str, **fields: Any) -> Any:
-    """A message; of a sequence of bytes rclpy takes Python's own array."""
+    """Creates a message; for bytes rclpy takes Python's own array."""
     codes = {"uint8": "B", "int8": "b"}
     given = {
         name: array(codes[value.dtype.name], value.tobytes())
@@ -38,7 +38,7 @@ def make(kind: str, **fields: Any) -> Any:
 
 
 class RbpfNode(Node):
-    """Hands messages to a tracker, and publishes what it returns."""
+    """Passes messages to a tracker, and publishes what it returns."""
 
     def __init__(self, system: str) -> None:
         super().__init__(f"rbpf_{system}")

@@ -1,9 +1,9 @@
-"""`rbpf` beside the package `particles` (N. Chopin) and beside integration on a grid: two standard models, the same data.
+"""`rbpf` compared with the package `particles` (N. Chopin) and with numerical integration: two standard models.
 
     python -m examples.studies.beyond_gaussians
 
 Stochastic volatility, and the growth model (G. Kitagawa 1987), whose posterior has two modes. Both are bootstrap filters
-of 1,000 particles, resampled systematically where the effective sample size falls below half of them.
+of 1,000 particles, with systematic resampling if the effective sample size falls below half of them.
 """
 
 import inspect
@@ -17,7 +17,7 @@ from examples.stochastic_volatility import BETA, PHI, SIGMA, LogVariance, Return
 from rbpf import Euclidean, Filter, LikelihoodSensor, MotionModel, PriorProposal, Transition
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # of escapes in its docstrings, told where they are compiled
+    warnings.simplefilter("ignore")  # about escapes in its docstrings, at compilation
     import particles
     from particles import collectors, distributions, state_space_models
 
@@ -25,7 +25,7 @@ PARTICLES, SEEDS, STEPS = 1000, 20, 100
 
 
 def grown(x: np.ndarray, t: int) -> np.ndarray:
-    """Where the growth model leads."""
+    """Transition function of the growth model."""
     return x / 2 + 25 * x / (1 + x**2) + 8 * np.cos(1.2 * t)
 
 
@@ -91,7 +91,7 @@ def ours(
 
 
 def theirs(model: state_space_models.StateSpaceModel, data: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
-    """The same of `particles`."""
+    """The same by `particles`."""
     np.random.seed(seed)  # noqa: NPY002 - the library draws from the global state
     bootstrap = state_space_models.Bootstrap(ssm=model, data=data)
     smc = particles.SMC(fk=bootstrap, N=PARTICLES, resampling="systematic", collect=[collectors.Moments()])
@@ -100,7 +100,7 @@ def theirs(model: state_space_models.StateSpaceModel, data: np.ndarray, seed: in
 
 
 def lines(*classes: type) -> int:
-    """Of code and comment, empty ones left out."""
+    """Number of lines of code and comments, without empty ones."""
     return sum(bool(line.strip()) for one in classes for line in inspect.getsource(one).splitlines())
 
 

@@ -1,12 +1,11 @@
-"""Does the filter know how wrong it is? Many simulated runs of both systems, with few and many particles.
+"""Consistency of the filters: NEES over many simulated runs of both systems, with few and many particles.
 
-The normalised error squared of the pose (NEES), the mean over independent recordings, is 1 per degree of freedom for an
-honest filter, and stays in the green band in 95 % of the steps. A filter is over-confident from the step at which it
-leaves the band upwards and does not come back (`left_for_good`). The upper pictures have
-the curves for three numbers of particles. The lower ones have, for the middle number, what each remedy does to the mean
-over all steps: iterating the proposal's linearisation, the exact importance ratio instead of the linearised weight,
-marginalising the frame of the known points instead of sampling the start
-(monocular), or the lack of each.
+The normalised estimation error squared (NEES) of the pose, averaged over independent recordings, is 1 per degree of
+freedom for a consistent filter, and in the green band in 95 % of the steps. A filter is overconfident from the step at
+which it leaves the band upwards for good (`left_for_good`). The upper plots show the curves for three numbers of
+particles. The lower plots show, for the middle number, the effect of each remedy, or of its absence, on the mean over all
+steps: iterating the proposal's linearisation, the exact importance ratio instead of the linearised weight, and
+marginalising the frame of the known points instead of sampling the start (monocular).
 """
 
 from collections.abc import Callable, Sequence
@@ -45,11 +44,11 @@ class Trial:
     Attributes:
         dim: degrees of freedom of the pose, d.
         distances: (T,) errors of the position, m, without alignment.
-        nees: (T,) of the pose; NaN where the filter holds it to be known exactly.
+        nees: (T,) of the pose; NaN where the filter's pose is exact.
         nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
         landmark_nees: (M,) of the landmarks at the end;  landmark_dim: degrees of freedom of one.
-        ancestors: (T,) how many particles of each step still have descendants at the end.
-        coalescence: steps back from the end to the latest ancestor that all particles share; None where there is none.
+        ancestors: (T,) number of particles of each step with descendants at the end.
+        coalescence: steps back from the end to the latest common ancestor of all particles; None without one.
         log_evidence: of the whole run.
     """
 
@@ -67,12 +66,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class RobotTrial:
-    """Range-bearing SLAM in a simulated world; call it with a seed of world and filter.
+    """Range-bearing SLAM in a simulated world; called with a seed of world and filter.
 
     Attributes:
         world: what is simulated.
         config: of the filter.
-        spoil: changes what the filter is given, after the simulation; None changes nothing.
+        spoil: changes the filter's input, after the simulation; None changes nothing.
     """
 
     world: RobotWorld
@@ -103,12 +102,12 @@ class RobotTrial:
 
 @dataclass(frozen=True)
 class DeskTrial:
-    """Monocular SLAM on simulated features; call it with a seed of world and filter.
+    """Monocular SLAM on simulated features; called with a seed of world and filter.
 
     Attributes:
         world: what is simulated.
         config: of the filter.
-        measuring: how it is measured.
+        measuring: settings of the measurements.
     """
 
     world: DeskWorld
@@ -116,7 +115,7 @@ class DeskTrial:
     measuring: Measuring = field(default_factory=Measuring)
 
     def __post_init__(self) -> None:
-        """Errors are told without alignment, which takes known points.
+        """Errors are without alignment, which requires known points.
 
         Raises:
             InputError: there are fewer than four.
@@ -133,7 +132,7 @@ class DeskTrial:
 
 
 def camera_trial(log: FeatureLog, done: Run) -> Trial:
-    """A filtered log whose truth begins where its run does."""
+    """The trial of a filtered log whose ground truth starts with its run."""
     truth, path = done.truth, done.log
     assert truth is not None
     errors = whitened_errors(SE3, path.poses, path.covs, truth.poses)
@@ -161,12 +160,12 @@ def _genealogy(filter_: Filter) -> tuple[np.ndarray, int | None, float]:
 
 
 LAST = 10
-"""Steps that must be left after the step from which on a filter is over-confident, to be able to say so."""
+"""Least number of steps after the start of overconfidence, to assert it."""
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over independent runs, with the standard error of it."""
+    """A mean over independent runs, with its standard error."""
 
     value: float
     error: float
@@ -181,7 +180,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class Consistency:
-    """What R runs of T steps say together.
+    """Consistency of R runs of T steps.
 
     Attributes:
         trials: the runs.
@@ -190,7 +189,7 @@ class Consistency:
     trials: list[Trial]
 
     def __post_init__(self) -> None:
-        """Checks that they belong together.
+        """Checks that the runs are compatible.
 
         Raises:
             InputError: there is none, or they differ in length or dimension.
@@ -206,16 +205,16 @@ class Consistency:
 
     @property
     def mean_nees(self) -> np.ndarray:
-        """(T,) mean over the runs; NaN where the filter holds the pose to be known exactly."""
+        """(T,) mean over the runs; NaN where the filter's pose is exact."""
         return np.mean([trial.nees for trial in self.trials], axis=0)
 
     def band(self, probability: float = 0.95) -> Band:
-        """In which an honest filter's mean NEES of one step lies with a probability."""
+        """Interval of a consistent filter's mean NEES of one step, with a probability."""
         return chi_square_band(self.dim, len(self.trials), probability)
 
     @property
     def overconfident_from(self) -> int | None:
-        """The step from which on the filter is over-confident, by `left_for_good`; None for one that never is."""
+        """The step from which on the filter is overconfident, by `left_for_good`; None if it never is."""
         return left_for_good(self.mean_nees, self.band().high)
 
     @property
@@ -240,7 +239,7 @@ class Consistency:
         return Mean.of([float(np.sqrt(np.square(trial.distances).mean())) for trial in self.trials])
 
     def coverage(self, probability: float) -> Mean:
-        """How often the true pose lies in the credible region of a probability."""
+        """Fraction of true poses in the credible region of a probability."""
         from scipy.stats import chi2
 
         bound = chi2.ppf(probability, self.dim)
@@ -249,11 +248,11 @@ class Consistency:
 
     @property
     def coalescence(self) -> float:
-        """Median of the steps back to the latest common ancestor; infinite where most runs have none."""
+        """Median number of steps back to the latest common ancestor; infinite if most runs have none."""
         return float(np.median([np.inf if t.coalescence is None else t.coalescence for t in self.trials]))
 
     def ancestors(self, age: int) -> float:
-        """Mean number of particles `age` steps before the end that still have descendants at the end."""
+        """Mean number of particles `age` steps before the end with descendants at the end."""
         return float(np.mean([trial.ancestors[max(trial.ancestors.size - 1 - age, 0)] for trial in self.trials]))
 
     def entries(self) -> dict[str, Any]:
@@ -287,18 +286,18 @@ def run_trials(trial: Callable[[int], Trial], seeds: Sequence[int], workers: int
 
 
 def left_for_good(mean_nees: np.ndarray, high: float) -> int | None:
-    """When a mean NEES (T,) leaves its band upwards and does not come back.
+    """The step at which a mean NEES (T,) leaves its band upwards for good.
 
     That is the first step above the band such that, for every later step s, at least half of the steps from it to s
-    are above the band: single steps inside do not end over-confidence, and single ones outside, of which an honest
-    filter has one in forty, do not begin it. It must lie `LAST` steps or more before the end.
+    are above the band: single steps inside do not end overconfidence, and single ones outside, one in forty for a
+    consistent filter, do not begin it. It must be at least `LAST` steps before the end.
 
     Returns:
-        The step; None for a filter that stays inside or comes back.
+        The step; None for a filter that stays inside or returns.
     """
     votes = np.where(np.nan_to_num(mean_nees, nan=0.0) > high, 1, -1)
     total = np.concatenate([[0], np.cumsum(votes)])
-    # the sum of the votes from t to s is total[s + 1] − total[t]; its least over s must not be negative
+    # the sum of the votes from t to s is total[s + 1] − total[t]; its minimum over s must not be negative
     least = np.minimum.accumulate(total[:0:-1])[::-1]
     starts = np.flatnonzero((votes > 0) & (least >= total[:-1]))
     return int(starts[0]) if starts.size and starts[0] <= mean_nees.size - LAST else None
@@ -339,7 +338,7 @@ def desk_trials(frames: int, particles: tuple[int, ...]) -> tuple[Trials, Trials
 
 
 def draw_curves(axes: Any, system: str, found: dict[str, Consistency]) -> None:
-    """Mean NEES per degree of freedom over time."""
+    """Plots the mean NEES per degree of freedom over time."""
     first = next(iter(found.values()))
     band, dim = first.band(), first.dim
     axes.axhspan(band.low / dim, band.high / dim, color="tab:green", alpha=0.25, label="95 % band, honest filter")
@@ -355,7 +354,7 @@ def draw_curves(axes: Any, system: str, found: dict[str, Consistency]) -> None:
 
 
 def draw_remedies(axes: Any, found: dict[str, Consistency]) -> None:
-    """Mean over all steps, with its standard error, for poses and landmarks."""
+    """Plots the mean NEES over all steps, with its standard error, for poses and landmarks."""
     places = np.arange(len(found))[::-1]
     for shift, what, colour in ((0.12, "pose_nees", "tab:blue"), (-0.12, "landmark_nees", "tab:red")):
         means = [getattr(consistency, what) for consistency in found.values()]
@@ -391,12 +390,12 @@ def main(
     """Runs everything and prints the table.
 
     Args:
-        runs: recordings for each number of particles.
-        remedies: recordings for each remedy.
+        runs: number of recordings for each number of particles.
+        remedies: number of recordings for each remedy.
         steps: of each recording.
-        particles: three numbers of them; remedies are tried with the middle one.
+        particles: three numbers of particles; remedies are tried with the middle one.
         workers: processes.
-        out: folder for picture and tables.
+        out: folder for plot and tables.
         quick: few short recordings, few particles.
     """
     if quick:

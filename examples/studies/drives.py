@@ -1,4 +1,4 @@
-"""Drives of a robot on two wheels that goes where it faces: straights, bends, turns on the spot and rests.
+"""Drives of a differential-drive robot: straights, bends, turns on the spot and rests.
 
 Curvature and acceleration are continuous. In a bend of length L through the angle Θ the heading is Θ W(x) at the fraction x
 of its length, with W = 10 x³ - 15 x⁴ + 6 x⁵: the curvature, its first derivative and those of the neighbouring straights,
@@ -15,14 +15,14 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.validation.simulation.paths import eased
 
-KNOTS = 257  #: Of the table that gives the fraction of a bend for the way along it.
-#: Of the Gauss-Legendre rule that integrates a position along a bend: exact to the last digits up to half a turn.
+KNOTS = 257  #: Knots of the table from distance along a bend to its fraction.
+#: Order of the Gauss-Legendre rule for positions along a bend: exact to rounding up to half a turn.
 NODES = 24
 
 
 @dataclass(frozen=True)
 class Move:
-    """A part of a drive: forwards so far, turning to the left by so much, after standing still for so long."""
+    """A part of a drive: distance ahead, turn to the left, and rest before."""
 
     length_m: float = 0.0
     turn_rad: float = 0.0
@@ -31,7 +31,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Travelled:
-    """Where a robot is at T times, elements (T, 3) of SE(2), and how far it drove and turned since the start (T,).
+    """Poses of a robot at T times, elements (T, 3) of SE(2), and its distance and heading since the start (T,).
 
     The heading includes whole turns.
     """
@@ -42,10 +42,10 @@ class Travelled:
 
 
 class Drive:
-    """Carries out moves one after the other in a given time.
+    """Executes moves in sequence in a given time.
 
-    The pace is the length per second of (driven way, arm · heading): the robot slows down in bends and turns on the
-    spot at pace / arm. It stops where it rests, and between driving and turning on the spot.
+    The pace is the rate of the length of (distance, arm · heading): the robot slows down in bends and turns on the
+    spot at pace / arm. It stops for rests, and between driving and turning on the spot.
 
     Attributes:
         waypoints: (M + 1, 3) poses before each move and after the last.
@@ -54,8 +54,8 @@ class Drive:
     def __init__(self, start: np.ndarray, moves: Sequence[Move], seconds: float, arm_m: float, ramp_s: float) -> None:
         """Plans the drive from a pose (3,) world_from_robot.
 
-        `seconds` are for all moves, rests, starts and stops, else an InputError; turning by one radian counts as driving
-        `arm_m`; the pace is reached in `ramp_s`.
+        `seconds` must suffice for all moves, rests, starts and stops, else an InputError is raised; turning by one radian
+        counts as driving `arm_m`; the pace is reached in `ramp_s`.
         """
         self._length = np.array([move.length_m for move in moves])
         self._turn = np.array([move.turn_rad for move in moves])
@@ -64,7 +64,7 @@ class Drive:
         self.waypoints = np.concatenate([np.asarray(start, float)[None], np.zeros((len(moves), 3))])
         for k in range(len(moves)):
             self.waypoints[k + 1] = SE2.compose(self.waypoints[k], self._within(k, np.ones(1))[0])
-        # Legs between two stops: when they start, how far they are, the pace of all.
+        # Legs between two stops: start times, lengths, and the common pace.
         spot, rest = self._length == 0.0, np.array([move.rest_s for move in moves])
         first = np.flatnonzero(np.concatenate([[True], (spot[1:] != spot[:-1]) | (rest[1:] > 0.0)]))
         edges = np.concatenate([[0.0], self._ends])[np.append(first, len(moves))]
@@ -78,8 +78,8 @@ class Drive:
         self._begins = np.cumsum(rest[first] + np.concatenate([[0.0], self._lasts[:-1]]))
 
     def __call__(self, seconds: np.ndarray) -> Travelled:
-        """Where the robot is at times (T,), which lie between 0 and the end."""
-        # Way in units of the pace: a leg ends as it began.
+        """The robot's poses at times (T,) between 0 and the end."""
+        # Distance in units of the pace: a leg ends as it starts.
         seconds = np.asarray(seconds, float)
         leg = np.maximum(np.searchsorted(self._begins, seconds, side="right") - 1, 0)
         time = np.clip(seconds - self._begins[leg], 0.0, self._lasts[leg])
@@ -102,7 +102,7 @@ class Drive:
         return self._turn[move] * np.where(self._length[move] > 0.0, _bent(fraction), fraction)
 
     def _within(self, k: int, fraction: np.ndarray) -> np.ndarray:
-        """Poses (T, 3) at fractions (T,) of move k, seen from its start."""
+        """Poses (T, 3) at fractions (T,) of move k, relative to its start."""
         node, weight = np.polynomial.legendre.leggauss(NODES)
         at = 0.5 * fraction[:, None] * (node + 1.0)
         heading = self._turn[k] * _bent(at)
@@ -112,9 +112,9 @@ class Drive:
 
 
 def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np.ndarray, list[Move]]:
-    """Pose (3,) at the start and moves along a polyline (K, 2) [m] with rounded corners.
+    """Start pose (3,) and moves along a polyline (K, 2) [m] with rounded corners.
 
-    A bend begins `bend_m` before its corner and ends as far behind it: an InputError where a side is too short for that.
+    A bend begins `bend_m` before its corner and ends as far after it. Raises InputError: a side is too short.
     """
     sides = np.diff(np.asarray(corners, float), axis=0)
     length = np.linalg.norm(sides, axis=1)
@@ -136,12 +136,12 @@ def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np
 
 
 def _bent(fraction: np.ndarray) -> np.ndarray:
-    """W: the part of a bend's turn that is done at a fraction of its length."""
+    """W: the fraction of a bend's turn at a fraction of its length."""
     return np.asarray(fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2))
 
 
 def _fraction_by_way(move: Move, arm_m: float) -> Any:
-    """The fraction of a move that is done, as a spline of the way, turning included."""
+    """The fraction of a move as a spline of its distance, turning included."""
     from scipy.interpolate import CubicSpline
 
     fraction = np.linspace(0.0, 1.0, KNOTS)

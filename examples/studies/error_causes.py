@@ -1,14 +1,13 @@
-"""Why is a filter further from the truth than the batch optimum of its measurements? One thing changed at a time.
+"""Causes of a filter's excess error over the batch optimum of its measurements: one change at a time.
 
 `--recording` is a robot's log, `--run` the folder of a finished monocular run; without either a log is simulated. The
 filter runs again on the same measurements: with more particles, another linearisation, other weights; for a camera also
-without the matches that the batch shows to be wrong, with landmarks that start at the batch's depths, with other stated
-noise, and with the focal length and k1 that the batch prefers. The batch starts from the filter and from its own start,
-and, for a robot, is also solved with what had been measured until each instant and no more. What brings the error down
-to the batch's is what kept it up.
+without outliers of the batch, with landmarks initialised at the batch's depths, with other stated noise, and with the
+focal length and k1 of the batch. The batch is initialised by the filter and by its own start, and, for a robot, is also
+solved with only the measurements up to each instant. A change that reduces the error to the batch's reveals the cause.
 
-The table has one row for each change: the position error with it, and its ratio to the batch's; the picture shows the
-errors. A run without ground truth is compared with the batch optimum.
+The table has one row per change: its position error, and the ratio to the batch's; the plot shows the errors. A run
+without ground truth is compared with the batch optimum.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,22 +52,22 @@ ONLINE = "batch of what was measured until then"
 HEADER = ("changed", "error_m", "least_m", "most_m", "ratio")
 
 MANY = 10
-"""Times as many particles."""
+"""Factor on the number of particles."""
 
 WRONG_PX = 3.0
-"""A match farther than this from the reprojection by the batch is a wrong one."""
+"""Reprojection error in the batch beyond which a match is an outlier."""
 
 DEPTH_FRACTION = 0.01
-"""Standard deviation of a depth that is given, as a fraction of it."""
+"""Relative standard deviation of given depths."""
 
 
 @final
 @dataclass(frozen=True)
 class Cause:
-    """Error with one thing changed.
+    """Error with one change.
 
     Attributes:
-        name: of what was changed.
+        name: of the change.
         errors_m: root mean square position error of each seed.
         batch_m: of the batch optimum.
     """
@@ -90,7 +89,7 @@ def robot_causes(
     seeds: Sequence[int],
     on_change: Callable[[str], None] = lambda name: None,
 ) -> list[Cause]:
-    """Of a robot's log, whose associations are known.
+    """Causes for a robot's log with known association.
 
     Raises:
         InputError: the recording is wrong, or has no ground truth.
@@ -135,10 +134,10 @@ def camera_causes(
     alignment: Alignment = "rigid",
     on_change: Callable[[str], None] = lambda name: None,
 ) -> list[Cause]:
-    """Of a finished monocular run, from the files in its folder; the first row is the run itself.
+    """Causes for a finished monocular run, from the files in its folder; the first row is the run itself.
 
     Raises:
-        InputError: the folder is none, or its measurements cannot be adjusted.
+        InputError: the folder is not a run, or its measurements cannot be adjusted.
     """
     record, log = RunFolder.open(folder), read_feature_log(folder)
     path = record.path
@@ -204,13 +203,13 @@ def _proposals(now: ProposalConfig) -> Iterator[tuple[str, ProposalConfig]]:
 
 
 def scaled_noise(log: FeatureLog, factor: float) -> FeatureLog:
-    """The same pixels, with stated standard deviations so many times as large."""
+    """The same pixels, with stated standard deviations multiplied by a factor."""
     frames = [FeatureFrame(f.stamp_ns, f.landmarks, f.z, factor**2 * f.cov_z) for f in log.frames]
     return replace(log, frames=frames)
 
 
 def reprojection_errors(batch: Optimum) -> list[np.ndarray]:
-    """Distance of each match from the reprojection of its landmark, by frame (K,), px; NaN without a landmark."""
+    """Reprojection error of each match by frame (K,), px; NaN without a landmark."""
     assert isinstance(batch.problem, FeatureLog)
     camera, points, out = batch.problem.camera, batch.estimate.landmarks.named(), []
     nowhere = np.full(3, np.nan)
@@ -222,7 +221,7 @@ def reprojection_errors(batch: Optimum) -> list[np.ndarray]:
 
 
 def agreeing_matches(log: FeatureLog, batch: Optimum) -> FeatureLog:
-    """The log without the matches that the batch shows to be wrong."""
+    """The log without outliers of the batch."""
     frames = list(log.frames)
     for t, error in zip(batch.steps.tolist(), reprojection_errors(batch), strict=True):
         frame, kept = frames[t], ~(error > WRONG_PX)
@@ -231,7 +230,7 @@ def agreeing_matches(log: FeatureLog, batch: Optimum) -> FeatureLog:
 
 
 def batch_depths(batch: Optimum) -> dict[int, float]:
-    """Depth of each landmark in the camera that saw it first, by name, m; without those that the batch leaves open."""
+    """Depth of each landmark in its first camera, by name, m; without those undetermined in the batch."""
     assert isinstance(batch.problem, FeatureLog)
     points, depths = batch.estimate.landmarks.named(), dict[int, float]()
     for frame, pose in zip(batch.problem.frames, batch.estimate.world_from_body, strict=True):
@@ -243,24 +242,24 @@ def batch_depths(batch: Optimum) -> dict[int, float]:
 
 @final
 class GivenDepths(Sensor):
-    """A sensor whose landmarks start at depths that are known beforehand.
+    """A sensor whose landmarks are initialised at given depths.
 
     Args:
         features: the sensor.
-        depths: by name, m; others start as usual.
+        depths: by name, m; others are initialised as usual.
     """
 
     def __init__(self, features: FeatureSensor, depths: Mapping[int, float]) -> None:
         self.features, self.depths = features, depths
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
-        """As the sensor does."""
+        """As the sensor."""
         return self.features.observe(frame, belief)
 
     def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """As the sensor does, but each landmark at its own depth."""
+        """As the sensor, but each landmark at its given depth."""
         out = []
         for group in self.features.new_landmarks(frame, belief, observed):
             for k, name in enumerate(group.ids.tolist()):
@@ -307,7 +306,7 @@ def main(
 
 
 def picture(causes: list[Cause]) -> Figure:
-    """The error that remains with each change."""
+    """Plots the remaining error with each change."""
     figure, axes = new_axes("one thing changed at a time", "", "position error [m]")
     errors = [cause.row()[1] for cause in causes]
     axes.barh([cause.name for cause in causes], errors, color=COLOURS["filter"])

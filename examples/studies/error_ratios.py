@@ -1,8 +1,8 @@
-"""How far is the filter from the best that its measurements allow? A table of filter and batch errors.
+"""Errors of filters relative to the batch optimum of their measurements, as a table.
 
-Each recording is filtered with several seeds; GTSAM adjusts the very measurements that each run used. A ratio of 1 is
-perfect, up to 1.5 is the goal. Where recordings lie is told by the environment variable RBPF_DATA; those that are not
-there are passed over. A simulated log and a rendered desk are always in the table.
+Each recording is filtered with several seeds; GTSAM adjusts the same measurements as used in each run. A ratio of 1 is
+optimal, up to 1.5 is the goal. Recordings are in the folder of the environment variable RBPF_DATA; missing ones are
+skipped. A simulated log and a rendered desk are always in the table.
 """
 
 import os
@@ -43,13 +43,13 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 HEADER = ("recording", "particles", "seeds", "filter_m", "least_m", "most_m", "batch_m", "ratio")
-"""Of a table of `ErrorRatio.row`."""
+"""Columns of `ErrorRatio.row`."""
 
 ROBUST = 1.345
-"""Huber's threshold for a camera's batch, which no wrong match may spoil, in standard deviations."""
+"""Huber's threshold for a camera's batch, for robustness to outliers, in standard deviations."""
 
 LEAST = 3
-"""Instants with a true pose that an alignment needs."""
+"""Least number of true poses for an alignment."""
 
 
 @final
@@ -88,7 +88,7 @@ class ErrorRatio:
 
 
 def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
-    """Filters a robot's log with each seed, and solves its batch problem.
+    """Filters a robot's log with each seed, and computes its batch optimum.
 
     Raises:
         InputError: the recording is wrong, or has too little ground truth.
@@ -99,7 +99,7 @@ def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int
 
 
 def camera_ratio(recording: MonoRecording, config: MonoConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
-    """Filters a sequence of images with each seed, and adjusts what each measured in batch.
+    """Filters a sequence of images with each seed, and adjusts the measurements of each in batch.
 
     Raises:
         InputError: the recording is wrong, or has too little ground truth.
@@ -110,7 +110,7 @@ def camera_ratio(recording: MonoRecording, config: MonoConfig, seeds: Sequence[i
 
 
 def stereo_ratio(recording: StereoRecording, config: StereoConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
-    """Filters pairs of images with each seed, and adjusts the pixels that each used.
+    """Filters pairs of images with each seed, and adjusts the pixels used by each.
 
     Raises:
         InputError: the recording is wrong, or has too little ground truth.
@@ -123,16 +123,16 @@ def stereo_ratio(recording: StereoRecording, config: StereoConfig, seeds: Sequen
 def tracks_ratio(
     log: FeatureLog, config: StereoConfig, seeds: Sequence[int] = (0,), start: Array | None = None
 ) -> ErrorRatio:
-    """Filters named pixels of a stereo pair without ground truth, beside the optimum of the same pixels.
+    """Filters named pixels of a stereo pair without ground truth, and compares with the optimum of the same pixels.
 
-    What the optimum is off by is taken from its own covariance: the root b of the mean trace of its positions'. What
-    the filter is off by is then √(b² + d²), d its distance from the optimum (rms).
+    The optimum's error is taken from its covariance: b, the root of the mean trace of its positions' covariances. The
+    filter's error is then √(b² + d²), with d its distance from the optimum (rms).
 
     Args:
         log: the pixels.
         config: of the filter.
         seeds: of it.
-        start: (T, 7) where the batch begins; the filter's path by default.
+        start: (T, 7) initial path of the batch; by default the filter's.
 
     Raises:
         InputError: the log is of one camera, or the batch does not converge.
@@ -153,7 +153,7 @@ def tracks_ratio(
 
 
 def error_of(estimate: PathAndMap, truth: Trajectory, alignment: Alignment) -> float:
-    """Root mean square distance from the truth, at the instants that both have.
+    """Root mean square distance from the truth, at common instants.
 
     Raises:
         InputError: they share none, or too few to align them.
@@ -194,11 +194,11 @@ CAMERAS = "mono_redkitchen_a", "stereo_zed_room1"
 PAIRS = "stereo_zed_room1", "stereo_kitti_seq1"
 TRACKS = "gtsam_stereo_vo"
 RENDERED_PX = 0.25
-"""Noise of a match in rendered images, nearly: told one pixel the filter weighs its measurements too little."""
+"""Approximate noise of a match in rendered images: with one pixel the filter would underweigh its measurements."""
 
 
 def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5) -> dict[str, float]:
-    """Prints the table, and writes it and its picture to a folder; `quick` takes the simulated worlds, made small."""
+    """Prints the table, and writes it and its plot to a folder; `quick` uses small simulated worlds."""
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as folder:
         found = list(simulated(Path(folder), quick, 1 if quick else seeds))
@@ -210,7 +210,7 @@ def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5) -> dict[s
 
 
 def simulated(folder: Path, quick: bool, seeds: int) -> Iterator[ErrorRatio]:
-    """A robot's log and a rendered desk, of which everything is known."""
+    """A simulated robot's log and a rendered desk."""
     simulate_robot(RobotWorld(steps=60 if quick else 200, landmarks=25), folder / "simulated_robot", seed=0)
     yield robot_ratio(folder / "simulated_robot", RangeBearingConfig(map="particles"), range(seeds))
     width, frames = (320, 30) if quick else (640, 300)
@@ -222,7 +222,7 @@ def simulated(folder: Path, quick: bool, seeds: int) -> Iterator[ErrorRatio]:
 
 
 def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
-    """The recordings that are there."""
+    """The available recordings."""
     for name in ROBOTS:
         if (data / name).is_dir():
             yield robot_ratio(data / name, RangeBearingConfig(map="particles"), range(seeds))
@@ -238,7 +238,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
 
 
 def picture(found: list[ErrorRatio]):
-    """Filter and batch side by side, on a logarithmic scale."""
+    """Plots filter and batch side by side, on a logarithmic scale."""
     figure, axes = new_axes("filter beside the batch optimum", "position error [m]", "")
     places = range(len(found))
     names = {"filter": [ratio.row()[3] for ratio in found], "batch": [ratio.row()[6] for ratio in found]}

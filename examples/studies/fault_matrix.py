@@ -1,7 +1,7 @@
-"""What the two visual systems make of damaged input: dropped frames, darkness, blur, wrong calibration, full disks.
+"""Both visual systems with faulty input: dropped frames, darkness, blur, wrong calibration, full disks.
 
-A rendered desk is damaged in every way that `examples.studies.image_faults` and `examples.studies.file_faults` know, and
-run. The tables say what each run said, whether it recovered, and how far off it was; the picture has the errors.
+A rendered desk is damaged in all ways of `examples.studies.image_faults` and `examples.studies.file_faults`, and filtered.
+The tables have each run's messages, whether it recovered, and its errors; the plot shows the errors.
 """
 
 import os
@@ -46,22 +46,22 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 
 NONE = "none"
 RIGHT_M, RIGHT_DEG = 0.03, 2.0
-"""A pose is right when its error exceeds that of the undamaged run by no more than this."""
+"""Largest excess of a correct pose's error over that of the undamaged run."""
 
 END = 10
-"""Frames at the end by whose median error it is judged whether a run is right again."""
+"""Frames at the end whose median error decides whether a run has recovered."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What a run tells of itself.
+    """A run's own report.
 
     Attributes:
-        stamps_ns: (T,) of the frames that were filtered.
+        stamps_ns: (T,) of the filtered frames.
         poses: (T, 7) in the truth's world.
-        lost: (T,) frames in which the run says that it does not see where it is.
-        problems: what it says.
-        failure: why it ended early.
+        lost: (T,) frames of reported tracking loss.
+        problems: its messages.
+        failure: the reason of an early end.
     """
 
     stamps_ns: np.ndarray
@@ -73,18 +73,18 @@ class Told:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A fault and what became of it.
+    """A fault and its outcome.
 
     Attributes:
         system: that ran.
-        fault: what was done to its input.
-        frames: filtered, of those that the damaged sequence has.
-        lost: in so many of them the run says that it does not see where it is.
+        fault: of its input.
+        frames: filtered frames of the damaged sequence.
+        lost: number of frames of reported tracking loss.
         rmse_m: error of the position over all frames.
         last_m: median error of the last frames; NaN where there are none.
         last_deg: of the rotation.
         verdict: "as without", "recovers", "lost", "wrong" (and does not know it), "stopped" or "refused".
-        said: what the run says, each sentence once.
+        said: the run's messages, each once.
     """
 
     system: str
@@ -99,7 +99,7 @@ class Outcome:
 
 
 def usual_faults(rate_hz: float, frames: int) -> dict[str, Fault]:
-    """The faults that the documentation reports, for a recording of about five seconds."""
+    """The faults reported in the documentation, for a recording of about five seconds."""
     second, first = round(rate_hz), 2 * frames // 5
     return {
         "10 % of the frames dropped": drop_frames(0.1),
@@ -124,7 +124,7 @@ def try_mono(
     faults: Mapping[str, Fault],
     name: str = "mono",
 ) -> list[Outcome]:
-    """The monocular system on a sequence with ground truth, undamaged first; no alignment with known points.
+    """Runs the monocular system on a sequence with ground truth, undamaged first; with known points, without alignment.
 
     Raises:
         InputError: the sequence has no ground truth.
@@ -138,7 +138,7 @@ def try_mono(
 
 
 def try_stereo(sequence: ImageSequence, config: StereoConfig, faults: Mapping[str, Fault]) -> list[Outcome]:
-    """The stereo system on a sequence with ground truth, undamaged first; the first true camera is the world.
+    """Runs the stereo system on a sequence with ground truth, undamaged first; the first true camera is the world.
 
     Raises:
         InputError: the sequence has no ground truth.
@@ -166,7 +166,7 @@ def judged(system: str, fault: str, damaged: Any, run: Callable[[Any], Told], cl
         fault: the fault's name.
         damaged: the sequence.
         run: filters it.
-        clean: the outcome without a fault; None where this is it.
+        clean: the outcome without a fault; None if this is that run.
     """
     try:
         told = run(damaged)
@@ -200,7 +200,7 @@ def _verdict(outcome: Outcome, told: Told, clean: Outcome | None) -> str:
 
 
 def summarised(problems: list[str]) -> list[str]:
-    """Each sentence once, without the frames' numbers, and how often it came."""
+    """Each message once, without frame numbers, and its count."""
     counts = Counter(sub(r"^(frame|pair) \d+( of [^:]*)?:? ", "", problem) for problem in problems)
     return [text if count == 1 else f"{text} (x{count})" for text, count in counts.items()]
 
@@ -231,9 +231,9 @@ def main(frames: int = 150, kills: int = 5, out: Path = Path("demo/faults"), qui
 
     Args:
         frames: of the monocular sequence, at 30 Hz; the stereo one has every second of them.
-        kills: how often a run is killed and resumed.
+        kills: number of times that a run is killed and resumed.
         out: folder for recording, tables and picture.
-        quick: a few frames, one fault of images and one kill; what is not killed runs in this process.
+        quick: a few frames, one image fault and one kill; other runs are in this process.
     """
     frames, kills = (16, 1) if quick else (frames, kills)
     desk = out / f"desk_{frames}"
@@ -297,19 +297,19 @@ def of_machine(desk: Path, out: Path, kills: int, quick: bool) -> dict[str, Ende
 
 
 def command(folder: Path, out: Path) -> list[str]:
-    """`rbpf run mono` without what takes long."""
+    """`rbpf run mono` without slow outputs."""
     known = ["--known-points", str(folder / "known_points.csv")]
     return ["run", "mono", str(folder), *known, "--out", str(out), "--particles", "20", "--no-video", "--no-batch"]
 
 
 def same_path(whole: Path, resumed: Path) -> bool:
-    """Whether two runs tell the same path, to the byte."""
+    """Whether two runs have the same path, to the byte."""
     name = "trajectory.tum"
     return (resumed / name).exists() and (whole / name).read_bytes() == (resumed / name).read_bytes()
 
 
 def draw(outcomes: Sequence[Outcome], path: Path) -> None:
-    """The error over the whole run, and at its end, for each fault; coloured by the outcome."""
+    """Plots the error over the whole run and at its end, for each fault; coloured by outcome."""
     systems = dict.fromkeys(outcome.system for outcome in outcomes)
     figure = Figure(figsize=(10.0, 7.0), layout="constrained")
     for axes, system in zip(figure.subplots(len(systems), 1, squeeze=False)[:, 0], systems, strict=True):

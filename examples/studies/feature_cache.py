@@ -1,8 +1,8 @@
-"""Features of a sequence of pairs, measured once and kept in files, to be filtered as often as one likes.
+"""A cache of a stereo sequence's features, to filter them repeatedly.
 
-Decoding and SIFT take most of a pair's time, and depend on no setting of the filter. `cache_features` goes on where it
-was interrupted: what it keeps are chunks of pairs, each a file that appears when it is complete. `filter_cached`
-filters them: a front end of its own, `CachedFrontEnd`, hands the features to the system.
+Decoding and SIFT take most of a pair's time, and do not depend on the filter's settings. `cache_features` continues after
+an interruption: it stores chunks of pairs, each a file that appears once it is complete. `filter_cached` filters them: a
+separate front end, `CachedFrontEnd`, passes the features to the system.
 """
 
 import json
@@ -32,18 +32,18 @@ CHUNK = 100
 """Pairs in a file."""
 
 FEATURES = "z", "cov", "scale", "orientation", "descriptors"
-"""What is kept of them: without images there are no first views."""
+"""Stored fields of the features: without images there are no first views."""
 
 
 @dataclass(frozen=True)
 class CachedPair:
-    """A pair whose features are known.
+    """A pair with cached features.
 
     Attributes:
         stamp_ns: time of the pair.
-        features: None where the pair could not be measured.
-        problem: why not, or what was wrong with it all the same, in words.
-        seconds: that measuring took.
+        features: None if the pair could not be measured.
+        problem: the reason, or another problem of the pair, in words.
+        seconds: time of the measurement.
     """
 
     stamp_ns: int
@@ -55,7 +55,7 @@ class CachedPair:
 @final
 @dataclass(frozen=True)
 class CachedSequence:
-    """The features of a sequence, which are filtered in place of its images.
+    """The features of a sequence, to filter instead of its images.
 
     Attributes:
         name: of the recording.
@@ -88,16 +88,16 @@ class CachedSequence:
 def cache_features(
     sequence: ImageSequence, config: StereoConfig, folder: Path, on_pair: Callable[[int, int], None] | None = None
 ) -> CachedSequence:
-    """Measures what is not in `folder` yet.
+    """Measures the features that are not in `folder` yet.
 
     Args:
         sequence: the recording.
-        config: of which `sift` and `pair` count here; a run over the features needs the same.
-        folder: for the files, created where it does not exist.
-        on_pair: called with the pairs done and their number.
+        config: only `sift` and `pair` matter; a run over the features needs the same.
+        folder: for the files, created if necessary.
+        on_pair: called with the number of pairs done and the total.
 
     Raises:
-        InputError: the folder holds features of another recording or measured otherwise, or a pair is refused.
+        InputError: the folder has features of another recording or of other settings, or a pair is refused.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, sequence, config)
@@ -120,7 +120,7 @@ def cache_features(
 
 
 class CachedFrontEnd(ImageFrontEnd):
-    """Takes pairs whose features are known, in place of images."""
+    """A front end for cached features instead of images."""
 
     takes = CachedPair
 
@@ -134,7 +134,7 @@ class CachedFrontEnd(ImageFrontEnd):
 def filter_cached(
     sequence: CachedSequence, config: StereoConfig, listeners: Iterable[Listener] = ()
 ) -> Run[StereoSlam]:
-    """A sequence whose features are known, filtered to its end."""
+    """Filters a sequence of cached features."""
     system = StereoSlam(sequence.rig, config, front_end=CachedFrontEnd(sequence.rig, config))
     return filter_opened(Opened(system, sequence, sequence.stamps_ns, sequence.truth), listeners)
 
@@ -144,7 +144,7 @@ def _file(folder: Path, first: int) -> Path:
 
 
 def _claim(folder: Path, sequence: ImageSequence, config: StereoConfig) -> None:
-    """Notes whose features these are, or checks that they are the sequence's."""
+    """Records the source of the features, or checks that it is the sequence."""
     stamps = sequence.stamps_ns
     ours = {
         "recording": sequence.name,
@@ -180,7 +180,7 @@ def _read(folder: Path, first: int, rig: RectifiedStereo, stamps_ns: np.ndarray)
     path = _file(folder, first)
     arrays, pairs, at = load_arrays(path), [], 0
     with fitting(path):
-        # The last file of a part of a sequence holds more pairs than the part.
+        # The last file may have more pairs than a part of the sequence.
         entries = (arrays[name].tolist() for name in ("count", "problem", "seconds"))
         for stamp_ns, count, problem, seconds in zip(stamps_ns.tolist(), *entries, strict=False):
             features = None

@@ -1,6 +1,6 @@
-"""Deliberate faults of files and machines: a recording's folder that is damaged, a run that is stopped, a full disk.
+"""Fault injection in files and machines: a damaged recording, a killed run, a full disk.
 
-Folders are those that the image simulator writes (EuRoC ASL).
+Folders are those written by the image simulator (EuRoC ASL).
 """
 
 import os
@@ -19,9 +19,9 @@ LIMITED = (
     "import resource, sys; from rbpf.cli import main; sys.dont_write_bytecode = True; "
     "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2); sys.exit(main(sys.argv[2:]))"
 )
-"""A program whose files cannot grow beyond so many bytes: what writes more gets an error, as on a full disk.
+"""A program with limited file sizes: writing beyond the limit raises an error, as on a full disk.
 
-It writes no bytecode, which would be cut off unnoticed.
+It writes no bytecode, which would be truncated silently.
 """
 
 Damage = Callable[[Path], None]
@@ -29,7 +29,7 @@ Damage = Callable[[Path], None]
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit code, and the last line that it wrote to its error output."""
+    """The end of a command: its exit code, and the last line of its standard error."""
 
     code: int
     said: str
@@ -37,12 +37,12 @@ class Ended:
 
 
 def nan_stamp(folder: Path) -> None:
-    """The time of the fourth image is no number."""
+    """The time of the fourth image is not a number."""
     _edit_line(folder / "mav0" / "cam0" / "data.csv", 4, lambda line: "nan," + line.split(",", 1)[1])
 
 
 def nan_known_point(folder: Path) -> None:
-    """A coordinate of the second known point is no number."""
+    """A coordinate of the second known point is not a number."""
 
     def edit(line: str) -> str:
         cells = line.split(",")
@@ -52,7 +52,7 @@ def nan_known_point(folder: Path) -> None:
 
 
 def nan_calibration(folder: Path) -> None:
-    """A focal length is no number."""
+    """A focal length is not a number."""
     path = folder / "mav0" / "cam0" / "sensor.yaml"
     lines = path.read_text().splitlines(keepends=True)
     row = next(i for i, line in enumerate(lines) if line.startswith("intrinsics"))
@@ -61,22 +61,22 @@ def nan_calibration(folder: Path) -> None:
 
 
 def cut_list(folder: Path) -> None:
-    """The list of images ends inside a line."""
+    """The list of images ends within a line."""
     _cut(folder / "mav0" / "cam0" / "data.csv")
 
 
 def cut_known_points(folder: Path) -> None:
-    """The table of known points ends inside a line."""
+    """The table of known points ends within a line."""
     _cut(folder / "known_points.csv")
 
 
 def cut_image(folder: Path) -> None:
-    """The ninth image ends too early."""
+    """The ninth image is truncated."""
     _cut(sorted((folder / "mav0" / "cam0" / "data").iterdir())[8])
 
 
 def cut_first_image(folder: Path) -> None:
-    """The first image ends too early."""
+    """The first image is truncated."""
     _cut(sorted((folder / "mav0" / "cam0" / "data").iterdir())[0])
 
 
@@ -92,18 +92,18 @@ FILE_FAULTS: dict[str, Damage] = {
 
 
 def damaged_copy(folder: Path, damage: Damage, copy: Path) -> Path:
-    """A copy of a recording with one thing wrong in it."""
+    """A copy of a recording with one fault."""
     shutil.copytree(folder, copy)
     damage(copy)
     return copy
 
 
 def run_command(arguments: Sequence[str], most_bytes: int | None = None) -> Ended:
-    """Runs `rbpf` in a process of its own.
+    """Runs `rbpf` in a separate process.
 
     Args:
         arguments: of the command.
-        most_bytes: size that no file may pass; None is unlimited.
+        most_bytes: maximum file size; None is unlimited.
     """
     program = ["-m", "rbpf"] if most_bytes is None else ["-c", LIMITED, str(most_bytes)]
     done = subprocess.run([sys.executable, *program, *arguments], capture_output=True, text=True, check=False)
@@ -114,14 +114,14 @@ def run_command(arguments: Sequence[str], most_bytes: int | None = None) -> Ende
 def kill_and_resume(
     arguments: Sequence[str], out: Path, kills: int, rng: np.random.Generator, longest_s: float = 2.0
 ) -> Ended:
-    """Kills a run with checkpoints at random moments (SIGKILL), resumes it every time, and lets it end at last.
+    """Kills a run with checkpoints at random times (SIGKILL), resumes it every time, and finally lets it finish.
 
     Args:
         arguments: of the command, with a checkpoint every few frames.
         out: the run's folder.
-        kills: how often.
-        rng: chooses the moments, counted from when the run has written another checkpoint.
-        longest_s: the run is killed at most so long after that.
+        kills: number of kills.
+        rng: draws the times, relative to the run's next checkpoint.
+        longest_s: maximum time after that checkpoint.
     """
     checkpoint = out / "checkpoint.npz"
     for _ in range(kills):

@@ -1,9 +1,8 @@
-"""Landmarks without names: which hypotheses are kept, and which one is right in the end?
+"""Unknown data association: which hypotheses are kept, and which one is right in the end?
 
-A robot leaves a hall, passes two doors of a corridor that look alike, goes round far off with no landmark in view, and comes
-back to one of them, by then unsure of its place by about their distance. Seen alone, the door may be either; what comes next
-decides. Beside it, worlds in the plane with loops: how many readings are taken for another landmark, and is the uncertainty
-still true?
+A robot leaves a hall, passes two similar doors of a corridor, drives a detour without any landmark in view, and returns to
+one of the doors, with a position uncertainty of about their distance. The door alone is ambiguous; later landmarks decide.
+In addition, worlds in the plane with loops: the fraction of wrong associations, and the consistency.
 """
 
 from collections.abc import Sequence
@@ -43,7 +42,7 @@ def corridor(seed: int) -> RobotLog:
     places = np.concatenate([np.arange(0.0, FAR_END, 0.5), np.arange(FAR_END, -0.1, -0.5)])
     frames, path = list[Frame](), list[np.ndarray]()
     for t, place in enumerate(places.tolist()):
-        # Beyond the doors the odometry slips along the corridor.
+        # Beyond the doors the wheels slip along the corridor.
         std = np.array([1e-3, 0.8 if t and min(place, places[t - 1]) > 15.0 else 0.02, 0.01])
         pose, cov = np.array([0.0, place, 0.0]), np.diag(std**2)
         delta = None if not t else SE2.retract(SE2.between(path[-1], pose), std * rng.normal(size=3))
@@ -58,16 +57,16 @@ def corridor(seed: int) -> RobotLog:
 
 @dataclass(frozen=True)
 class Return:
-    """What became of a run in the corridor."""
+    """Result of a run in the corridor."""
 
-    error_m: float  #: of the last pose.
-    kept: float  #: fraction of the steps between the door and what decides in which the right hypothesis was held.
-    rivals: float  #: fraction of them in which a wrong one was held, too.
-    left: int  #: hypotheses at the end.
+    error_m: float  #: error of the last pose.
+    kept: float  #: fraction of the ambiguous steps in which the right hypothesis was kept.
+    rivals: float  #: fraction of them in which a wrong one was kept, too.
+    left: int  #: number of hypotheses at the end.
 
 
 def come_back(seed: int, hypotheses: int = 4) -> Return:
-    """Filters the log of a seed without its names, with so many hypotheses at most."""
+    """Filters a seed's log without names, with a maximum number of hypotheses."""
     log = corridor(seed)
     config = RangeBearingConfig(
         particles=20, seed=seed, association="ml", map="joint", unknown=AssociationConfig(hypotheses=hypotheses)
@@ -88,7 +87,7 @@ def come_back(seed: int, hypotheses: int = 4) -> Return:
 
 
 def wrong_share(run: Run, log: RobotLog) -> float:
-    """Fraction of the readings that were taken for another landmark, for a new one that was known, or for clutter."""
+    """Fraction of wrong associations: with another landmark, as new although known, or as clutter."""
     system = run.system
     assert isinstance(system, RangeBearingSlam) and system.hypotheses is not None
     name_of, known, wrong, count = dict[int, int](), set[int](), 0, 0
@@ -113,7 +112,7 @@ FILTERS = {
 
 
 def in_world(world: RobotWorld, runs: int) -> list[list[str | int | float]]:
-    """A line per filter: the means over logs of seeds 0, 1, …, which are the filter's, too."""
+    """A row per filter: means over logs of seeds 0, 1, …, which are also the filter's."""
     rows = list[list[str | int | float]]()
     for name, config in FILTERS.items():
         found = []
@@ -135,7 +134,7 @@ def in_world(world: RobotWorld, runs: int) -> list[list[str | int | float]]:
 
 
 def recorded(folder: Path, recordings: Sequence[str], seeds: int) -> list[list[str | int | float]]:
-    """A line per recording and filter: mean and spread of the path's error over the seeds, metres."""
+    """A row per recording and filter: mean and spread of the path's error over the seeds, metres."""
     rows = list[list[str | int | float]]()
     for recording in recordings:
         log = open_log(folder / recording)
@@ -164,11 +163,11 @@ def main(
     """Prints the tables, with the fraction of right returns as the result, if there are any.
 
     Args:
-        returns: runs in the corridor, seeds 0, 1, …; none by 0.
-        runs: worlds in the plane, seeds 0, 1, …; none by 0.
+        returns: number of runs in the corridor, with seeds 0, 1, ….
+        runs: number of worlds in the plane, with seeds 0, 1, ….
         steps: of each.
-        recordings: folder of the recorded logs; None leaves them out.
-        seeds: of the filter on each recording, 0, 1, ….
+        recordings: folder of the recorded logs; None skips them.
+        seeds: number of seeds of the filter on each recording, 0, 1, ….
         out: folder for the tables.
         quick: few and short runs.
     """

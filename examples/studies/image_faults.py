@@ -1,9 +1,9 @@
-"""Deliberate faults of cameras: functions from a sequence of images, or of pairs of them, to a damaged sequence.
+"""Fault injection in images: functions from a sequence of images or pairs to a damaged one.
 
     damaged = black_out(60, 30)(open_images("desk"))
 
-Everything else of the sequence stays as it is, its ground truth too. Faults can be applied one after the other, and
-every one of them gives the same bytes whenever and from wherever the sequence is read.
+The rest of the sequence, including ground truth, is unchanged. Faults can be composed, and are deterministic: a sequence
+read again, or from another frame on, gives the same bytes.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,12 +16,12 @@ from rbpf.sensors.readers.part import Chosen
 
 Fault = Callable[[ImageSequence], ImageSequence]
 Paint = Callable[[int, np.ndarray, bool], np.ndarray]
-"""Changes image (H, W) uint8 number t, of the right camera or not."""
+"""Changes image (H, W) uint8 number t, of the left or right camera."""
 
 
 @dataclass(frozen=True)
 class Painted(Source):
-    """Images of another source, changed one by one."""
+    """Images of another source, each changed."""
 
     source: Source
     paint: Paint
@@ -51,12 +51,12 @@ class Unreadable(Source):
 
 
 def keep_every(step: int) -> Fault:
-    """A slower camera: one image of so many."""
+    """A slower camera: every n-th image."""
     return lambda sequence: _chosen(sequence, np.arange(0, len(sequence), step))
 
 
 def drop_frames(fraction: float, seed: int = 0) -> Fault:
-    """Loses a fraction of the images without a trace, never the first one."""
+    """Drops a fraction of the images silently, never the first one."""
 
     def fault(sequence: ImageSequence) -> ImageSequence:
         kept = np.random.default_rng(seed).random(len(sequence)) >= fraction
@@ -78,12 +78,12 @@ def truncate_files(fraction: float, seed: int = 0) -> Fault:
 
 
 def black_out(first: int, count: int) -> Fault:
-    """The light is out: images from number `first` on are black."""
+    """Darkness: images from number `first` on are black."""
     return painted(lambda t, image, _: np.zeros_like(image) if first <= t < first + count else image)
 
 
 def jump_exposure(every: int, least: float = 0.4, most: float = 1.8, seed: int = 0) -> Fault:
-    """The camera's gain jumps every so many images, between these factors; the first images are as they were."""
+    """The camera's gain jumps at regular intervals, between these factors; the first images are unchanged."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
         if t < every:
@@ -95,7 +95,7 @@ def jump_exposure(every: int, least: float = 0.4, most: float = 1.8, seed: int =
 
 
 def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fault:
-    """Smears images along a line of this length, whose direction turns from image to image; never the first one."""
+    """Motion blur along a line of this length, whose direction varies from image to image; never in the first one."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
         if t < max(first, 1) or (count is not None and t >= first + count):
@@ -114,7 +114,7 @@ def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fau
 
 
 def salt_and_pepper(fraction: float, seed: int = 0) -> Fault:
-    """A fraction of the pixels is black or white, others in every image; not in the first one."""
+    """A fraction of the pixels is black or white, different ones in every image; none in the first one."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
         if t == 0:
@@ -129,13 +129,13 @@ def salt_and_pepper(fraction: float, seed: int = 0) -> Fault:
 
 
 def cover_view(fraction: float, first: int, count: int, disparity_px: int = 12, seed: int = 0) -> Fault:
-    """A textured thing as high as the image and a fraction of it wide passes through the view in so many images.
+    """A textured object, as high as the image and a fraction of its width, moves through the view.
 
     Args:
         fraction: of the width.
-        first: image in which it comes in at the left.
-        count: images until it has gone out at the right.
-        disparity_px: how much further left the right camera sees it.
+        first: image in which it enters at the left.
+        count: number of images until it has left at the right.
+        disparity_px: its disparity.
         seed: of its texture.
     """
 
@@ -154,7 +154,7 @@ def cover_view(fraction: float, first: int, count: int, disparity_px: int = 12, 
 
 
 def wrong_focal(factor: float) -> Fault:
-    """The calibration's focal lengths are so many times the right ones."""
+    """The calibration's focal lengths are wrong by a factor."""
 
     def fault(sequence: ImageSequence) -> ImageSequence:
         camera = replace(sequence.camera, fx=factor * sequence.camera.fx, fy=factor * sequence.camera.fy)
@@ -164,7 +164,7 @@ def wrong_focal(factor: float) -> Fault:
 
 
 def jitter_stamps(std_s: float, seed: int = 0) -> Fault:
-    """Stamps with a random error, which stay in order; the first one is right."""
+    """Stamps with random errors, still in order; the first one is exact."""
 
     def fault(sequence: ImageSequence) -> ImageSequence:
         error = 1e9 * std_s * np.random.default_rng(seed).standard_normal(len(sequence))
@@ -176,7 +176,7 @@ def jitter_stamps(std_s: float, seed: int = 0) -> Fault:
 
 
 def painted(paint: Paint) -> Fault:
-    """Any change of single images."""
+    """A fault that changes single images."""
     return lambda sequence: _with_source(sequence, lambda source: Painted(source, paint))
 
 

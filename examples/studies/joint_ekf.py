@@ -1,4 +1,4 @@
-"""A plain joint EKF-SLAM over the same measurements, an independent oracle: one Gaussian of pose and map."""
+"""A plain EKF-SLAM on the same measurements, as an independent reference: one Gaussian of pose and map."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ class Filtered(NamedTuple):
 
 
 def joint_ekf(m: Measurements) -> Filtered:
-    """Predict, update with all known landmarks at once, append new ones; the pose in the right chart."""
+    """Predict, update jointly with all known landmarks, append new ones; the pose in the right chart."""
     space, model, dim = m.space, m.model(), m.space.dim
     pose, points, cov, places = m.start, np.empty((0, m.z.shape[1])), np.zeros((dim, dim)), dict[int, int]()
     path, pose_covs, log_evidence = [], [], 0.0
@@ -40,7 +40,7 @@ def joint_ekf(m: Measurements) -> Filtered:
                 places[int(m.landmarks[row])] = len(points)
                 points, cov = _appended(model, pose, points, cov, m.z[row], m.cov_z[row])
         path.append(pose)
-        pose_covs.append(cov[:dim, :dim].copy())  # a view would keep every step's whole covariance
+        pose_covs.append(cov[:dim, :dim].copy())  # a view would keep every step's full covariance
     blocks = {name: _block(cov, dim, len(m.z[0]), i) for name, i in places.items()}
     landmarks = {name: points[i] for name, i in places.items()}
     return Filtered(np.array(path), np.array(pose_covs), landmarks, blocks, log_evidence)
@@ -67,7 +67,7 @@ def _innovation(model, z, pose, points, at, dim):
 
 
 def _updated(nu, slope, cov, noises):
-    used = np.flatnonzero(slope.any(axis=0))  # of many landmarks, few are in view
+    used = np.flatnonzero(slope.any(axis=0))  # few of many landmarks are in view
     seen = slope[:, used] @ cov[used]
     innovation = seen[:, used] @ slope[:, used].T
     p = noises.shape[-1]

@@ -1,9 +1,9 @@
-"""Does an uncertainty stay true after loops? The joint map beside particles with maps of their own, and beside a joint EKF.
+"""Consistency after loop closure: the joint map compared with per-particle maps and with a joint EKF.
 
-Simulated: a robot drives its loops among landmarks in the plane, and every filter sees the same logs. NEES per degree of
-freedom is 1 for an honest filter; a loop's error persists, so that one run is hardly more than one sample of it: what counts
-is the mean over the runs beside the EKF's, with its standard error. Recorded: logs with a truth, several seeds of the filter.
-Two cameras go round a room twice, beside the batch of the same pixels: landmarks are known, each pixel counts once.
+Simulated: a robot drives loops among landmarks in the plane, and every filter has the same logs. NEES per degree of freedom
+is 1 for a consistent filter; errors persist over a loop, so that one run is hardly more than one sample: the mean over runs
+is compared with the EKF's, with its standard error. Recorded: logs with ground truth, several seeds of the filter. Stereo:
+two laps of a room, compared with the batch of the same pixels: association is known, and each pixel is used once.
 """
 
 import time
@@ -42,7 +42,7 @@ RECORDINGS = ("mrpt_kf_slam_2d", "mrpt_kf_slam_6d", "mrclam6_robot1")
 
 
 def loops(steps: int, std_rotation_deg: float = 0.3) -> RobotWorld:
-    """Two rounds of 50 m in the plane, a dozen landmarks in view; an odometry that loses its heading as told."""
+    """Two laps of 50 m in the plane, a dozen landmarks in view; with a given heading noise of the odometry."""
     return RobotWorld(
         steps=steps, landmarks=100, radius_m=8.0, laps=2.0, extent_m=12.0, max_range_m=4.5, half_field_of_view_deg=180.0,
         std_range_m=0.05, std_angle_deg=1.0, std_translation_m=0.02, std_rotation_deg=std_rotation_deg,
@@ -53,9 +53,9 @@ MANY = RobotWorld(
     steps=1500, landmarks=800, radius_m=20.0, laps=2.0, extent_m=28.0, max_range_m=4.5, half_field_of_view_deg=180.0,
     std_range_m=0.05, std_angle_deg=1.0, std_translation_m=0.02, std_rotation_deg=0.3,
 )  # fmt: skip
-"""Two rounds of 125 m, seen twice: more landmarks than one Gaussian takes quickly."""
+"""Two laps of 125 m: more landmarks than one Gaussian can process quickly."""
 LONG = replace(MANY, steps=20_000, laps=20_000 / 750)
-"""The same ground for so long, of which three hundred landmarks come into view."""
+"""The same area for a long time, with three hundred landmarks coming into view."""
 OF_MANY = {
     **{f"joint map, sub-maps of {n}": replace(JOINT, submap=n) for n in (50, 150)},
     "joint map, one": replace(JOINT, submap=None),
@@ -65,7 +65,7 @@ OF_MANY = {
 
 @dataclass(frozen=True)
 class EkfTrial:
-    """The joint EKF on the logs of a world; call it with a seed."""
+    """The joint EKF on the logs of a world; called with a seed."""
 
     world: RobotWorld
 
@@ -76,7 +76,7 @@ class EkfTrial:
 
 
 def measured_in(log: RobotLog) -> tuple[Measurements, RunTruth]:
-    """What a filter uses of a log with the truth of all its steps, and this."""
+    """A filter's measurements of a log with ground truth at all steps, and the ground truth."""
     done = filter_opened(open_robot_log(log, replace(JOINT, particles=1, window=1)))
     assert log.truth is not None
     truth = truth_at(log.space, log.truth, done.log.stamps_ns, "first frame")
@@ -102,7 +102,7 @@ def of_ekf(log: RobotLog) -> Trial:
 
 
 def of_batch(log: RobotLog) -> float:
-    """How far the path is off that explains all measurements best, rms in metres."""
+    """Position error of the batch optimum, rms in metres."""
     measured, truth = measured_in(log)
     found = solve(measured, marginals=False, incremental=True)
     shift = log.space.translation(found.world_from_body) - log.space.translation(truth.poses)
@@ -124,7 +124,7 @@ def simulated(
 
 
 def rows_of(world: str, found: dict[str, Consistency], beside: str = "joint EKF") -> list[list[str | int | float]]:
-    """A line per filter: evidence and error beside another's of the same run."""
+    """A row per filter: evidence and error relative to another's on the same run."""
     other, rows = found[beside].trials, list[list[str | int | float]]()
     for name, consistency in found.items():
         evidence = [own.log_evidence - its.log_evidence for own, its in zip(consistency.trials, other, strict=True)]
@@ -186,13 +186,13 @@ class RoomRun(NamedTuple):
 
 @dataclass(frozen=True)
 class RoomTrial:
-    """Stereo SLAM on the pixels of a room, 15 points of 0.5 px in a pair, and their batch; call it with a seed."""
+    """Stereo SLAM on the pixels of a room, 15 points of 0.5 px in a pair, and their batch; called with a seed."""
 
     world: RoomWorld
     config: StereoConfig
 
     def __call__(self, seed: int) -> RoomRun:
-        """Simulates, filters, and solves for the optimum."""
+        """Simulates, filters, and computes the batch optimum."""
         measuring = Measuring(
             noise_px=0.5, measurements=15, known=0, new_per_frame=15, nearest_m=0.5, farthest_m=7.0, dropout=0.0,
             turnover=0.0, occlusion=False,
@@ -214,7 +214,7 @@ class RoomTrial:
 
 
 def rooms(world: RoomWorld, runs: int, workers: int) -> list[list[str | int | float]]:
-    """A line per filter: means over the runs."""
+    """A row per filter: means over the runs."""
     rows = list[list[str | int | float]]()
     for name, config in STEREO_FILTERS.items():
         found = in_parallel(RoomTrial(world, config), range(runs), workers)
@@ -230,7 +230,7 @@ def rooms(world: RoomWorld, runs: int, workers: int) -> list[list[str | int | fl
 
 
 def draw(found: dict[str, Consistency], out: Path) -> None:
-    """The mean NEES over time, of all filters."""
+    """Plots the mean NEES of all filters over time."""
     figure = Figure(figsize=(9.0, 5.0), layout="constrained")
     axes = figure.subplots()
     first = next(iter(found.values()))
@@ -259,21 +259,21 @@ def main(
     out: Path = Path("demo/joint_map"),
     quick: bool = False,
 ) -> dict[str, float]:
-    """Prints the tables, with the mean NEES of every filter's poses as the result, and how its map errs beside the batch's.
+    """Prints the tables; returns the mean NEES of every filter's poses, and the error of its map relative to the batch's.
 
     Args:
-        runs: simulated logs of a robot, seeds 0, 1, …; none by 0.
+        runs: number of simulated logs of a robot, with seeds 0, 1, ….
         steps: of each.
-        particles: numbers of them.
+        particles: numbers of particles.
         windows: of the joint map.
-        many_runs: logs with 800 landmarks, seeds 0, 1, …, beside one Gaussian of all; each takes minutes.
-        recordings: folder of the recorded logs; None leaves them out.
-        seeds: of the filter on each recording, 0, 1, ….
-        long_runs: logs of 20,000 steps among 300 landmarks, seeds 0, 1, …; each takes ten minutes.
-        room_runs: two cameras in a room, seeds 0, 1, …; none by 0.
+        many_runs: number of logs with 800 landmarks, compared with one Gaussian of all; each takes minutes.
+        recordings: folder of the recorded logs; None skips them.
+        seeds: number of seeds of the filter on each recording, 0, 1, ….
+        long_runs: number of logs of 20,000 steps among 300 landmarks; each takes ten minutes.
+        room_runs: number of stereo runs in a room, with seeds 0, 1, ….
         frames: of each.
         workers: processes.
-        out: folder for picture and tables.
+        out: folder for plot and tables.
         quick: one short log and few particles.
     """
     if quick:

@@ -1,8 +1,8 @@
-"""A laboratory, to take pictures of from a robot with a stereo camera (S05 §V).
+"""A simulated laboratory for a robot with a stereo camera (S05 §V).
 
-Its plan: two rooms of 18 m × 10 m together, a door between them, and the ways of a robot through them. Its furniture:
+Its plan: two rooms of 18 m × 10 m together, a door between them, and a robot's drives through them. Its furniture:
 shelves, tables, cabinets and cartons along the walls, tables in the middle, posters; all boxes are parallel to the walls,
-so that what is hidden is known exactly.
+so that occlusion is exact.
 
 The world's z axis points up; x runs along the longer side from the corner of the first room, the floor is z = 0.
 
@@ -28,24 +28,24 @@ from rbpf.validation.simulation.laser import WheelOdometer
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
 from rbpf.validation.simulation.textures import Paint
 
-SIZE_M = 18.0, 10.0, 2.8  #: Of both rooms together.
-PARTITION_M = 9.9, 10.1  #: Where the wall between the rooms begins and ends along x.
-DOOR_M, LINTEL_M = (4.2, 5.8), 2.1  #: Where the door begins and ends along y, and its height.
-JAMB_M = 0.3  #: Nothing stands nearer to the door than this.
-#: The walls along y stay free so far from the rooms' corners, where the furniture of the others stands.
+SIZE_M = 18.0, 10.0, 2.8  #: Size of both rooms together.
+PARTITION_M = 9.9, 10.1  #: Extent along x of the wall between the rooms.
+DOOR_M, LINTEL_M = (4.2, 5.8), 2.1  #: Extent of the door along y, and its height.
+JAMB_M = 0.3  #: Clearance around the door.
+#: Clearance of the walls along y from the rooms' corners, for the furniture of the other walls.
 CORNER_M = 0.95
-BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0  #: How the robot drives: see `Drive`.
+BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0  #: Parameters of the drive, see `Drive`.
 TOUR_FRAMES, TURN_BACK_FRAMES = 4000, 600
 RATE_HZ = 15.0
-AWAY_DEG, AWAY_S = 140.0, 5.0  #: The robot looks away by this angle and for this time.
+AWAY_DEG, AWAY_S = 140.0, 5.0  #: Angle and time for which the robot turns away.
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall that furniture stands against.
+    """A wall with furniture along it.
 
-    It runs along an axis, 0 for x and 1 for y, at a coordinate of the other one, along which +1 or -1 leads into the room;
-    something may stand in the intervals `free_m` (K, 2) along it.
+    It is parallel to an axis, 0 for x and 1 for y, at a coordinate of the other one, along which +1 or -1 is into the
+    room; furniture may stand in the intervals `free_m` (K, 2) along it.
     """
 
     axis: int
@@ -62,7 +62,7 @@ class Wall:
         return corners
 
     def sheet(self, along: Sequence[float], deep: float, high: Sequence[float]) -> tuple[Array, Array, Array]:
-        """Corner, across and down of a sheet that hangs parallel to the wall and faces the room."""
+        """Corner, across and down of a sheet parallel to the wall that faces the room."""
         left, right = along if self.inwards == (1 if self.axis else -1) else along[::-1]
         corner, across = np.zeros(3), np.zeros(3)
         corner[[self.axis, 1 - self.axis, 2]] = left, self.at_m + self.inwards * deep, high[1]
@@ -88,11 +88,11 @@ def walls() -> list[Wall]:
     ]
 
 
-#: (2, 2, 2) where tables stand in the middle of the rooms, least and greatest x and y.
+#: (2, 2, 2) least and greatest x and y of the tables in the middle of the rooms.
 ISLANDS = np.array([[[3.9, 3.8], [5.7, 6.2]], [[13.4, 4.0], [14.8, 6.0]]])
 
-#: Once round the first room, half a round again, through the door and round the second room, back through the door and
-#: half round the first room the other way.
+#: One and a half laps of the first room, through the door, a lap of the second room, back through the door, and half a
+#: lap of the first room in the opposite direction.
 TOUR = [
     *[(2.0, 5.0), (2.0, 2.1), (7.6, 2.1), (7.6, 7.9), (2.0, 7.9)],
     *[(2.0, 5.0), (2.0, 2.1), (7.6, 2.1), (7.6, 5.0)],
@@ -116,16 +116,16 @@ def turn_back() -> Drive:
     return Drive(np.array([0.0, 1.6, 2.1]), moves, (TURN_BACK_FRAMES - 1) / RATE_HZ, ARM_M, RAMP_S)
 
 
-ABOVE_M = 0.9  #: What hangs higher than this is seen from below as well.
-TOUCHING_M = 0.002  #: Faces nearer to a wall than this are not seen.
-#: Thickness of a shelf's boards, of a table's top, of its legs, and of what things lean against.
+ABOVE_M = 0.9  #: Height above which sheets are also visible from below.
+TOUCHING_M = 0.002  #: Faces nearer to a wall than this are invisible.
+#: Thickness of a shelf's boards, of a tabletop, of its legs, and of backboards.
 BOARD_M, TOP_M, LEG_M, BACK_M = 0.025, 0.04, 0.05, 0.01
 TABLE_M = 0.74
-HANG_M = 0.01  #: Posters are this far from what they hang on.
+HANG_M = 0.01  #: Distance of posters from their background.
 
 
 class Surface(NamedTuple):
-    """A flat parallelogram that can be seen, as `Rectangle` has it, and the paint of its texture."""
+    """A visible parallelogram, as in `Rectangle`, and the paint of its texture."""
 
     corner: np.ndarray
     across: np.ndarray
@@ -135,14 +135,14 @@ class Surface(NamedTuple):
 
 @dataclass
 class Furnishing:
-    """Collects what stands and hangs in the laboratory: opaque boxes, and what can be seen of them, and posters."""
+    """Collects the objects of the laboratory: opaque boxes with their visible faces, and posters."""
 
     rng: np.random.Generator
-    blocks: list[np.ndarray] = field(default_factory=list)  #: (2, 3) least and greatest corner of each.
+    blocks: list[np.ndarray] = field(default_factory=list)  #: (2, 3) least and greatest corner of each box.
     surfaces: list[Surface] = field(default_factory=list)
 
     def add(self, box: np.ndarray, side: Paint, top: Paint) -> None:
-        """A box (2, 3): sides, top and, high above the floor, bottom, seen from without; not those that touch a wall."""
+        """Adds a box (2, 3): sides, top and, high above the floor, bottom, facing outwards; except faces that touch a wall."""
         self.blocks.append(box)
         (x0, y0, z0), (x1, y1, z1) = box
         up = np.array([0.0, 0.0, z1 - z0])
@@ -157,7 +157,7 @@ class Furnishing:
             self.surfaces.append(Surface(ring[0] - up, ring[1] - ring[0], ring[3] - ring[0], side))
 
     def hang(self, wall: Wall, middle: float, high: float, size: tuple[float, float], deep: float = 0.0) -> None:
-        """A print (wide, high) so far before a wall, its middle at a place along it and above the floor."""
+        """Adds a poster (width, height) `deep` in front of a wall, centred at `middle` along it and `high` above the floor."""
         paint = textures.picture if self.rng.random() < 0.7 else textures.page
         wide, tall = 0.5 * size[0], 0.5 * size[1]
         sheet = wall.sheet((middle - wide, middle + wide), deep + HANG_M, (high - tall, high + tall))
@@ -182,7 +182,7 @@ def furnished(rng: np.random.Generator) -> Furnishing:
 
 
 def shell() -> list[tuple[Surface, float]]:
-    """Outer walls, floors and ceiling, each with the size of its texels as a multiple of the others'."""
+    """Outer walls, floors and ceiling, each with the factor on its texel size."""
     length, width, height = SIZE_M
     ring = np.array([[0.0, width], [length, width], [length, 0.0], [0.0, 0.0]])
     corners, sides = np.c_[ring, np.full(4, height)], np.c_[np.roll(ring, -1, axis=0) - ring, np.zeros(4)]
@@ -196,7 +196,7 @@ def shell() -> list[tuple[Surface, float]]:
 
 
 def _along(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
-    """Fills an interval along a wall, piece by piece."""
+    """Fills an interval along a wall with furniture."""
     kinds = _shelf, _table, _cabinet, _cartons
     place, last = start + lab.uniform(0.0, 0.3), -1
     while True:
@@ -212,7 +212,7 @@ WIDTHS_M = (0.9, 1.5), (1.2, 1.8), (0.6, 1.0), (0.5, 1.1)  #: Of a shelf, a tabl
 
 
 def _shelf(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
-    """Two uprights, a back, boards, and what stands on them."""
+    """Two uprights, a back, boards, and objects on them."""
     deep, high = lab.uniform(0.35, 0.45), lab.uniform(1.6, 2.1)
     for left in (start, end - BOARD_M):
         lab.add(wall.box((left, left + BOARD_M), (0.0, deep), (0.0, high)), textures.wood, textures.wood)
@@ -225,7 +225,7 @@ def _shelf(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
 
 
 def spines(shape: textures.Shape, rng: np.random.Generator) -> np.ndarray:
-    """Backs of books that stand side by side, each with bands and a title."""
+    """Spines of books side by side, each with bands and a title."""
     row = textures.grey_levels(60.0 + 6.0 * textures.clouds(shape, rng))
     column = 0
     while column < shape[1]:
@@ -254,7 +254,7 @@ def _row(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, l
 
 
 def _table(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
-    """A table with things on it, perhaps a carton below, and a poster above."""
+    """A table with objects on it, perhaps a carton below, and a poster above."""
     deep = lab.uniform(0.6, 0.8)
     _desk(lab, wall, (start, end), (0.0, deep))
     if lab.rng.random() < 0.5:
@@ -266,7 +266,7 @@ def _table(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
 
 
 def _desk(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: tuple[float, float], rows: int = 1) -> None:
-    """A table's top, legs, and rows of things on it."""
+    """A tabletop, legs, and rows of objects on it."""
     lab.add(wall.box(along, deep, (TABLE_M - TOP_M, TABLE_M)), textures.wood, textures.wood)
     for left in (along[0], along[1] - LEG_M):
         for back in (deep[0], deep[1] - LEG_M):
@@ -293,7 +293,7 @@ def _cabinet(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
 
 
 def _cartons(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
-    """A heap of cartons, each smaller than that below, and a poster above."""
+    """A stack of cartons, each smaller than the one below, and a poster above."""
     low, deep = 0.0, lab.uniform(0.4, 0.6)
     while low < 1.2:
         high = low + lab.uniform(0.25, 0.5)
@@ -306,7 +306,7 @@ def _cartons(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
 
 
 def _poster(lab: Furnishing, wall: Wall, start: float, end: float, high: float) -> None:
-    """A print on a wall, somewhere between two places, and a smaller one above it."""
+    """A poster on a wall, at random between two positions, and a smaller one above it."""
     wide = lab.uniform(0.6, 0.95) * (end - start)
     middle = lab.uniform(start + 0.5 * wide, end - 0.5 * wide)
     lab.hang(wall, middle, high, (wide, lab.uniform(0.35, 0.7)))
@@ -314,7 +314,7 @@ def _poster(lab: Furnishing, wall: Wall, start: float, end: float, high: float) 
 
 
 def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
-    """Two tables back to back, things on both, and a board with posters between them."""
+    """Two tables back to back with objects, and a board with posters between them."""
     middle = 0.5 * float(low[0] + high[0])
     along = float(low[1]), float(high[1])
     board = 0.5 * BACK_M
@@ -328,20 +328,20 @@ def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
             lab.hang(side, place, 1.22, size)
 
 
-#: (7,) the left camera looks forwards, 1 m above the floor, from a little before and to the left of the wheels' middle;
-#: the robot's frame has x forwards, y to the left, z up, its origin between the wheels on the floor.
+#: (7,) the left camera faces forwards, 1 m above the floor, slightly ahead and to the left of the wheels' centre; the
+#: robot's frame has x forwards, y to the left, z up, and its origin between the wheels on the floor.
 ROBOT_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.06], [0.0, -1.0, 0.0, 1.0]]))
 
 
 @dataclass(frozen=True)
 class LabDrive:
-    """How a robot drives through the laboratory."""
+    """A robot's drive through the laboratory."""
 
     #: "tour" through both rooms and back, 4,000 frames over 67.9 m; or "turn_back", 600 frames, on which the robot
     #: twice looks away for 5 s and back.
     trajectory: Literal["tour", "turn_back"] = "tour"
-    frames: Annotated[int | None, Range(ge=2, le=MOST)] = None  #: most images; None for all.
-    every: Count = 1  #: only each so many-th frame of the trajectory becomes an image.
+    frames: Annotated[int | None, Range(ge=2, le=MOST)] = None  #: maximum number of images; None for all.
+    every: Count = 1  #: every n-th frame of the trajectory becomes an image.
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -377,14 +377,14 @@ def world_from_camera(world_from_robot: np.ndarray) -> np.ndarray:
 class TexturedLab(Ranged):
     """Two rooms of 18 m × 10 m together, with shelves, tables, cabinets, cartons and posters."""
 
-    drive: LabDrive = LabDrive()  #: of the robot that carries the camera.
-    texel_m: Positive = 0.003  #: side of a texel; of floors twice, of the ceiling four times as much.
+    drive: LabDrive = LabDrive()  #: drive of the robot with the camera.
+    texel_m: Positive = 0.003  #: side of a texel; twice this for floors, four times for the ceiling.
     contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
-        """Draws the furniture and the textures; the drive is always the same.
+        """Draws the furniture and the textures; the drive is fixed.
 
-        A shorter drive leaves all that is drawn as it is.
+        A shorter drive does not change the random draws.
         """
         lab = furnished(rng)
         rectangles = []
@@ -397,7 +397,7 @@ class TexturedLab(Ranged):
         return TexturedScene("lab", stamps_ns(int(images[-1]) + 1, RATE_HZ)[images], path, rectangles)
 
     def wheels(self, seed: int) -> WheelOdometry:
-        """What the wheels say in every frame of the trajectory, whether that becomes an image or not."""
+        """Wheel odometry at every frame of the trajectory, also those without an image."""
         slip, travelled = np.random.default_rng(seed).spawn(1)[0], self.drive.travelled()
         stamps = stamps_ns(len(travelled.way_m), RATE_HZ)
         return WheelOdometry(
@@ -407,26 +407,26 @@ class TexturedLab(Ranged):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderLab(RenderOptions):
-    """What is rendered."""
+    """Options of rendering."""
 
     focal_fraction = 0.78125
     #: a tour of 4,000 images over 68 m through both rooms and back, or 600 images on which the robot twice looks away
     #: for 5 s and back.
     trajectory: Literal["tour", "turn_back"] = "tour"
-    frames: WholeCount = None  #: only so many images, the first; by default all.
-    every: Count = 1  #: only each so many-th frame becomes an image.
+    frames: WholeCount = None  #: number of images, the first ones; by default all.
+    every: Count = 1  #: every n-th frame becomes an image.
     focal_px: RealPositive = None  #: focal length, px; by default 0.78125 of the width, 500 px at 640.
-    #: of a second camera to the right, m; None or nothing for none.
+    #: baseline to a second camera on the right, m; None for none.
     baseline_m: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = 0.12
-    noise_std: NotNegative = 8.0  #: of the sensor, grey levels.
-    blur_s: NotNegative = 0.0  #: the shutter is open this long, s.
-    exposure_drift: Fraction = 0.0  #: greatest change of the exposure, as a fraction.
-    vignetting: Fraction = 0.0  #: fraction of the light that is missing in the corners.
-    texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are drawn sooner.
+    noise_std: NotNegative = 8.0  #: standard deviation of the sensor noise, grey levels.
+    blur_s: NotNegative = 0.0  #: exposure time, s.
+    exposure_drift: Fraction = 0.0  #: largest relative change of the exposure.
+    vignetting: Fraction = 0.0  #: relative loss of light in the corners.
+    texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003  #: side of a texel, m; larger ones are faster to draw.
 
 
 def simulate_lab(options: Annotated[RenderLab, tyro.conf.arg(name="")]) -> None:
-    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
+    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and wheel odometry."""
     check_ranges(options)
     drive = LabDrive(options.trajectory, options.frames, options.every)
     world = TexturedLab(drive, options.texel_m, options.contrast)

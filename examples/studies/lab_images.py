@@ -1,6 +1,6 @@
-"""Are the images of the simulated laboratory as hard as real ones? SIFT features counted, matched and measured in both.
+"""Realism of the simulated laboratory's images: numbers, matches and noise of SIFT features, compared with recordings.
 
-Beside the table there are a plan of the laboratory with the robot's way, and a few of its views.
+In addition to the table, it plots a plan of the laboratory with the robot's path, and a few of its views.
 """
 
 import csv
@@ -26,15 +26,15 @@ import matplotlib.pyplot as plt
 
 BASELINE_M = 0.12
 RATIO = 0.8
-"""A match is kept if the second best is farther by this (D. Lowe 2004)."""
+"""Threshold of the ratio test (D. Lowe 2004)."""
 
 ROWS_PX, EPIPOLAR_PX = 3.0, 1.5
-"""Greatest difference of rows between the two cameras, and distance from an epipolar line between two times."""
+"""Largest row difference between the two cameras, and largest epipolar distance between two times."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Left and right image, the next left one, and the disparities [px] in the left one where they are known."""
+    """Left and right image, the next left one, and the disparities [px] in the left one, if known."""
 
     left: np.ndarray
     right: np.ndarray
@@ -68,7 +68,7 @@ def recorded(folder: Path, moments: int) -> Iterator[Moment]:
 
 
 class Sift:
-    """Features of images, and which of them look alike."""
+    """Features of images and their matches."""
 
     def __init__(self) -> None:
         self._sift, self._matcher = cv2.SIFT.create(nfeatures=0), cv2.BFMatcher()
@@ -79,19 +79,19 @@ class Sift:
         return np.array([point.pt for point in found]), descriptors
 
     def matches(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of descriptors that look alike, in both."""
+        """Rows of matching descriptors in both."""
         pairs = [pair for pair in self._matcher.knnMatch(a, b, k=2) if len(pair) == 2]
         kept = [best for best, second in pairs if best.distance < RATIO * second.distance]
         return np.array([m.queryIdx for m in kept], int), np.array([m.trainIdx for m in kept], int)
 
 
 def robust_std(values: np.ndarray) -> float:
-    """Of a normal distribution with the same median deviation."""
+    """Standard deviation of a normal distribution with the same median absolute deviation."""
     return float(1.4826 * np.median(np.abs(values - np.median(values)))) if values.size else np.nan
 
 
 def smooth_part(px: np.ndarray, disparity: np.ndarray, rows: np.ndarray, width: int) -> np.ndarray:
-    """What a calibration that is slightly wrong adds to the rows (K,): a fit over the image, outliers left out."""
+    """Row offsets (K,) due to small calibration errors: a fit over the image, without outliers."""
     u, v = (px / width - 0.5).T
     d = disparity / width
     design = np.stack([np.ones_like(u), u, v, d, u * v, v * d], axis=-1)
@@ -140,7 +140,7 @@ def statistics(moments: Iterable[Moment]) -> dict[str, float]:
 
 
 def draw_plan(file: Path, seed: int) -> None:
-    """What stands in the laboratory, from above, and both drives."""
+    """Plots the laboratory from above, and both drives."""
     figure, axes = plt.subplots(figsize=(9.0, 5.6), layout="constrained")
     for low, high in furnished(np.random.default_rng(seed)).blocks:
         grey = 0.3 + 0.5 * min(low[2] / 2.0, 1.0)
@@ -169,7 +169,7 @@ def main(
     Args:
         beside: recordings of a stereo camera to compare with.
         noise_std: of the simulated sensor, grey levels, one row each.
-        moments: how many pairs of images, spread over each sequence.
+        moments: number of image pairs, spread over each sequence.
         seed: of the laboratory.
         out: folder for the table and the pictures.
         quick: few small images.

@@ -1,17 +1,16 @@
-"""Does the camera find its way back after the light was out? Many blackouts of a run, one at a time.
+"""Relocalisation after darkness: many blackouts of a run, one at a time.
 
-Each sequence is filtered once, undisturbed, with checkpoints at even distances. From each checkpoint the run is
-continued once more, with a second of black images while the camera moves on, until it is tracked again or three seconds
-of light have passed. The pose is judged against the truth a second after the camera was found: a blackout is recovered
-from *rightly* within two seconds, rightly but late, *wrongly* (more than 10 cm or 3° worse than the undisturbed run in
-the same frame), or not.
+Each sequence is filtered once, undisturbed, with checkpoints at equal intervals. From each checkpoint the run is
+continued again, with a second of black images while the camera moves on, until it is tracked again or three seconds of
+light have passed. The pose is compared with the ground truth a second after relocalisation: a recovery is *right* within
+two seconds, right but late, *wrong* (more than 10 cm or 3° worse than the undisturbed run in the same frame), or missing.
 
-The first table has a line per sequence, the second one per failure, with how far recognition came: the landmarks in
-view from where the camera truly is, the most corners that were like a landmark and like nothing else, and the most of
-them that one pose explained. `blackouts.csv` has all. Where the light comes back on a place that the map does not know,
-nothing can be recognised: blackouts with fewer than `LEAST_VISIBLE` landmarks in view are counted apart.
+The first table has a row per sequence, the second one per failure, with the progress of relocalisation: landmarks in
+view from the true pose, the largest number of unambiguous matches of corners with landmarks, and of inliers of a pose.
+`blackouts.csv` has all. Unmapped surroundings cannot be recognised: blackouts with fewer than `LEAST_VISIBLE` landmarks
+in view are counted separately.
 
-Without sequences a desk and a room are rendered. Sequences without ground truth are judged against the undisturbed run.
+Without sequences a desk and a room are rendered. Sequences without ground truth are compared with the undisturbed run.
 """
 
 import shutil
@@ -41,24 +40,24 @@ from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
 SETTLED_S = 1.0
-"""The pose is judged when the camera has been tracked again for so long."""
+"""Time of tracking after which the pose is evaluated."""
 
 RIGHT_M, RIGHT_DEG = 0.1, 3.0
-"""A pose is right when its error exceeds that of the undisturbed run in the same frame by no more than this."""
+"""Largest excess of a right pose's error over that of the undisturbed run in the same frame."""
 
 Verdict = Literal["rightly", "late", "wrongly", "not"]
 
 
 @dataclass(frozen=True)
 class Blackouts:
-    """What is done to a sequence.
+    """The blackouts of a sequence.
 
     Attributes:
         folder: of the sequence.
         config: of the filter.
-        count: of blackouts, at even distances; fewer where there are not so many frames.
-        first_s: the first one is not before this.
-        dark_s: how long the light is out.
+        count: number of blackouts, at equal intervals; fewer if there are too few frames.
+        first_s: earliest time of the first one.
+        dark_s: duration of darkness.
         within_s: how soon the camera must be found.
     """
 
@@ -72,16 +71,16 @@ class Blackouts:
 
 @dataclass(frozen=True)
 class Outcome:
-    """After a blackout; T frames from the one before it on.
+    """The outcome of a blackout; T frames from the one before it on.
 
     Attributes:
-        dark: frames without light.
-        found: frame from which on the camera was not lost again, −1 where there is none.
-        visible: landmarks of known depth in view when the light came back.
+        dark: number of dark frames.
+        found: frame from which on the camera was not lost again; −1 for none.
+        visible: landmarks of known depth in view at the end of darkness.
         errors_m: (T,) of the position.
         errors_deg: (T,) of the rotation.
-        seconds_lost: median time of a frame with light in which it was still lost; NaN without one.
-        attempts: to recognise the place, in the frames with light in which it was lost.
+        seconds_lost: median time of a bright frame in which it was still lost; NaN without one.
+        attempts: at relocalisation, in the bright frames in which it was lost.
     """
 
     dark: range
@@ -101,8 +100,8 @@ class Series:
         name: of the sequence.
         rate_hz: of its images.
         within_s: how soon the camera must be found.
-        outcomes: one for each blackout.
-        way_m: (B,) how far the camera went in the dark.
+        outcomes: one per blackout.
+        way_m: (B,) the camera's distance in the dark.
         usual_m: (T,) error of the undisturbed run's position, all frames.
         usual_deg: (T,) of its rotation.
     """
@@ -116,22 +115,22 @@ class Series:
     usual_deg: np.ndarray
 
     def seconds(self, outcome: Outcome) -> float:
-        """From the first image with light to being found; infinite where it was not."""
+        """From the first bright image to relocalisation; infinite without it."""
         return (outcome.found - outcome.dark.stop) / self.rate_hz if outcome.found >= 0 else np.inf
 
     def judged(self, outcome: Outcome) -> int:
-        """The frame in which the pose is judged: when the camera has been tracked again for a while, or the last."""
+        """The frame in which the pose is evaluated: after some tracking, or the last."""
         last = outcome.dark.start - 2 + outcome.errors_m.size
         settled = max(outcome.found, outcome.dark.stop) + round(SETTLED_S * self.rate_hz)
         return min(settled, last)
 
     def error(self, outcome: Outcome) -> tuple[float, float]:
-        """Of the pose that is judged, m and degrees."""
+        """Error of the evaluated pose, m and degrees."""
         row = self.judged(outcome) - outcome.dark.start + 1
         return float(outcome.errors_m[row]), float(outcome.errors_deg[row])
 
     def verdict(self, outcome: Outcome) -> Verdict:
-        """Found rightly in time, rightly but late, at a wrong pose, or not."""
+        """Relocalised in time, late, at a wrong pose, or not."""
         if outcome.found < 0:
             return "not"
         frame, (metres, degrees) = self.judged(outcome), self.error(outcome)
@@ -155,10 +154,10 @@ class Job:
         folder: of the sequence.
         config: of the filter.
         checkpoint: of the undisturbed run, just before.
-        dark: frames without light.
-        end: no frame from here on is looked at.
-        settled: frames of tracking after which it ends early.
-        reference: (T, 7) what counts as the true poses.
+        dark: number of dark frames.
+        end: frames from here on are not processed.
+        settled: frames of tracking after which the run ends early.
+        reference: (T, 7) poses taken as true.
     """
 
     folder: Path
@@ -192,7 +191,7 @@ class _EnoughError(Exception):
 
 
 class _Watch:
-    """Follows one run after the light went out."""
+    """Monitors one run from the start of darkness."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -202,7 +201,7 @@ class _Watch:
         self.attempts: list[Attempt] = []
 
     def __call__(self, run: Run, _: Tracked) -> None:
-        """After a frame."""
+        """Called after a frame."""
         t = len(run.log) - 1
         job, self.run, self.done = self.job, run, t + 1
         if t == job.dark.stop - 1:
@@ -217,10 +216,10 @@ class _Watch:
 
 
 def black_out(job: Job) -> Outcome:
-    """Continues from the checkpoint, in the dark at first."""
+    """Continues from the checkpoint, first in the dark."""
     sequence, watch = open_images(job.folder), _Watch(job)
     dark = replace(sequence, source=Dark(sequence.source, job.dark, job.end))
-    # The checkpoint stays as it is.
+    # The checkpoint is not changed.
     config = replace(job.config, checkpoint_every=job.end + 1)
     with suppress(_EnoughError):
         filter_opened(open_mono(dark, config, known_of(job.folder)), [watch], job.checkpoint, resume=True)
@@ -238,13 +237,13 @@ def black_out(job: Job) -> Outcome:
 
 
 def run_series(blackouts: Blackouts, out: Path, workers: int = 1) -> Series:
-    """Filters a sequence undisturbed, and again and again from checkpoints with the light out.
+    """Filters a sequence undisturbed, and repeatedly from checkpoints with darkness.
 
-    Errors are against the ground truth; where there is none, against the undisturbed run.
+    Errors are relative to the ground truth, or without it to the undisturbed run.
 
     Args:
-        blackouts: what is done.
-        out: folder for the checkpoints; they are removed in the end.
+        blackouts: of the sequence.
+        out: folder for the checkpoints; they are deleted at the end.
         workers: processes.
 
     Raises:
@@ -279,12 +278,12 @@ def run_series(blackouts: Blackouts, out: Path, workers: int = 1) -> Series:
 
 
 def even_starts(first: int, stop: int, count: int) -> list[int]:
-    """At most `count` different frames from `first` to before `stop`, at even distances."""
+    """At most `count` different frames from `first` to before `stop`, at equal intervals."""
     return np.unique(np.linspace(first, max(first, stop - 1), count).astype(int)).tolist()
 
 
 def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int], out: Path) -> Run:
-    """Filters everything; the states before the frames `starts` stay as `out`/TTTTT.npz."""
+    """Filters the whole sequence; saves the states before the frames `starts` as `out`/TTTTT.npz."""
     out.mkdir(parents=True, exist_ok=True)
 
     def keep(run: Run, _: Tracked) -> None:
@@ -295,21 +294,21 @@ def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int]
 
 
 def in_view(run: Run, truth: np.ndarray) -> int:
-    """Landmarks of known depth that are in view from where the camera truly is; truth (2, 7) before and after."""
+    """Landmarks of known depth in view from the camera's true pose; truth (2, 7) before and after."""
     pose = SE3.compose(run.system.loss.trusted[0], SE3.between(truth[0], truth[1]))
     _, points = run.system.loss.relocaliser.known_landmarks(run.system.filter.belief())
     return int(run.system.sensor.camera.visible(SE3.inverse_transform(pose, points)).sum())
 
 
 def nearest_truth(sequence: ImageSequence) -> np.ndarray:
-    """(T, 7) true world_from_camera, for each image that of the nearest stamp."""
+    """(T, 7) true world_from_camera of the nearest stamp for each image."""
     assert sequence.truth is not None
     nearest = np.abs(sequence.truth.stamps_ns[:, None] - sequence.stamps_ns).argmin(axis=0)
     return np.asarray(sequence.truth.poses[nearest])
 
 
 def known_of(folder: Path) -> KnownPixels | None:
-    """Known points of a folder, None where there are none."""
+    """Known points of a folder, or None."""
     path = folder / "known_points.csv"
     return read_known_points(path) if path.exists() else None
 
@@ -319,7 +318,7 @@ COLOURS = {"rightly": "tab:green", "late": "tab:olive", "wrongly": "tab:red", "n
 
 
 def simulated(out: Path, frames: int, quick: bool) -> list[Path]:
-    """A desk and a room, rendered unless they have been before; the desk alone if it has to be quick."""
+    """A desk and a room, rendered unless they exist; only the desk if `quick`."""
     size = (320, 240) if quick else (640, 480)
     camera = Pinhole(*size, 0.82 * size[0], 0.82 * size[0], 0.5 * size[0] - 0.5, 0.5 * size[1] - 0.5)
     worlds: dict[str, Any] = {"desk": TexturedDesk(frames=frames, texel_m=0.002 if quick else 0.001)}
@@ -332,7 +331,7 @@ def simulated(out: Path, frames: int, quick: bool) -> list[Path]:
 
 
 def line(series: Series) -> list[str | int | float]:
-    """Of the first table."""
+    """A row of the first table."""
     verdicts = [series.verdict(one) for one in series.outcomes]
     fair = [one.visible >= LEAST_VISIBLE for one in series.outcomes]
     right = [verdict == "rightly" for verdict in verdicts]
@@ -344,7 +343,7 @@ def line(series: Series) -> list[str | int | float]:
 
 
 def details(series: Series, number: int) -> list[str | int | float]:
-    """Of one blackout."""
+    """A row of one blackout."""
     one = series.outcomes[number]
     metres, degrees = series.error(one)
     pairs = max((attempt.matches for attempt in one.attempts), default=0)
@@ -357,7 +356,7 @@ def details(series: Series, number: int) -> list[str | int | float]:
 
 
 def draw(all_series: list[Series]) -> Figure:
-    """Errors over time since the light went out; time to recovery over the distance."""
+    """Plots errors over time since the start of darkness, and time to recovery over distance."""
     figure = Figure(figsize=(12.0, 3.8 * len(all_series)), layout="constrained")
     rows = figure.subplots(len(all_series), 2, squeeze=False)
     for (over_time, over_way), series in zip(rows, all_series, strict=True):
@@ -392,21 +391,21 @@ def main(
     out: Path = Path("demo/mono_blackouts"),
     quick: bool = False,
 ) -> dict[str, float]:
-    """Blacks out a second at many places of sequences; prints how often the camera finds itself again.
+    """Blacks out sequences for a second at many times; prints the rate of recovery.
 
     Args:
-        sequences: with ground truth, if their errors are to count; by default a desk and a room are rendered.
+        sequences: with ground truth, for absolute errors; by default a desk and a room are rendered.
         blackouts: on each sequence, at most.
-        first_s: the first one is not before this.
-        dark_s: how long the light is out.
+        first_s: earliest time of the first one.
+        dark_s: duration of darkness.
         within_s: how soon the camera must be found.
         frames: of the rendered sequences.
         particles: of the filter.
         seed: of the filter.
         workers: processes.
         out: folder for picture, tables, checkpoints and rendered sequences.
-        quick: two blackouts on a short desk, seen coarsely by few particles, not before 2 s: the map of the first
-            seconds has too few landmarks of known depth to recognise anything.
+        quick: two blackouts on a short desk with small images and few particles, not before 2 s: earlier, the map has
+        too few landmarks of known depth for relocalisation.
     """
     if quick:
         blackouts, first_s, frames, particles = 2, 2.0, 165, 10
@@ -431,7 +430,7 @@ def main(
 
 
 def figures_of(all_series: list[Series]) -> dict[str, float]:
-    """Shares over all sequences, and the errors of those that were found."""
+    """Fractions over all sequences, and the errors after relocalisation."""
     pairs: list[tuple[Series, Outcome]] = [(series, one) for series in all_series for one in series.outcomes]
     verdicts = [series.verdict(one) for series, one in pairs]
     errors = [series.error(one)[0] for series, one in pairs if series.verdict(one) == "rightly"]

@@ -1,9 +1,9 @@
-"""A camera goes once round a room and comes back, unsure of its place: does it know it again, and only it?
+"""Loop closure by place recognition: a camera returns after a lap of a room, with an uncertain pose.
 
-Few features are measured, so that it comes back some decimetres off, more than what it looks for can be off. The pictures on
-the walls differ in one world; in another the room looks the same when it is turned by half a circle; in a third every
-picture hangs twice, side by side. Each is filtered as it is, and once more without asking where it has been. A loop is
-closed wrongly if the position errs by more than three of its standard deviations afterwards, and by more than before.
+Few features are measured, so that it returns with an error of some decimetres, more than active search can bridge. The
+pictures on the walls differ in one world; another room is symmetric under rotation by half a turn; in a third every picture
+hangs twice, side by side. Each is filtered with and without place recognition. A loop closure is wrong if the position error
+afterwards exceeds three standard deviations, and the error before.
 """
 
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ NEVER = replace(CONFIG, relocalisation=RelocalisationConfig(ask_every=10**6))
 
 
 def room(twins: Twins, rng: np.random.Generator) -> TexturedScene:
-    """Walked in a circle, looking outwards."""
+    """A room with a path in a circle, facing outwards."""
     turn = 2.0 * np.pi * LAPS * np.arange(FRAMES) / FRAMES
     heading = turn + np.deg2rad(30.0)
     eye = np.stack([RADIUS_M * np.cos(turn), RADIUS_M * np.sin(turn), np.full_like(turn, EYE_M)], axis=-1)
@@ -70,7 +70,7 @@ def room(twins: Twins, rng: np.random.Generator) -> TexturedScene:
 
 @dataclass(frozen=True)
 class Rendered(Source):
-    """Pictures of a scene, taken when they are needed; a frame's noise depends on nothing but its number."""
+    """Images of a scene, rendered when needed; a frame's noise depends only on its number."""
 
     scene: TexturedScene
 
@@ -87,7 +87,7 @@ class Rendered(Source):
 
 
 def sequence(twins: Twins, seed: int) -> tuple[ImageSequence, KnownPixels]:
-    """In the frame of the first camera."""
+    """Images and known points in the frame of the first camera."""
     scene = room(twins, np.random.default_rng(seed))
     source, first = Rendered(scene), SE3.inverse(scene.world_from_camera[0])
     px, places = known_corners(scene, source.renderer, CAMERA, KNOWN)
@@ -98,7 +98,7 @@ def sequence(twins: Twins, seed: int) -> tuple[ImageSequence, KnownPixels]:
 
 @dataclass(frozen=True)
 class Job:
-    """A world, and whether it is asked where the camera has been."""
+    """A world, and whether place recognition is used."""
 
     twins: Twins
     seed: int
@@ -107,17 +107,17 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of a run over T frames."""
+    """Outcome of a run over T frames."""
 
     off: np.ndarray  #: (T,) error of the position, metres.
-    std: np.ndarray  #: (T,) what the run says it is, metres.
-    nees: np.ndarray  #: (T,) of the pose, over its six numbers.
-    closed: list[int]  #: frames in which a loop was closed.
-    milliseconds: float  #: of a frame, on the average, with its picture.
+    std: np.ndarray  #: (T,) the run's standard deviation of it, metres.
+    nees: np.ndarray  #: (T,) of the pose, per degree of freedom.
+    closed: list[int]  #: frames of loop closures.
+    milliseconds: float  #: mean time per frame, with rendering.
 
     @property
     def before(self) -> float:
-        """Error when seven eighths of the first lap are done."""
+        """Error after seven eighths of the first lap."""
         return float(self.off[int(0.875 * len(self.off) / LAPS)])
 
     @property
@@ -127,12 +127,12 @@ class Outcome:
 
     @property
     def wrong(self) -> int:
-        """Loops that are closed wrongly."""
+        """Number of wrong loop closures."""
         return sum(self.off[t] > max(self.off[t - 1], 3.0 * self.std[t]) for t in self.closed)
 
 
 def walk(job: Job) -> Outcome:
-    """A run from end to end."""
+    """A whole run."""
     images, known = sequence(job.twins, job.seed)
     run = filter_opened(open_mono(images, CONFIG if job.asks else NEVER, known))
     assert images.truth is not None
@@ -150,10 +150,10 @@ def main(
     """Renders, filters, and prints the table.
 
     Args:
-        seeds: rooms of each kind.
+        seeds: number of rooms of each kind.
         workers: processes.
-        out: folder of the table and the picture.
-        quick: one room, and no run that never asks.
+        out: folder for the table and the plot.
+        quick: one room, and no run without place recognition.
     """
     worlds: list[Twins] = ["none"] if quick else ["none", "across", "beside"]
     asked, seeds = ([True], 1) if quick else ([True, False], seeds)

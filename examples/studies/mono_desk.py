@@ -1,11 +1,10 @@
-"""A camera in a hand moves over a desk (E06, section 6): how good is the filter, and does it know?
+"""A hand-held camera over a desk (E06, section 6): accuracy and consistency of the filter.
 
-Ten simulated recordings, 1 px noise, 25 measurements per frame, four points known beforehand. Each is filtered with 50 and
-250 particles that have maps of their own and with 50 on a joint map, and solved by batch adjustment of the same
-measurements. The table has the error of the positions, without any alignment; the batch has seen the whole recording when
-it places the first frame, the filter has not. The upper picture has the normalised error squared (NEES) of the pose, the
-mean over the recordings: of 6 numbers, so 6 is honest, and an honest filter stays in the band in 95 % of the frames.
-Above it a filter is over-confident.
+Ten simulated recordings, 1 px noise, 25 measurements per frame, four known points. Each is filtered with 50 and 250
+particles with per-particle maps and with 50 on a joint map, and adjusted in batch from the same measurements. The table has
+position errors without alignment; the batch uses the whole recording for every frame, the filter only the past. The upper
+plot has the normalised estimation error squared (NEES) of the pose, averaged over the recordings: 6 is the expected value
+for 6 degrees of freedom, and a consistent filter is in the band in 95 % of the frames. Above it a filter is overconfident.
 """
 
 from dataclasses import replace
@@ -62,7 +61,7 @@ def solve_and_filter(job: Job) -> tuple[float, list[tuple[float, np.ndarray]]]:
 
 
 def draw(names: list[str], mm: np.ndarray, nees: np.ndarray, band: Band, path: Path) -> None:
-    """NEES (C, T) over time, and errors (S, 1 + C) of the batch and the filters."""
+    """Plots NEES (C, T) over time, and errors (S, 1 + C) of the batch and the filters."""
     figure = Figure(figsize=(9.0, 8.0), layout="constrained")
     upper, lower = figure.subplots(2, 1)
     upper.axhspan(band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter")
@@ -86,7 +85,7 @@ def draw(names: list[str], mm: np.ndarray, nees: np.ndarray, band: Band, path: P
 def main(
     seeds: int = 10, workers: int = 2, out: Path = Path("demo/mono_desk"), quick: bool = False
 ) -> dict[str, float]:
-    """Simulates, filters and solves; prints the table.
+    """Simulates, filters and adjusts in batch; prints the table.
 
     Args:
         seeds: number of recordings.

@@ -1,16 +1,15 @@
-"""Are the rendered worlds easier than life? What active search finds in them, beside real recordings.
+"""Realism of the rendered worlds: success of active search, compared with real recordings.
 
-The same system with the same settings filters every sequence. The first table has the fraction of the searches that ended
-with a match, and of those that did not why: nothing in the ellipse was alike enough, or what was alike was astray: it
-did not agree with where the camera went. Then the correlation of what was found: the median, and the tenth that was
-least alike. Survival is the fraction of features that are not dropped within so many frames of being looked for (Kaplan
-and Meier's estimate). Noise and contrast are those of the images themselves, grey levels: the noise is read off the
-smoothest blocks, which in compressed video have lost it.
+The same system with the same settings filters every sequence. The first table has the fraction of searches with a match,
+and of failures by cause: no sufficient correlation in the ellipse, or an outlier (astray), which disagrees with the
+consensus motion. Then the correlation of matches: median and first decile. Survival is the fraction of features that are
+not dropped within a number of searches (Kaplan-Meier estimate). Noise and contrast are of the images themselves, in grey
+levels: noise is estimated from the smoothest blocks, which in compressed video have lost it.
 
     python -m examples.studies.mono_realism --recordings DATA/mono_redkitchen_a DATA/stereo_zed_room1 DATA/mono_robot_lateral
 
-The rendered desk and room are made twice: as the defaults of the simulator are, and with perfect pictures. The length
-counts: in its first seconds a camera sees everything from nearly where it saw it first, and finds it.
+The rendered desk and room are rendered twice: with the simulator's defaults, and with ideal imaging. The length matters:
+in the first seconds a camera observes everything from near its first viewpoint, where search is easy.
 """
 
 from dataclasses import dataclass, replace
@@ -33,27 +32,27 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.textured_scene import ImageWorld
 
 SMOOTH_FRACTION = 0.05
-"""The noise is read off this fraction of an image's blocks, the smoothest."""
+"""Fraction of an image's blocks, the smoothest, for estimating noise."""
 BLOCK_PX = 16
 DARKEST, BRIGHTEST = 20.0, 235.0
-"""Blocks outside are clipped: they show no noise."""
+"""Range of grey levels; blocks outside are clipped and show no noise."""
 MOST_IMAGES = 25
-"""From which an image's own figures are taken."""
+"""Blocks for an image's noise and contrast."""
 
 
 @dataclass(frozen=True)
 class SearchStatistics:
-    """Of one run; S searches of single features in single frames, F features.
+    """Statistics of one run; S searches of single features in single frames, F features.
 
     Attributes:
         name: of the sequence.
-        frames: that were filtered.
+        frames: number of filtered frames.
         lost: frames in which the camera was lost.
-        score: (S,) best normalised cross-correlation in the ellipse; −1 where nothing could be compared.
-        found: (S,) whether it was taken: alike enough, and in agreement with the others.
+        score: (S,) best normalised cross-correlation in the ellipse; −1 without a comparison.
+        found: (S,) whether it was accepted: correlated enough, and an inlier.
         accept: least score of a match.
-        attempts: (F,) frames in which each feature was looked for.
-        dropped: (F,) whether it was dropped in the end because it failed too often.
+        attempts: (F,) frames in which each feature was searched.
+        dropped: (F,) whether it was finally dropped because of failures.
         noise: grey levels, standard deviation in the smoothest parts of the images.
         contrast: grey levels, median standard deviation of blocks of `BLOCK_PX`.
     """
@@ -71,34 +70,34 @@ class SearchStatistics:
 
     @property
     def share_found(self) -> float:
-        """Share of the searches that ended with a match."""
+        """Fraction of searches with a match."""
         return float(self.found.mean())
 
     @property
     def share_unlike(self) -> float:
-        """Share in which nothing was alike enough."""
+        """Fraction without sufficient correlation."""
         return float((self.score < self.accept).mean())
 
     @property
     def share_astray(self) -> float:
-        """Share in which something was alike, in a place that does not agree with the others."""
+        """Fraction of outliers: sufficient correlation, but in disagreement with the other matches."""
         return float(((self.score >= self.accept) & ~self.found).mean())
 
     def survival(self, most: int) -> np.ndarray:
-        """(most + 1,) fraction of features that are not dropped within so many frames of being looked for.
+        """(most + 1,) fraction of features that are not dropped within 0, 1, … searches.
 
-        E. Kaplan and P. Meier's estimate (1958): a feature that left the view, or lived at the end, is counted as long
-        as it was looked for.
+        E. Kaplan and P. Meier's estimate (1958): a feature that left the view, or survived the run, is censored at its
+        number of searches.
         """
         return survival(self.attempts, self.dropped, most)
 
 
 def survival(lengths: np.ndarray, ended: np.ndarray, most: int) -> np.ndarray:
-    """Kaplan–Meier estimate (most + 1,) of the fraction that lasts beyond 0, 1, … `most`.
+    """Kaplan–Meier estimate (most + 1,) of the fraction that survives beyond 0, 1, … `most`.
 
     Args:
-        lengths: (F,) whole numbers, how long each was watched.
-        ended: (F,) whether it ended then; else it went out of sight.
+        lengths: (F,) integer durations of observation.
+        ended: (F,) whether it ended then; else it is censored.
         most: last length of the estimate.
     """
     times = np.arange(most + 1)
@@ -108,7 +107,7 @@ def survival(lengths: np.ndarray, ended: np.ndarray, most: int) -> np.ndarray:
 
 
 def measure_search(folder: Path, config: MonoConfig, name: str | None = None) -> SearchStatistics:
-    """Filters a sequence, from its known points where it has any, and counts.
+    """Filters a sequence, from its known points if it has any, and collects statistics.
 
     Args:
         folder: of the sequence.
@@ -153,7 +152,7 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
 def _look(image: np.ndarray) -> tuple[float, float]:
     """Noise, and contrast of blocks, in grey levels.
 
-    The noise is what a kernel leaves that cancels planes (J. Immerkær 1996), where there is least of it.
+    The noise is the least residual of a kernel that cancels planes (J. Immerkær 1996).
     """
     grey = image.astype(float)
     inner = grey[:-2] - 2.0 * grey[1:-1] + grey[2:]
@@ -179,7 +178,7 @@ TOLD = 30, 100, 300
 
 
 def rendered(out: Path, frames: int, quick: bool) -> dict[str, Path]:
-    """Folders of the rendered sequences by name; rendered unless they have been before."""
+    """Folders of the rendered sequences by name; rendered unless they exist."""
     size = (320, 240) if quick else (640, 480)
     camera = Pinhole(*size, 0.82 * size[0], 0.82 * size[0], 0.5 * size[0] - 0.5, 0.5 * size[1] - 0.5)
     texel_m = 0.002 if quick else 0.001
@@ -199,7 +198,7 @@ def rendered(out: Path, frames: int, quick: bool) -> dict[str, Path]:
 
 
 def draw(found: list[SearchStatistics]) -> Figure:
-    """Histograms of the correlation of what was taken and what was not; survival."""
+    """Plots histograms of the correlation of accepted and rejected matches, and survival."""
     figure = Figure(figsize=(12.0, 4.2 + 1.7 * ((len(found) + 2) // 3)), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.7 * ((len(found) + 2) // 3), 4.2))
     panels = upper.subplots((len(found) + 2) // 3, 3, sharex=True, squeeze=False)
@@ -237,15 +236,15 @@ def main(
     out: Path = Path("demo/mono_realism"),
     quick: bool = False,
 ) -> dict[str, float]:
-    """Filters recordings and rendered worlds; prints how active search fares.
+    """Filters recordings and rendered worlds; prints statistics of active search.
 
     Args:
-        recordings: folders of real sequences, with known_points.csv where they have any.
+        recordings: folders of real sequences, with known_points.csv if any.
         frames: of the rendered sequences.
         particles: of the filter.
         seed: of the filter.
         out: folder for picture, table and rendered sequences.
-        quick: a short desk, seen coarsely by few particles.
+        quick: a short desk with small images and few particles.
     """
     frames, particles = (60, 10) if quick else (frames, particles)
     config = MonoConfig(particles=particles, seed=seed)

@@ -1,4 +1,4 @@
-"""Independent runs side by side, one process each."""
+"""Independent runs in parallel, one process each."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -10,12 +10,12 @@ Result = TypeVar("Result")
 
 
 def in_parallel(function: Callable[[Job], Result], jobs: Iterable[Job], workers: int) -> list[Result]:
-    """Results of a function of the top level of its module, in the order of the jobs.
+    """Results of a module-level function, in the order of the jobs.
 
     Args:
         function: of one job; function, jobs and results must be picklable.
         jobs: any number.
-        workers: processes; with 1 everything runs in this one.
+        workers: number of processes; with 1 everything runs in this one.
     """
     if workers == 1:
         return [function(job) for job in jobs]

@@ -1,10 +1,10 @@
-"""Worlds of points, and what a camera measures of them feature by feature: a `FeatureLog` with ground truth.
+"""Worlds of points and their feature measurements by a camera: a `FeatureLog` with ground truth.
 
     log = simulate_features(DeskWorld(frames=300), Measuring(), MONO, seed=0)
 
-A measurement is the true point's projection plus Gaussian noise, or an outlier. Points come and go; they are hidden by
-opaque blocks, by distance and by the image's border. Which of the visible ones are measured is up to a tracker with a
-fixed budget. Names are right, noise is known, and it is a hundred times faster than taking pictures.
+A measurement is the true point's projection plus Gaussian noise, or an outlier. Points appear and disappear; they are
+occluded by opaque blocks, and limited by distance and the image's border. A tracker with a fixed budget selects the
+measured ones. Association and noise are known, and it is a hundred times faster than rendering images.
 """
 
 from collections.abc import Callable
@@ -24,22 +24,22 @@ from rbpf.validation.simulation.paths import HandHeld, looking
 from rbpf.validation.simulation.textured_scene import EPOCH_NS, stamps_ns
 
 SURFACE = 1e-6
-"""Fraction of the line of sight that may lie in a block: a point on a block's face is seen from the front."""
+"""Tolerated fraction of the line of sight within a block: a point on its face is visible from the front."""
 
 Draw = Callable[[int], np.ndarray]
-"""Draws that many positions (K, 3) in the world."""
+"""Draws K positions (K, 3) in the world."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A world with everything random about it drawn.
+    """A realisation of a world.
 
     Attributes:
         name: of the world.
         stamps_ns: (T,) int64 times of the frames.
         world_from_camera: (T, 7) true poses at these times.
         points: (Q, 3) in the world, m.
-        present: (Q, 2) int64, the frame in which a point appears and the one in which it is gone for good.
+        present: (Q, 2) int64, the frame in which a point appears and the one from which on it is gone.
         blocks: (B, 2, 3) least and greatest corner of opaque boxes, m.
     """
 
@@ -52,15 +52,15 @@ class Scene:
 
 
 class PointWorld(Protocol):
-    """What can be simulated."""
+    """A random world of points."""
 
     def build(self, rng: np.random.Generator) -> Scene:
-        """Draws everything random about the world."""
+        """Draws a realisation of the world."""
         ...
 
 
 def hidden(eye: np.ndarray, points: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Whether a block stands between the eye (3,) and points (P, 3), by the slab method; (P,) bool."""
+    """Whether a block occludes points (P, 3) from the eye (3,), by the slab method; (P,) bool."""
     around = np.concatenate([eye[None], points])
     near = (blocks[:, 0] <= around.max(axis=0)) & (blocks[:, 1] >= around.min(axis=0))
     low, high = np.moveaxis(blocks[near.all(axis=1)] - eye, 1, 0)
@@ -75,7 +75,7 @@ def hidden(eye: np.ndarray, points: np.ndarray, blocks: np.ndarray) -> np.ndarra
 
 
 def outside(draw: Draw, blocks: np.ndarray) -> Draw:
-    """Draws again what falls into a block."""
+    """Rejects positions within a block."""
 
     def redraw(count: int) -> np.ndarray:
         points = draw(count)
@@ -91,11 +91,11 @@ def outside(draw: Draw, blocks: np.ndarray) -> Draw:
 def populated(
     draw: Draw, count: int, frames: int, renewal: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of which one appears elsewhere whenever one disappears for good.
+    """Points that are replaced by others elsewhere when they disappear.
 
     Args:
-        draw: the places.
-        count: of points at any time.
+        draw: draws positions.
+        count: number of points at any time.
         frames: of the recording.
         renewal: probability per frame that a point disappears.
         rng: generator.
@@ -116,16 +116,16 @@ def populated(
 
 @dataclass(frozen=True)
 class DeskWorld(Ranged):
-    """Points over a desk, seen by a camera in a hand.
+    """Points over a desk, observed by a hand-held camera.
 
     Attributes:
         frames: number of images.
         rate_hz: images per second.
         points: number of points at any time, uniform in a box with its base on z = 0 and its middle over the origin.
         size_m: of the box along x, y, z.
-        hand: that moves the camera.
-        blocks: number of opaque things on the desk.
-        renewal: fraction of the points that disappear for good per second; others appear elsewhere.
+        hand: motion of the camera.
+        blocks: number of opaque objects on the desk.
+        renewal: fraction of the points that are replaced per second by others elsewhere.
     """
 
     frames: Annotated[int, Range(ge=2, le=MOST)] = 1000
@@ -151,21 +151,21 @@ class DeskWorld(Ranged):
 
 PRINTED = {textures.picture, textures.page, textures.carton, spines}
 RICH = 20.0
-"""What is printed has so many times as many points per area as what is painted, of wood or a carpet."""
+"""Ratio of point densities of printed surfaces and of plain ones, such as paint, wood or carpet."""
 
 
 @dataclass(frozen=True)
 class LabWorld(Ranged):
-    """Points on all that can be seen in the `TexturedLab`; the same seed furnishes both alike.
+    """Points on all visible surfaces of the `TexturedLab`; with the same seed both have the same furniture.
 
-    All boxes hide what is behind them. Measure it with any camera:
+    All boxes occlude. Any camera can measure it:
 
         >>> log = simulate_features(LabWorld(LabDrive(frames=3), points=3000), Measuring(known=0), STEREO, seed=0)
         >>> len(log.frames), log.frames[0].z.shape
         (3, (25, 3))
 
     Attributes:
-        drive: of the robot that carries the camera.
+        drive: drive of the robot with the camera.
         points: number of points.
     """
 
@@ -197,11 +197,11 @@ class LabWorld(Ranged):
 
 @dataclass(frozen=True)
 class RoomWorld(Ranged):
-    """Points on the walls of an empty room, 9 m wide, in which a camera goes round in a circle.
+    """Points on the walls of an empty room, 9 m wide, in which a camera moves in a circle.
 
     Attributes:
         frames: number of images.
-        laps: rounds, of 16 m.
+        laps: number of laps, of 16 m.
         rate_hz: images per second.
         points: number of points.
     """
@@ -212,7 +212,7 @@ class RoomWorld(Ranged):
     points: Count = 260
 
     def build(self, rng: np.random.Generator) -> Scene:
-        """Draws the points, at most 0.8 m before a wall; the camera looks ahead and to the outside."""
+        """Draws the points, at most 0.8 m in front of a wall; the camera faces ahead and outwards."""
         turn = np.pi / 2.0 * rng.integers(0, 4, self.points)
         out, along = 4.5 - rng.uniform(0.0, 0.8, self.points), rng.uniform(-4.5, 4.5, self.points)
         cos, sin, up = np.cos(turn), np.sin(turn), rng.uniform(-1.5, 1.5, self.points)
@@ -226,25 +226,25 @@ class RoomWorld(Ranged):
 
 
 COLUMNS, ROWS = 5, 4
-"""Cells of the image: new tracks begin where the cells hold fewest."""
+"""Cells of the image: new tracks start in the cells with fewest tracks."""
 
 
 class Tracker:
-    """Keeps tracks from frame to frame and begins others where places are free.
+    """Continues tracks from frame to frame and starts new ones within a budget.
 
-    Points known beforehand are measured first. Tracks go on while the point is visible. Free places go to visible
-    points that are in the map already, then to new ones; both spread over the image.
+    Known points are measured first. Tracks continue while the point is visible. The remaining budget goes to visible
+    points already in the map, then to new ones; both spread over the image.
     """
 
     def __init__(
         self, known: np.ndarray, count: int, measuring: "Measuring", image_px: np.ndarray, rng: np.random.Generator
     ) -> None:
-        """Starts before the first frame.
+        """Initialises before the first frame.
 
         Args:
-            known: (M,) points known beforehand.
-            count: of points in the world, Q.
-            measuring: how many are measured, and how long.
+            known: (M,) known points.
+            count: number of points in the world, Q.
+            measuring: numbers of measurements and durations of tracks.
             image_px: width and height.
             rng: generator.
         """
@@ -259,11 +259,11 @@ class Tracker:
         self._frame = 0
 
     def step(self, visible: np.ndarray, px: np.ndarray) -> np.ndarray:
-        """Goes on by one frame.
+        """Selects the points of the next frame.
 
         Args:
             visible: (Q,) bool.
-            px: (Q, 2) where the points are in the image; only the visible ones count.
+            px: (Q, 2) pixels of the points; only visible ones are used.
 
         Returns:
             (K,) int64 rows of the points to measure.
@@ -274,7 +274,7 @@ class Tracker:
         lost = self._rng.random(tracks.size) < measuring.turnover
         self._resting[tracks[lost]] = self._frame + measuring.rest_frames
         old = tracks[~lost][: measuring.measurements - known.size]
-        # Free places go to points of the map, then to new ones.
+        # The remaining budget goes to points of the map, then to new ones.
         taken = np.concatenate([known, old])
         free = visible & self._unknown & (self._resting <= self._frame)
         free[old] = False
@@ -291,7 +291,7 @@ class Tracker:
         return np.concatenate([np.concatenate([known, old])[measured], again, new])
 
     def _begin(self, candidates: np.ndarray, taken: np.ndarray, px: np.ndarray, count: int) -> np.ndarray:
-        """Up to `count` candidates (a mask), one after the other from a cell that holds fewest."""
+        """Up to `count` candidates (a mask), each from a cell with fewest tracks."""
         choice = self._rng.permutation(np.flatnonzero(candidates))
         chosen = np.zeros(min(count, choice.size), dtype=np.int64)
         cell = self._cell(px[choice])
@@ -313,35 +313,35 @@ MONO = Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
 STEREO = RectifiedStereo(MONO, 0.12)
 
 CERTAIN = 5.0
-"""Points nearer to the border than this many standard deviations of the noise are not measured: the noise would have
-to be cut off at the border."""
+"""Points nearer to the border than this many standard deviations of the noise are not measured, as the border would
+truncate the noise."""
 
 RADIUS = 0.35
-"""Of the ellipse near which the known points are chosen, as a fraction of the image's size: in its middle half."""
+"""Size of the ellipse near which known points are chosen, relative to the image: its middle half."""
 
 LEAST_SPREAD = 0.05
-"""Known points are on a line if they extend, in the image, less than this fraction of their length to the side."""
+"""Known points are collinear if their extent across, in the image, is below this fraction of that along."""
 
 
 @dataclass(frozen=True)
 class Measuring:
-    """How the visible points are measured.
+    """Measurement of the visible points.
 
     Attributes:
         noise_px: standard deviation per coordinate.
-        measurements: most of them per frame.
-        known: number of points known beforehand, around the middle of the first image. They are measured whenever they
+        measurements: maximum number per frame.
+        known: number of known points, around the middle of the first image. They are measured whenever they
             are visible, and never disappear.
         known_std_m: standard deviation per axis of their given positions.
-        new_per_frame: most points that enter the map per frame; the first frame takes as many as fit.
-        outlier_rate: probability that a measurement lies anywhere in the image; never that which begins a landmark.
-        dropout: probability per frame that a tracked point is missed and its track goes on.
-        turnover: probability per frame that a tracked point is lost and its place given to another.
-        rest_frames: a lost point is not looked for during these.
-        border_px: no patch fits into the image's border of this width.
-        nearest_m: points nearer than this are not recognised.
-        farthest_m: nor those farther away.
-        occlusion: whether blocks hide what is behind them.
+        new_per_frame: maximum number of points that enter the map per frame; the first frame uses the whole budget.
+        outlier_rate: probability that a measurement is uniform in the image; never the first one of a landmark.
+        dropout: probability per frame that a tracked point is missed and its track continues.
+        turnover: probability per frame that a tracked point is lost and replaced by another.
+        rest_frames: number of frames in which a lost point is not searched.
+        border_px: width of the image's border without measurements, as no patch fits.
+        nearest_m: points nearer than this are not measured.
+        farthest_m: points farther than this are not measured.
+        occlusion: whether blocks occlude points.
     """
 
     noise_px: Positive = 1.0
@@ -370,17 +370,17 @@ def simulate_features(
     """Simulates a recording; the same arguments give the same bytes.
 
     Args:
-        world: where the camera goes and what is there.
-        measuring: which points are measured, and how well.
-        camera: that measures.
+        world: points and the camera's path.
+        measuring: selection and noise of measurements.
+        camera: of the measurements.
         seed: of the only random generator.
 
     Returns:
-        The log; landmarks are named by their rows among the world's points. The truth has every point that was ever
-        there.
+        The log; landmarks are named by their rows among the world's points. The truth has all points that ever
+        existed.
 
     Raises:
-        InputError: too few points are visible in the first frame, or those known lie on a line in it.
+        InputError: too few points are visible in the first frame, or the known ones are collinear in it.
     """
     rng = np.random.default_rng(seed)
     scene = world.build(rng)
@@ -395,7 +395,7 @@ def simulate_features(
         visible, z = _view(scene, measuring, camera, frame)
         rows = tracker.step(visible, z[:, :2])
         noisy = z[rows] + measuring.noise_px * rng.standard_normal((rows.size, camera.dim))
-        # Outliers lie anywhere in the image; a stereo pair's disparity is positive.
+        # Outliers are uniform in the image; a stereo pair's disparity is positive.
         wrong = seen[rows] & (rng.random(rows.size) < measuring.outlier_rate)
         px = rng.uniform(0.0, size - 1.0, (int(wrong.sum()), 2))
         if not isinstance(camera, Pinhole):
@@ -415,7 +415,7 @@ def simulate_features(
 
 
 def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo, size: np.ndarray) -> np.ndarray:
-    """(M,) rows of the points known beforehand, visible in the first frame, near an ellipse about the image's middle."""
+    """(M,) rows of the known points, visible in the first frame, near an ellipse around the image's centre."""
     visible, z = _view(scene, measuring, camera, 0)
     wanted = measuring.known
     if wanted > measuring.measurements:
@@ -445,7 +445,7 @@ def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo
 def _view(
     scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo, frame: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which points (Q,) the camera sees in a frame, and where (Q, p); pixels of the others mean nothing."""
+    """Visibility (Q,) of points in a frame, and their pixels (Q, p), meaningless for invisible ones."""
     pose = scene.world_from_camera[frame]
     local = SE3.inverse_transform(pose, scene.points)
     distance = np.linalg.norm(local, axis=1)

@@ -1,12 +1,12 @@
-"""Simulation-based calibration of any model that can simulate: is the truth ranked uniformly among posterior samples?
+"""Simulation-based calibration of a generative model: is the truth ranked uniformly among posterior samples?
 
-Draw parameters from the prior, data from the parameters, samples from what the filter takes for the posterior. If that
-is the posterior, the rank of the true parameter among L samples is uniform on 0 … L, whatever the model (S. Talts et
-al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018). A histogram like ∪ is an
-over-confident filter, like ∩ a cautious one, a slope is a bias.
+Draw parameters from the prior, data given the parameters, and samples from the filter's posterior. If it is exact, the
+rank of the true parameter among L samples is uniform on 0 … L, for any model (S. Talts et al., "Validating Bayesian
+inference algorithms with simulation-based calibration", 2018). A ∪-shaped histogram shows overconfidence, a ∩-shaped
+one underconfidence, a slope bias.
 
-Samples of a particle filter have weights: the rank follows from the weight below the truth, Σ_i w_i 1[θ_i < θ],
-as the place of the truth among the gaps of as many samples as the weights are worth, ties broken at random.
+Samples of a particle filter are weighted: the rank follows from the weight below the truth, Σ_i w_i 1[θ_i < θ],
+for the effective number of samples, with ties broken at random.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,15 +23,15 @@ from rbpf.lie import Array
 Simulate = Callable[[np.random.Generator], tuple[Array, Any]]
 """Parameters (d,) from the prior, and data from them."""
 Infer = Callable[[Any, np.random.Generator], tuple[Array, Array]]
-"""Of data: samples (N, d) of the posterior, and their weights (N,)."""
+"""Given data: samples (N, d) of the posterior, and their weights (N,)."""
 LEAST = 20
-"""Simulations that tell anything."""
+"""Least number of simulations."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """Where the truth was among the samples.
+    """Ranks of the truth among the samples.
 
     Attributes:
         names: of the d parameters.
@@ -44,12 +44,12 @@ class Ranks:
     bins: int
 
     def histogram(self) -> NDArray[np.int64]:
-        """(bins, d) simulations whose fraction falls into each bin."""
+        """(bins, d) number of simulations with a fraction in each bin."""
         at = np.minimum((self.fractions * self.bins).astype(int), self.bins - 1)
         return np.stack([np.bincount(column, minlength=self.bins) for column in at.T], axis=1)
 
     def p_values(self) -> Array:
-        """(d,) of the χ² test of uniformity: small where the histogram is not flat."""
+        """(d,) p-values of the χ² test of uniformity: small if the histogram is not flat."""
         from scipy.stats import chi2
 
         expected = len(self.fractions) / self.bins
@@ -57,11 +57,11 @@ class Ranks:
         return np.asarray(chi2.sf(statistic, self.bins - 1))
 
     def spread(self) -> Array:
-        """(d,) variance of the fractions over that of a uniform law, 1/12: above 1 is over-confident."""
+        """(d,) variance of the fractions over that of the uniform distribution, 1/12: above 1 is overconfident."""
         return np.asarray(12.0 * np.square(self.fractions - 0.5).mean(axis=0))
 
     def band(self) -> tuple[int, int]:
-        """Counts between which a bin of a flat histogram lies in 95 of 100 cases."""
+        """The 95 % interval of a flat histogram's counts per bin."""
         from scipy.stats import binom
 
         low, high = binom.ppf([0.025, 0.975], len(self.fractions), 1.0 / self.bins)
@@ -75,9 +75,9 @@ def calibrate(
 
     Args:
         simulate: draws parameters and data.
-        infer: what is judged.
+        infer: the inference to be checked.
         names: of the parameters.
-        runs: simulations, each with generators of its own.
+        runs: number of simulations, each with its own generators.
         bins: of the histogram.
         seed: of everything.
 
@@ -120,7 +120,7 @@ def plot_ranks(ranks: Ranks, out: Path, name: str = "ranks.png") -> list[str]:
 
 
 def _below(truth: Array, samples: Array, weights: Array, rng: np.random.Generator) -> Array:
-    """(d,) weight below the truth; the next sample's weight is split at random, for N samples have N + 1 gaps."""
+    """(d,) weight below the truth; the next sample's weight is split at random, as N samples have N + 1 gaps."""
     out = np.empty(truth.size)
     for column, value in enumerate(truth.tolist()):
         below = samples[:, column] < value

@@ -1,16 +1,16 @@
-"""The figures of the paper, made again: what E. Eade and T. Drummond (2006) report, and what this system does.
+"""Reproduction of the figures of E. Eade and T. Drummond (2006) with the monocular system.
 
-Sequences are rendered for it (kept in `OUT/sequences`), filtered with the default settings from a few known points,
-and measured. Each figure leaves a picture, `figure_N.png`; the table has the paper's figure beside ours, and says where
-ours falls short.
+Sequences are rendered (into `OUT/sequences`), filtered with the default settings from a few known points, and
+evaluated. Each figure gives a plot, `figure_N.png`; the table compares the paper's values with ours, and marks those
+that are worse.
 
     python -m examples.studies.reproduce_e06 --figures 4 5
 
-2: likelihood of depth and of inverse depth, of features that are followed in images.
-3: time per frame against the number of landmarks.
-4: how well the landmarks of a flat desk lie in one plane.
-5: a loop is closed.
-6: three thousand frames at frame rate.
+2: likelihood of depth and of inverse depth, of features tracked in images.
+3: time per frame by the number of landmarks.
+4: coplanarity of the landmarks of a flat desk.
+5: loop closure.
+6: three thousand frames in real time.
 7: (and 8) new landmarks on their rays, and on their epipolar lines.
 9: a camera at rest before four points of a plane, with and without the epipolar constraint.
 """
@@ -36,7 +36,7 @@ FIGURES: dict[int, Callable[[Setting], list[Row]]] = {
     9: still_camera.reproduce,
 }
 ALSO = {8: 7}
-"""Figures that are made together with others."""
+"""Figures that are produced together with others."""
 
 
 def main(
@@ -48,16 +48,16 @@ def main(
     quick: bool = False,
     map: Literal["particles", "auto"] = "particles",
 ) -> dict[str, float]:
-    """Makes figures of the paper; prints the table.
+    """Reproduces figures of the paper; prints the table.
 
     Args:
         figures: their numbers.
-        out: folder for pictures, table and sequences.
+        out: folder for plots, table and sequences.
         width: of the images, px; figure 6 has its own.
         particles: of the filter.
         seed: of worlds and filter.
         quick: few small frames.
-        map: every particle's own, as the paper's, or the system's default, the joint map.
+        map: per-particle maps, as in the paper, or the system's default, the joint map.
     """
     wanted = sorted({ALSO.get(figure, figure) for figure in figures})
     unknown = [figure for figure in wanted if figure not in FIGURES]

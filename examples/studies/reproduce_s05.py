@@ -1,13 +1,12 @@
-"""The figures of R. Sim et al. (2005) in the simulated laboratory: Table I, maps (Figs. 4–6), time per frame (Fig. 7).
+"""Reproduction of R. Sim et al. (2005) in the simulated laboratory: Table I, maps (Figs. 4–6), time per frame (Fig. 7).
 
 The whole tour is 4,000 pairs over 68 m. It is rendered once (OUT/lab, ten minutes of one core) and its features are
-measured once (OUT/features, five minutes; an interrupted run goes on where it was); the filter takes some minutes.
---frames shortens the tour, --every thins it out, --sweep filters its first pairs with other settings.
+measured once (OUT/features, five minutes; continued after an interruption); the filter takes some minutes. --frames
+shortens the tour, --every subsamples it, --sweep-frames filters its first pairs with other settings.
 
-The map of the best particle is its own. The maps that odometry alone builds, visual or of the wheels, have the filter's
-observations, averaged along its path: they differ from one another by the paths only. Errors are those of places of
-landmarks as the true path would have them, in metres, first in the world of the first camera, then after a rigid
-alignment.
+The map of the best particle is its own. The maps of odometry alone, visual or of the wheels, average the filter's
+observations along the odometry's path: they differ only by the paths. Errors are of landmark positions relative to those
+along the true path, in metres, first in the world of the first camera, then after rigid alignment.
 """
 
 from pathlib import Path
@@ -36,7 +35,7 @@ PAPER = {191: (812, 0.62, 2109), 400: (1542, 4.02, 4194), 600: (2206, 6.87, 6264
 PAPER_SECONDS = 11.9
 
 EARLY, LAST = (350, 450), 100
-"""Frames of the tour about frame 400, and so many last ones: what an update costs in a small and in a large map."""
+"""Frames of the tour around frame 400, and number of last ones, for the time of an update in a small and a large map."""
 
 
 def main(
@@ -52,20 +51,20 @@ def main(
     sweep_seeds: int = 3,
     quick: bool = False,
 ) -> dict[str, float]:
-    """Renders the drive and measures its features, unless they are there, and filters it.
+    """Renders the drive and measures its features, unless they exist, and filters it.
 
     Args:
-        out: folder for images, features, tables and pictures.
-        frames: pairs, the first of the tour.
-        every: only each so many-th frame is a pair.
+        out: folder for images, features, tables and plots.
+        frames: number of pairs, from the start of the tour.
+        every: every n-th frame is a pair.
         particles: number of particles.
         dof: degrees of freedom; the paper's are 3.
         width: of the images, px.
-        trigger_m: way between updates.
+        trigger_m: distance between updates.
         seed: of the images and of the filter.
-        sweep_frames: so many first pairs are filtered with other settings, too.
-        sweep_seeds: each with so many seeds of the filter.
-        quick: thirty coarse pairs and 100 particles, to see that it works.
+        sweep_frames: number of first pairs that are also filtered with other settings.
+        sweep_seeds: number of seeds of the filter for each of these.
+        quick: thirty small pairs and 100 particles, as a check.
     """
     setting = Setting(out, frames, every, width, 0.003, particles, dof, trigger_m, seed)
     if quick:
@@ -90,13 +89,13 @@ def main(
 
 
 def told(what: str, done: int, total: int) -> None:
-    """Now and then."""
+    """Reports progress at intervals."""
     if done % 200 == 0 or done == total:
         print(f"{what}: {done} of {total} pairs", flush=True)
 
 
 def table_1(record: Record, paths: Paths, due: dict[int, int], out: Path) -> None:
-    """Ours, beside the paper's; `due` has its frame for a number of pairs."""
+    """Our Table I and the paper's; `due` maps a number of pairs to its frame."""
     lengths = np.linalg.norm(np.diff(SE3.translation(paths.wheels), axis=0), axis=1)
     header = ["pairs", "paper's frame", "landmarks", "paper's", "distance m", "paper's", "SIFT features", "paper's"]
     rows = []

@@ -1,8 +1,8 @@
-"""Does a filter run for ever? 100,000 frames of a camera and of a robot, in worlds whose points come and go.
+"""Long-term operation: 100,000 frames of a camera and of a robot, in worlds whose points are replaced.
 
-Both keep a fixed lag of their paths and forget landmarks that have not been seen for long. One row per 1,000 frames:
-the processor's time for a step, the memory of the process and all that the filter refers to, and how far off it is.
-Tables and picture say whether anything grows.
+Both keep a fixed lag of their paths and drop landmarks that have not been observed for long. One row per 1,000 frames:
+processor time per step, memory of the process and of all objects of the filter, and the error. Tables and plot show
+whether anything grows.
 """
 
 import gc
@@ -34,19 +34,18 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 
 Step = Callable[[Any, int], np.ndarray]
-"""Filters a frame, the first one being number 0, and tells the position (D,) that it estimates."""
+"""Filters a frame, counted from 0, and returns the estimated position (D,)."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """Some frames in a row.
+    """Consecutive frames.
 
     Attributes:
-        frames: filtered up to its end.
-        ms_per_frame: median time that the processor spends on a filter step, ms; what else the machine does is not
-            in it.
-        resident_mb: memory of the process at its end; its peak where the system does not tell.
-        held_kb: all that the filter refers to.
+        frames: number of frames filtered up to its end.
+        ms_per_frame: median processor time of a filter step, ms, independent of the machine's load.
+        resident_mb: memory of the process at its end; its peak if the system does not provide it.
+        held_kb: memory of all objects referenced by the filter.
         nodes: of the particles' ancestry.
         states: poses in the history.
         landmarks: in the map.
@@ -70,7 +69,7 @@ COLUMNS = tuple(item.name for item in fields(Window))
 
 @final
 class Forgetting(Sensor):
-    """A sensor that drops landmarks which have not been seen for long, so that the map of a changing world is bounded.
+    """A sensor that drops landmarks not observed for long, so that the map of a changing world is bounded.
 
     Args:
         inner: a sensor of named landmarks; frames have `landmarks` (K,), numbers.
@@ -84,13 +83,13 @@ class Forgetting(Sensor):
         self._seen: dict[int, int] = {}
 
     def observe(self, frame: Any, belief: Belief) -> Sequence[Observations]:
-        """What the inner sensor observes."""
+        """The inner sensor's observations."""
         self.frame += 1
         self._seen.update(dict.fromkeys(frame.landmarks.tolist(), self.frame))
         return self.inner.observe(frame, belief)
 
     def new_landmarks(self, frame: Any, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
-        """What the inner sensor starts, after the old ones have gone."""
+        """The inner sensor's new landmarks, after dropping old ones."""
         new_landmarks = self.inner.new_landmarks(frame, belief, observed)
         old = [name for name, seen in self._seen.items() if self.frame - seen > self.after]
         ids = np.array(old, dtype=np.int64)
@@ -101,7 +100,7 @@ class Forgetting(Sensor):
 
 
 def camera_steps(stream: CameraStream, config: MonoConfig, forget: int = 600) -> tuple[Filter, Step]:
-    """The monocular system's filter over a stream, and what makes its steps."""
+    """The monocular system's filter for a stream, and its step function."""
     log = stream.first()
     assert isinstance(log.camera, Pinhole)
     slam = MonoSlam(log.camera, config, log.known, wrapped=lambda sensor: Forgetting(sensor, forget))
@@ -113,21 +112,21 @@ def camera_steps(stream: CameraStream, config: MonoConfig, forget: int = 600) ->
 
 
 def robot_steps(stream: RobotStream, config: RangeBearingConfig, forget: int = 600) -> tuple[Filter, Step]:
-    """The range-bearing system's filter over a stream, and what makes its steps."""
+    """The range-bearing system's filter for a stream, and its step function."""
     slam = RangeBearingSlam.of_log(stream.first(), config)
     slam.filter.sensors = [Forgetting(slam.sensor, forget)]
     return slam.filter, lambda frame, _: slam.take(frame).pose[1:]
 
 
 def soak(stream: CameraStream | RobotStream, filter_: Filter, step: Step, frames: int, every: int) -> Iterator[Window]:
-    """Filters a stream; one window for every so many frames.
+    """Filters a stream; yields a window for every `every` frames.
 
     Args:
         stream: endless.
-        filter_: that is looked at.
-        step: makes its steps.
-        frames: of the stream that are filtered.
-        every: frames of a window.
+        filter_: the filter to be measured.
+        step: its step function.
+        frames: number of filtered frames.
+        every: number of frames of a window.
     """
     seen = stream.frames()
     for first in range(0, frames, every):
@@ -158,7 +157,7 @@ def _window(filter_: Filter, frames: int, seconds: float, square: float) -> Wind
 
 
 def resident_mb() -> float:
-    """Memory of this process now, MB of 2²⁰ bytes; where the system does not tell, its peak."""
+    """Current memory of this process, MB of 2²⁰ bytes; its peak if the system does not provide it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -169,7 +168,7 @@ def resident_mb() -> float:
 
 
 def held_bytes(root: object) -> int:
-    """Bytes of all objects and arrays that an object refers to, directly or not; code is left out."""
+    """Bytes of all objects and arrays referenced by an object, directly or indirectly, without code."""
     seen: set[int] = set()
     waiting, total = [root], 0
     while waiting:
@@ -186,7 +185,7 @@ def held_bytes(root: object) -> int:
 
 SYSTEMS = "camera", "robot"
 SETTLED = 0.1
-"""The first fraction of a run fills the map and is not compared."""
+"""Fraction at the start of a run that fills the map and is not compared."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +201,7 @@ class Job:
 
 
 def run(job: Job) -> list[Window]:
-    """Filters one stream; its table grows with it, so that a run that is stopped leaves what it measured."""
+    """Filters one stream; its table is written as it proceeds, and remains if the run is stopped."""
     turnover, windows = Turnover(), list[Window]()
     if job.system == "camera":
         camera = CameraStream(turnover, seed=0)
@@ -218,7 +217,7 @@ def run(job: Job) -> list[Window]:
 
 
 def growth(values: np.ndarray) -> float:
-    """Median of the last third of a run over that of the first third, once it has settled."""
+    """Median of the last third of a run over that of the first third, after the initial fraction."""
     settled = values[max(1, round(SETTLED * values.size)) :]
     third = max(1, settled.size // 3)
     return float(np.median(settled[-third:]) / np.median(settled[:third]))
@@ -239,7 +238,7 @@ def main(
         frames: of each stream.
         every: frames per row of the tables.
         particles: of both filters.
-        lag: steps of the paths that are kept.
+        lag: number of retained steps of the paths.
         workers: processes.
         out: folder for tables and picture.
         quick: a few frames, in this process.
@@ -263,7 +262,7 @@ def main(
 
 
 def draw(columns: dict[str, dict[str, np.ndarray]], path: Path) -> None:
-    """Time, memory, what is held and the error, by frame."""
+    """Plots time, memory, referenced objects and error by frame."""
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
     shown = {
         "ms_per_frame": "median processor time of a step [ms]",

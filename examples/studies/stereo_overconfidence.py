@@ -1,13 +1,13 @@
-"""How sure of itself is the stereo filter, and what makes it more honest, and better than its odometry?
+"""Overconfidence of the stereo filter: its causes, and remedies that also improve on odometry.
 
-S05 bounds what a match may weigh: −½ min(T_l, d²) with T_l = 4. A quarter of the true matches lie beyond. If these do
-not update their landmarks either, each particle believes what agrees with it and never hears the rest: its map drifts
-along with its own path, the error is that of the odometry, and the covariance is a tenth of what it should be. More
-particles and injected noise do not help. That T_l bounds the weight alone, and landmarks are updated by all that a
-wide gate lets pass, does.
+S05 bounds the weight of a match: −½ min(T_l, d²) with T_l = 4. A quarter of the correct matches exceed the bound. If
+these do not update their landmarks either, each particle is updated only by matches that agree with it: its map drifts
+with its path, the error is that of the odometry, and the covariance is a tenth of the true one. More particles and
+injected noise do not help. The remedy is that T_l bounds only the weight, and landmarks are updated by all matches
+within a wide gate.
 
-Pixels of the laboratory of points with Gaussian noise and known association: mean over the recordings of the error of
-the path, and the median over all pairs of the NEES of the pose, of which 6 is right.
+Pixels of the laboratory of points with Gaussian noise and known association: the path's error, mean over recordings,
+and the NEES of the pose, median over all pairs, of which 6 is consistent.
 """
 
 from dataclasses import replace
@@ -29,13 +29,13 @@ from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, MapConfig, OdometryCo
 from rbpf.validation.consistency.statistic import whitened_errors
 
 DIM = 6
-"""Of a pose: what the NEES of an honest filter is on the average."""
+"""Expected NEES of a pose for a consistent filter."""
 
 DEFAULT, CLIPPED = "default: prior, T_l = 4, updates within 16.3", "what is clipped does not update"
 
 
 class Figures(NamedTuple):
-    """Of one run: root mean square of the positions' errors, of the filter and of its odometry; NEES (T,)."""
+    """Figures of one run: root mean square position errors of the filter and of its odometry; NEES (T,)."""
 
     error_m: float
     odometry_m: float
@@ -43,7 +43,7 @@ class Figures(NamedTuple):
 
 
 def variants(particles: int) -> dict[str, StereoConfig]:
-    """What is changed, one thing at a time."""
+    """Variants with one change each."""
     base = replace(StereoConfig.s05(), particles=particles, trigger=TriggerConfig(0.0, 0.0))
     refined = ProposalConfig("ekf", iterations=1)
     clipped = replace(base, likelihood=truncated(4.0, 4.0))
@@ -78,7 +78,7 @@ def truncated(limit: float, update_limit: float) -> LikelihoodConfig:
 
 
 def figures_of(log: FeatureLog, config: StereoConfig) -> Figures:
-    """One run."""
+    """Figures of one run."""
     run = filter_features(log, config)
     assert run.truth is not None
     true, poses = run.truth.poses, run.log.poses
@@ -108,9 +108,9 @@ def main(
         particles: number of particles.
         seeds: number of recordings.
         frames: pairs of each.
-        every: only each so many-th frame of the robot's drive is a pair.
+        every: every n-th frame of the robot's drive is a pair.
         noise_px: of the pixels.
-        quick: one recording, a third of the pairs and few particles, to see that it works.
+        quick: one recording, a third of the pairs and few particles, as a check.
     """
     if quick:
         seeds, frames, particles = 1, 20, 100
@@ -133,7 +133,7 @@ def main(
 
 
 def draw(rows: list[list[str | float]], odometry_mm: float, file: Path) -> None:
-    """Error and NEES of the variants, beside that of the odometry and what is right."""
+    """Plots error and NEES of the variants, with the odometry's error and the expected NEES."""
     figure = Figure(figsize=(11.0, 4.5), layout="constrained")
     names = [str(row[0]) for row in rows][::-1]
     sides = zip(figure.subplots(1, 2, sharey=True), ("error, mm", "median NEES"), strict=True)

@@ -1,9 +1,8 @@
-"""What does the map bring? Each recording without it, with it, and played forward and then backward.
+"""Benefit of the map: each recording without and with a map, and played forwards and then backwards.
 
-The way back sees again all that the way there has seen. Odometry is that of the same runs, from the same features.
-Where recordings lie is told by the environment variable RBPF_DATA; those that are not there are passed over. The
-recorded tracks have no ground truth: the batch optimum of the same pixels takes its place. Pixels of the simulated
-laboratory are always in the table.
+On the way back all landmarks are re-observed. Odometry is that of the same runs, from the same features. Recordings are
+in the folder of the environment variable RBPF_DATA; missing ones are skipped. The recorded tracks have no ground truth,
+and are compared with the batch optimum of the same pixels. Pixels of the simulated laboratory are always in the table.
 """
 
 import os
@@ -36,11 +35,11 @@ from rbpf.validation.metrics.scores import score_path
 
 @final
 class Reordered(Source):
-    """Images of a sequence in another order, with the times given; all are held.
+    """Images of a sequence in another order, with given times; all are in memory.
 
     Args:
         sequence: of pairs.
-        rows: (T,) which of its pairs.
+        rows: (T,) indices of its pairs.
         stamps_ns: (T,) their times.
     """
 
@@ -55,7 +54,7 @@ class Reordered(Source):
 
 
 def pairs_there_and_back(sequence: ImageSequence) -> ImageSequence:
-    """T pairs, then T − 1 backward, at an even pace.
+    """T pairs, then T − 1 backwards, at constant rate.
 
     Raises:
         InputError: the recording has no truth, or less than two pairs.
@@ -72,7 +71,7 @@ def pairs_there_and_back(sequence: ImageSequence) -> ImageSequence:
 
 
 def log_there_and_back(log: FeatureLog) -> FeatureLog:
-    """T frames, then T − 1 backward; stamps count them. Truth, if there is any, has a pose for each frame."""
+    """T frames, then T − 1 backwards; stamps count them. Ground truth, if any, has a pose for each frame."""
     rows = there_and_back(len(log.frames))
     frames = [replace(log.frames[row], stamp_ns=t) for t, row in enumerate(rows.tolist())]
     truth = log.truth
@@ -93,7 +92,7 @@ WAYS = "there", "there and back"
 
 
 def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5, particles: int = 400) -> dict[str, float]:
-    """Prints a table in metres, medians over the seeds, and writes it to a folder; `quick` simulates a short path."""
+    """Prints a table of medians over the seeds, metres, and writes it to a folder; `quick` simulates a short path."""
     out.mkdir(parents=True, exist_ok=True)
     configs = [replace(StereoConfig.s05(), particles=particles, seed=seed) for seed in range(1 if quick else seeds)]
     rows = list(simulated(configs, 20 if quick else 60))
@@ -112,7 +111,7 @@ def simulated(configs: Sequence[StereoConfig], frames: int) -> Iterator[list]:
 
 
 def recorded(data: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
-    """The recordings that are there."""
+    """The available recordings."""
     for name in PAIRS:
         if (data / name).is_dir():
             yield from of_pairs(data / name, configs)
@@ -148,7 +147,7 @@ def row(name: str, filtered: Callable[[StereoConfig], Run], configs: Sequence[St
 
 
 def scores(run: Run) -> dict[str, float]:
-    """Errors of the filter, and with `vo_` before them those of its odometry alone.
+    """Errors of the filter, and, prefixed by `vo_`, those of its odometry alone.
 
     Raises:
         InputError: the recording has no ground truth.
@@ -165,7 +164,7 @@ def scores(run: Run) -> dict[str, float]:
 
 
 def picture(rows: list[list]):
-    """Odometry and filter side by side, on a logarithmic scale."""
+    """Plots odometry and filter side by side, on a logarithmic scale."""
     figure, axes = new_axes("what the map brings", "position error [m]", "")
     places = range(len(rows))
     for shift, at, name in ((-0.2, 1, "odometry"), (0.2, 2, "filter")):

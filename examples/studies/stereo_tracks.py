@@ -1,4 +1,4 @@
-"""Stereo feature tracks in the manner of GTSAM's stereo examples: who saw which landmark where, and a first guess.
+"""Stereo feature tracks in the format of GTSAM's stereo examples: observations of landmarks, and an initial path.
 
 The folder holds one file of each kind:
 
@@ -7,7 +7,7 @@ The folder holds one file of each kind:
 - `VO_stereo_factors*.txt`: a frame, a landmark, u_left, u_right, v (pixels), and X, Y, Z of the landmark in that
   camera's frame. Only the pixels are read, as the point follows from them.
 
-There are no times: a frame's stamp is its number.
+Times are not given: a frame's stamp is its number.
 """
 
 from dataclasses import dataclass
@@ -27,18 +27,18 @@ POSES = ("frame", *ENTRIES)
 FACTORS = ("frame", "landmark", "u_left", "u_right", "v", "x", "y", "z")
 
 KITTI_00 = (1241, 376)
-"""Width and height of the images of KITTI's sequence 00, which the files do not give."""
+"""Width and height of the images of KITTI's sequence 00, which are not in the files."""
 ROTATION = 1e-3
-"""How far a matrix's rotation may be from one: six digits are written."""
+"""Tolerance of a rotation matrix's orthonormality: files have six digits."""
 
 
 @dataclass(frozen=True)
 class StereoTracks:
-    """A recording and the path that it came with.
+    """A recording and its initial path.
 
     Attributes:
         log: the frames and the camera.
-        world_from_camera: (T, 7) first guess, no truth.
+        world_from_camera: (T, 7) initial path, not ground truth.
     """
 
     log: FeatureLog
@@ -46,10 +46,10 @@ class StereoTracks:
 
 
 def read_stereo_tracks(folder: str | Path, std_px: float = 1.0, size: tuple[int, int] = KITTI_00) -> StereoTracks:
-    """Read a folder of tracks.
+    """Reads a folder of tracks.
 
     Args:
-        folder: that holds the three files.
+        folder: of the three files.
         std_px: standard deviation of each coordinate of an observation.
         size: width and height of the images, px.
 
@@ -84,7 +84,7 @@ def read_stereo_tracks(folder: str | Path, std_px: float = 1.0, size: tuple[int,
     if wrong.any():
         raise table.error(int(np.argmax(wrong)), "expected a rotation, a translation and the row 0 0 0 1")
 
-    # Who saw what.
+    # The observations.
     table, count = read_columns(_only(folder, "VO_stereo_factors*.txt"), FACTORS), len(numbers)
     steps, names = table.integers("frame"), table.integers("landmark")
     table.require((steps >= 0) & (steps < count), "frame", f"that of a pose, 0 to {count - 1}")

@@ -1,8 +1,8 @@
-"""Endless streams of measurements: worlds whose points come and go, told frame by frame and never kept.
+"""Endless streams of measurements in worlds whose points are replaced, generated frame by frame.
 
-A `FeatureLog` or a `RobotLog` holds its whole recording; a stream of any length holds its world alone. The camera and
-the robot go round for ever, and every point is replaced by another one, with a new name and elsewhere, after a random
-time. What a filter is given is its first frame as a log, and then one frame after the other.
+A `FeatureLog` or a `RobotLog` stores a whole recording; a stream of any length stores only its world. The camera and the
+robot move in laps forever, and every point is replaced by another one, with a new name and elsewhere, after a random time.
+A filter's input is the first frame as a log, and then one frame after the other.
 """
 
 from abc import ABC, abstractmethod
@@ -21,7 +21,7 @@ from rbpf.validation.simulation.paths import looking
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 KNOWN = 5
-"""Points of the camera's world that are known and stay: they hold its scale and its place for ever."""
+"""Number of known, permanent points of the camera's world, which fix its scale and frame."""
 
 KNOWN_STD_M, LEAST_M = 0.001, 0.1
 MARGIN_PX = 6.0
@@ -30,11 +30,11 @@ CAMERA_HZ, ROBOT_HZ = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Turnover(Ranged):
-    """How many points there are, and how fast they are replaced.
+    """Number of points, and their rate of replacement.
 
     Attributes:
-        points: at any time.
-        measurements: points measured in a frame at most; those that have been there longest come first.
+        points: number of points at any time.
+        measurements: maximum number of points measured in a frame; the oldest points first.
         renewal: probability per frame that a point is replaced.
     """
 
@@ -51,7 +51,7 @@ class Seen(NamedTuple):
 
 
 class _Points:
-    """Points (P, D) with names that are never used again; the first `lasting` ones stay."""
+    """Points (P, D) with unique names; the first `lasting` ones are permanent."""
 
     def __init__(self, places: np.ndarray, lasting: int, turnover: Turnover) -> None:
         self.places = places
@@ -59,7 +59,7 @@ class _Points:
         self._lasting, self._turnover, self._next = lasting, turnover, len(places)
 
     def renew(self, fresh: np.ndarray, rng: np.random.Generator) -> None:
-        """Replaces some of the points by fresh ones (P, D)."""
+        """Replaces some of the points by new ones (P, D)."""
         gone = rng.random(len(self.places)) < self._turnover.renewal
         gone[: self._lasting] = False
         count = int(gone.sum())
@@ -74,7 +74,7 @@ class _Points:
 
 
 class _Stream(ABC):
-    """Something that goes on for ever among points that are replaced."""
+    """An endless stream among points that are replaced."""
 
     _rng: np.random.Generator
     _points: _Points
@@ -90,7 +90,7 @@ class _Stream(ABC):
 
     @abstractmethod
     def _draw(self, count: int) -> np.ndarray:
-        """Fresh points (count, D)."""
+        """New points (count, D)."""
 
     @abstractmethod
     def _measure(self, t: int) -> Seen:
@@ -98,7 +98,7 @@ class _Stream(ABC):
 
 
 class CameraStream(_Stream):
-    """A camera goes round over a desk for ever and looks at it.
+    """A camera that circles over a desk forever and faces it.
 
     Args:
         turnover: of the points.
@@ -126,7 +126,7 @@ class CameraStream(_Stream):
         return self._rng.uniform([-0.7, -0.7, 0.0], [0.7, 0.7, 0.3], (count, 3))
 
     def _measure(self, t: int) -> Seen:
-        """The camera's frame t: it goes round in 20 s, nearer and farther."""
+        """The camera's frame t: a lap takes 20 s, at varying distance."""
         s = t / CAMERA_HZ
         turn = 2.0 * np.pi * s / 20.0
         eye = np.array([0.45 * np.sin(turn), -0.8 + 0.2 * np.cos(0.7 * turn), 1.0 + 0.15 * np.sin(1.3 * turn)])
@@ -142,10 +142,10 @@ class CameraStream(_Stream):
 
 
 class RobotStream(_Stream):
-    """A robot drives round in a circle for ever, with noisy odometry, among landmarks that it sees ahead.
+    """A robot that drives in a circle forever, with noisy odometry, and observes landmarks ahead.
 
     Args:
-        turnover: of the landmarks; a fifth of them stay.
+        turnover: of the landmarks; a fifth of them are permanent.
         seed: of the only random generator.
         std_odometry: standard deviations of a step: heading [rad], forward and sideways [m].
         std_z: of range [m] and bearing [rad].
@@ -176,7 +176,7 @@ class RobotStream(_Stream):
         return self._rng.uniform([-reach, -3.0], [reach, self.radius_m * 2.0 + 3.0], (count, 2))
 
     def _pose(self, t: int) -> np.ndarray:
-        """(heading, x, y): the start is the origin; once round takes 300 steps."""
+        """(heading, x, y), starting at the origin; a lap takes 300 steps."""
         turn = 2.0 * np.pi * t / 300.0
         return np.array([turn, self.radius_m * np.sin(turn), self.radius_m * (1.0 - np.cos(turn))])
 

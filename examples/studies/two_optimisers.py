@@ -1,13 +1,13 @@
-"""GTSAM and COLMAP (Ceres) on the same adjustment of a run's observations: two programs that should give one answer.
+"""Bundle adjustment of a run's observations by both GTSAM and COLMAP (Ceres), which should agree.
 
-COLMAP knows no priors on points and no noise but one pixel's, so the problem that both solve alike has pixels of one
-standard deviation and holds the known points exactly; without any, the run's landmarks that are seen most often. Without
-`--run`, the folder of a finished monocular run, a desk is simulated.
+COLMAP supports no priors on points and only one standard deviation of all pixels, so the common problem has equal pixel
+noise and exact known points; without any, the run's most often observed landmarks are held. Without `--run`, the folder
+of a finished monocular run, a desk is simulated.
 
 COLMAP's Ceres perturbs cam_from_world = (R, t) as (Exp(2 δ) R, t + v): the quaternion from the left by HALF a rotation
 vector, the translation by addition, all in the camera's axes. With T = cam_from_world⁻¹ that is T Exp(ξ) with
 ξ = −(2 δ, v − 2 δ × t) to first order. `pycolmap.get_covariance_for_inverse` takes a whole rotation vector and so does
-not fit what `estimate_ba_covariance` returns. The tests check this of the installed build.
+not match the result of `estimate_ba_covariance`. The tests check this for the installed build.
 """
 
 from dataclasses import dataclass, replace
@@ -35,9 +35,9 @@ from rbpf.validation.gtsam.observations import ObservationTable, observation_tab
 from rbpf.validation.gtsam.solvers import BatchSolution
 
 LEAST_HELD = 3
-"""Held points, not on a line, that fix the gauge."""
+"""Number of held points, not collinear, that fix the gauge."""
 DAMPING = 1e-12
-"""Added by COLMAP to the diagonal before it inverts; its own 1e-8 shows in the covariances."""
+"""Damping added by COLMAP to the diagonal before inversion; its default 1e-8 affects the covariances."""
 
 _SAME = 1e-9
 _ITERATIONS = 200
@@ -66,10 +66,10 @@ class ColmapAdjustment:
 
 
 def with_held(log: FeatureLog, held: dict[int, Array]) -> FeatureLog:
-    """The log with these landmarks (name to position) known exactly, and no others: a problem for both optimisers.
+    """The log with exactly these known landmarks (name to position), without errors: a problem for both optimisers.
 
     Raises:
-        InputError: fewer than three, or all on a line: the gauge is not observable.
+        InputError: fewer than three, or all collinear: the gauge is not observable.
     """
     positions = np.array(list(held.values()), dtype=float).reshape(-1, 3)
     if len(positions) < LEAST_HELD or np.linalg.matrix_rank(positions[1:] - positions[0], tol=1e-6) < 2:
@@ -82,11 +82,11 @@ def with_held(log: FeatureLog, held: dict[int, Array]) -> FeatureLog:
 
 
 def adjust_by_colmap(log: FeatureLog, initial: InitialEstimate) -> ColmapAdjustment:
-    """Adjusts all poses and landmarks; the log's known points, which must be exact (`with_held`), stay where they are.
+    """Adjusts all poses and landmarks; the log's known points, which must be exact (`with_held`), are fixed.
 
     Args:
         log: of one camera, all pixels with the same isotropic noise.
-        initial: where to start; landmarks that it lacks are left out.
+        initial: initial estimate; landmarks missing in it are left out.
 
     Raises:
         InputError: the log is a stereo one (its shared row would count twice), its noise is of another form, the
@@ -163,7 +163,7 @@ def _solve(adjuster: Any, name: str) -> None:
 def _covariances(
     model: Any, adjuster: Any, table: ObservationTable, path: Array, points: Array, fixed: NDArray[np.bool_], std: float
 ) -> tuple[Array, Array]:
-    """Marginals (T, 6, 6) and (L, 3, 3). COLMAP's of a point takes all poses as exact: theirs is carried over to it."""
+    """Marginals (T, 6, 6) and (L, 3, 3). COLMAP's for a point is conditional on the poses: their covariance is propagated."""
     import pycolmap
 
     options = pycolmap.BACovarianceOptions()
@@ -189,13 +189,13 @@ def _covariances(
 
 
 def _in_our_chart(joint: Array, path: Array) -> Array:
-    """Blocks (T, T, 6, 6) of COLMAP's tangents in ours."""
+    """Converts blocks (T, T, 6, 6) from COLMAP's tangents to ours."""
     slope = tangent_slope(path)
     return slope[:, None] @ joint @ np.swapaxes(slope, -1, -2)[None]
 
 
 def _marginal(table: ObservationTable, path: Array, points: Array, within: Array, joint: Array, std: float) -> Array:
-    """P + Σ_ij G_i Σ_ij G_jᵀ of each point, where G_i = −P H_li says how it follows pose i."""
+    """P + Σ_ij G_i Σ_ij G_jᵀ of each point, where G_i = −P H_li is its derivative with respect to pose i."""
     by_pose, by_point = reprojection(table, path, points)[1]
     out = np.empty_like(within)
     for index in range(len(points)):
@@ -208,7 +208,7 @@ def _marginal(table: ObservationTable, path: Array, points: Array, within: Array
 
 
 HELD = 4
-"""Landmarks that are held where none are known."""
+"""Number of held landmarks without known points."""
 
 
 @final
@@ -217,7 +217,7 @@ class TwoOptima:
     """Both optima of one problem.
 
     Attributes:
-        log: the problem, with the landmarks that are held as exact known points.
+        log: the problem, with held landmarks as exact known points.
         gtsam: one optimum.
         colmap: the other.
         pose_differences: (T, 6) of the poses in the right chart [rad, m].
@@ -250,16 +250,16 @@ class TwoOptima:
 
 
 def adjust_by_both(log: FeatureLog, world_from_camera: Array) -> TwoOptima:
-    """Adjusts a log by both optimisers, from the same poses.
+    """Adjusts a log by both optimisers, from the same initial poses.
 
     Landmarks that the observations do not determine are left out of both.
 
     Args:
         log: of one camera, all pixels with the same isotropic noise.
-        world_from_camera: (T, 7) where both begin, such as a run's path.
+        world_from_camera: (T, 7) initial path of both, such as a run's.
 
     Raises:
-        InputError: too little is seen to fix the gauge, or an optimiser does not converge.
+        InputError: too few observations to fix the gauge, or an optimiser does not converge.
     """
     frames = connected_frames(log)
     if frames.size < 2:
@@ -289,7 +289,7 @@ def adjust_by_both(log: FeatureLog, world_from_camera: Array) -> TwoOptima:
 
 
 def _held(log: FeatureLog, settled: dict[int, Array]) -> dict[int, Array]:
-    """Known points where they are said to be; else, of the landmarks seen most often, those farthest apart."""
+    """Known points at their given positions; else, of the most often observed landmarks, those farthest apart."""
     if log.known is not None:
         given = dict(zip(log.known.names.tolist(), log.known.positions, strict=True))
         return {name: point for name, point in given.items() if name in settled}
@@ -336,7 +336,7 @@ def _cross(v: Array) -> Array:
 
 
 def main(run: Path | None = None, out: Path = Path("demo/two_optimisers"), quick: bool = False) -> dict[str, float]:
-    """Adjusts a run's observations twice and prints the greatest differences.
+    """Adjusts a run's observations twice and prints the largest differences.
 
     Args:
         run: folder of a finished monocular run.

@@ -1,17 +1,17 @@
-"""Does the verdict tell the truth? Runs whose fault is known, judged as a run judges itself, and with the truth beside.
+"""Validation of the verdict: runs with known faults, assessed without and with ground truth.
 
-A robot drives round among landmarks. In eight runs the filter is told one thing wrongly: the noise of its sensor or of
-its odometry too large or too small, an odometer with a bias of one of its standard deviations, a fifth of the sightings
-under wrong names, or derivatives of the measured angle by the landmark with the wrong sign. In two nothing is wrong,
-and in two nothing but that few particles with maps of their own go round in loops, so that they share one past; with a
-joint map the same loops are right. The last one is a camera without known points, whose scale is arbitrary. A run
-without truth is judged by its innovations and by the batch posterior of its measurements. Beside the verdicts stands
-what they are about: how many poses lie in the 95 % region, and how many times larger than claimed the errors of poses
-and landmarks are; those of the camera in the world of its first pose, which a simulation knows exactly.
+A robot drives among landmarks. In eight runs the filter's model has one fault: sensor or odometry noise too large or too
+small, a bias of the odometry of one standard deviation, a fifth of the observations with wrong association, or a wrong
+sign of the measured angle's derivative with respect to the landmark. Two runs have no fault, and in two the only fault is
+that few particles with per-particle maps drive loops, so that they share one past; with a joint map the same loops are
+right. The last one is a camera without known points, whose scale is arbitrary. A run without ground truth is assessed by
+its innovations and by the batch posterior of its measurements. The verdicts are shown with the facts: the fraction of
+poses in the 95 % region, and the ratio of actual to claimed errors of poses and landmarks; those of the camera in the
+world of its first pose, which is exact in a simulation.
 
-With `--worlds N` it says how often it is wrong: joint maps in N worlds for each of `FAULTS`, judged without the truth, with
-it, and by a truth alone that errs three times as much as the filter, whose standard deviations are stated. A fault's runs
-are right where their errors, in the mean over the worlds, are as claimed within `STATE_FACTOR`.
+`--worlds N` shows how often the verdict is wrong: joint maps in N worlds for each of `FAULTS`, assessed without the truth,
+with it, and by a truth alone with stated errors three times those of the filter. A fault's runs are right if their errors,
+in the mean over the worlds, are as claimed within `STATE_FACTOR`.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -63,7 +63,7 @@ def scale_odometry_noise(log: RobotLog, factor: float) -> RobotLog:
 
 
 def bias_odometry(log: RobotLog, sigmas: float) -> RobotLog:
-    """Adds a constant forward motion of so many of its standard deviations to each step's odometry."""
+    """Adds a constant forward bias to each step's odometry, in standard deviations."""
     forward = 1 if log.space.dim == SE2.dim else 3
 
     def change(frame: Frame) -> Frame:
@@ -77,7 +77,7 @@ def bias_odometry(log: RobotLog, sigmas: float) -> RobotLog:
 
 
 def swap_names(log: RobotLog, fraction: float, rng: np.random.Generator) -> RobotLog:
-    """Gives a fraction of the observations the name of another landmark, one that is not seen in the same step."""
+    """Gives a fraction of the observations the name of another landmark, one not observed in the same step."""
     every = np.unique(np.concatenate([frame.landmarks for frame in log.frames]))
 
     def change(frame: Frame) -> Frame:
@@ -90,7 +90,7 @@ def swap_names(log: RobotLog, fraction: float, rng: np.random.Generator) -> Robo
 
 
 def repeat_errors(log: RobotLog, factor: float) -> RobotLog:
-    """Adds to every sighting an error that repeats with the next of its landmark (correlation 0.95), as large as its noise.
+    """Adds an error as large as the noise to every observation, correlated (0.95) between observations of a landmark.
 
     Claims `factor` times the standard deviations of both together.
     """
@@ -113,7 +113,7 @@ def _changed(log: RobotLog, change: Callable[[Frame], Frame]) -> RobotLog:
 
 @contextmanager
 def wrong_derivative() -> Iterator[None]:
-    """The measured angle's derivative by the landmark has the wrong sign."""
+    """The measured angle's derivative with respect to the landmark has the wrong sign."""
     right = RangeBearing.jacobians
 
     def wrong(self: RangeBearing, *args: np.ndarray, **named: np.ndarray) -> Jacobians:
@@ -135,12 +135,12 @@ LOOPS = RobotWorld(steps=300, landmarks=150, radius_m=15.0, extent_m=22.0)
 
 @dataclass(frozen=True)
 class Case:
-    """A run of which is known what is wrong with it.
+    """A run with a known fault.
 
     Attributes:
-        name: what is.
-        run: makes it.
-        wrong: whether anything is.
+        name: of the fault.
+        run: performs the run.
+        wrong: whether there is a fault.
     """
 
     name: str
@@ -168,7 +168,7 @@ def robot(
 
 
 def camera_without_known_points() -> Run:
-    """A camera in a hand over a desk, of which nothing is known beforehand."""
+    """A run of a hand-held camera over a desk, without known points."""
     log = simulate_features(DeskWorld(frames=120), Measuring(), MONO, 0)
     return filter_features(replace(log, known=None), MonoConfig(particles=100, map="particles"))
 
@@ -193,7 +193,7 @@ CASES = (
 
 
 def judged(run: Run, folder: Path) -> tuple[Verdict, Verdict, dict[str, float]]:
-    """Verdicts on a run without the truth and with it, and what the truth says of it."""
+    """Verdicts on a run without and with ground truth, and its actual errors."""
     write_run(run, folder, {"recording": str(folder)})
     record = RunFolder.open(folder)
     own = [compare_with_batch(record)[0], compare_with_itself(record)]
@@ -206,7 +206,7 @@ def judged(run: Run, folder: Path) -> tuple[Verdict, Verdict, dict[str, float]]:
 
 
 def from_first_pose(record: RunFolder) -> RunTruth:
-    """A truth that is exact, in the world that begins with the run's first pose, and in the run's scale."""
+    """Exact ground truth in the world of the run's first pose, and in the run's scale."""
     truth, ours = record.truth, record.path.world_from_body[record.truth.rows]
     begin = SE3.compose(ours[0], SE3.inverse(truth.poses[0]))
     poses = SE3.compose(begin, truth.poses)
@@ -219,16 +219,16 @@ def from_first_pose(record: RunFolder) -> RunTruth:
 
 
 def is_right(case: Case, verdict: Verdict, found: Mapping[str, float]) -> bool:
-    """Whether a verdict is true of a run.
+    """Whether a verdict on a run is right.
 
-    Trust is right where poses and landmarks err as claimed within `STATE_FACTOR`, also where two wrongs make it so. What is
-    wrong with a model is reason enough not to trust a run, errors outside that factor always are. A side that is named
-    must be that of the errors.
+    Trust is right if errors of poses and landmarks are as claimed within `STATE_FACTOR`, even if faults cancel. A model's
+    fault is sufficient reason for distrust, and errors outside that factor require it. If over- or underconfidence is
+    named, it must be that of the errors.
 
     Args:
-        case: of the run.
-        verdict: on it.
-        found: what the truth says of it.
+        case: the run's case.
+        verdict: on the run.
+        found: its actual errors.
     """
     ratios = [np.sqrt(found[name]) for name in (NEES, LANDMARKS) if name in found]
     most, inside = max(ratios), 1.0 / STATE_FACTOR <= min(ratios) <= max(ratios) <= STATE_FACTOR
@@ -238,7 +238,7 @@ def is_right(case: Case, verdict: Verdict, found: Mapping[str, float]) -> bool:
     return bool(aside and (verdict.trust == "do not trust") == (case.wrong or not inside))
 
 
-#: What changes a log, and how many times as large as they are the reported standard deviations of poses are made.
+#: Change of a log, and factor on the reported standard deviations of poses.
 FAULTS: dict[str, tuple[Fault, float]] = {
     "nothing": (lambda log: log, 1.0),
     **{f"sensor noise × {k:g}": (partial(scale_sensor_noise, factor=k), 1.0) for k in (0.33, 0.5, 2.0, 3.0, 4.0)},
@@ -250,7 +250,7 @@ FAULTS: dict[str, tuple[Fault, float]] = {
 
 
 def coarse(truth: RunTruth, cov: np.ndarray, rng: np.random.Generator) -> tuple[RunTruth, Precision]:
-    """A truth of SE(2) that errs three times as covariances (T, 3, 3) say, alike from step to step; its precision."""
+    """Ground truth of SE(2) with correlated errors of three times the covariances' (T, 3, 3) size, and its precision."""
     std = 3.0 * np.sqrt(np.diagonal(cov, axis1=1, axis2=2).mean(axis=0))
     own = Precision(float(std[1:].max()), float(std[0]))
     drawn = lfilter([np.sqrt(0.19)], [1.0, -0.9], rng.normal(size=(len(truth.poses) + 100, 3)), axis=0)[100:]
@@ -259,7 +259,7 @@ def coarse(truth: RunTruth, cov: np.ndarray, rng: np.random.Generator) -> tuple[
 
 
 def rates(worlds: int) -> list[list[object]]:
-    """Of each fault how many times as large as claimed errors of poses and landmarks are, and a letter for each verdict."""
+    """For each fault the ratio of actual to claimed errors of poses and landmarks, and a letter for each verdict."""
     rows: list[list[object]] = []
     for name, (fault, factor) in FAULTS.items():
         told, squares = [], []
@@ -290,12 +290,12 @@ def rates(worlds: int) -> list[list[object]]:
 
 
 def main(out: Path = Path("demo/verdict"), quick: bool = False, worlds: int = 0) -> dict[str, bool]:
-    """Prints the verdicts, and leaves their table and a picture of the errors that they are about.
+    """Prints the verdicts, and writes their table and a plot of the errors.
 
     Args:
         out: folder for the table and the picture.
         quick: only the shortest of the cases.
-        worlds: in place of the cases, so many worlds for each fault.
+        worlds: instead of the cases, number of worlds for each fault.
     """
     rows, right = [], {}
     if worlds:

@@ -1,4 +1,4 @@
-"""`odometry.csv` and `odometry.yaml`: what a robot's wheels say about its motion, beside a sequence of images.
+"""`odometry.csv` and `odometry.yaml`: a robot's wheel odometry along with a sequence of images.
 
 odometry.csv, one line per reading in order of time, comma-separated, lines that start with # are comments:
 
@@ -6,11 +6,11 @@ odometry.csv, one line per reading in order of time, comma-separated, lines that
     1400000000000000000,0,0,0,0,0,0
     1400000000066666667,0.0179,0.0001,0.0052,0.0005,0.0001,0.0019
 
-`dx_m`, `dy_m`, `dyaw_rad` are the motion since the line before, seen from the robot's frame there: x forwards, y to the
-left, yaw to the left; on the first line they are zero. The sigmas are the standard deviations of what is random in
-it; wrong diameters of the wheels, which err the same way all the time, are not in them.
+`dx_m`, `dy_m`, `dyaw_rad` are the motion since the line before, in the robot's frame there: x forwards, y to the left,
+yaw to the left; on the first line they are zero. The sigmas are the standard deviations of its random errors, without
+systematic errors such as wrong wheel diameters.
 
-odometry.yaml says where the camera stands on the robot:
+odometry.yaml has the camera's pose on the robot:
 
     robot_from_camera: [qx, qy, qz, qw, x, y, z]   # unit quaternion; m
 """
@@ -32,15 +32,15 @@ KIND = "the readings of a robot's wheels"
 MOTION = ("dx_m", "dy_m", "dyaw_rad")
 SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_yaw_rad")
 
-UNIT = 1e-6  #: How far a quaternion's length may be from 1.
+UNIT = 1e-6  #: Tolerance of a quaternion's norm.
 
 
 @dataclass(frozen=True)
 class WheelOdometry:
     """Readings of a robot's wheels."""
 
-    stamps_ns: np.ndarray  #: (T,) int64 times, strictly rising.
-    #: (T - 1, 3) motion from each time to the next, elements of SE(2): [theta, x, y] in the robot's frame.
+    stamps_ns: np.ndarray  #: (T,) int64 times, strictly ascending.
+    #: (T - 1, 3) motions between consecutive times, elements of SE(2): [theta, x, y] in the robot's frame.
     delta: np.ndarray
     std: np.ndarray  #: (T - 1, 3) standard deviations of theta [rad], x and y [m].
     robot_from_camera: np.ndarray  #: (7,) pose of the left camera on the robot.
@@ -85,7 +85,7 @@ def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
 
 
 def write_wheel_odometry(folder: Path, odometry: WheelOdometry) -> None:
-    """odometry.csv and odometry.yaml, as described above."""
+    """Writes odometry.csv and odometry.yaml, as described above."""
     table = np.roll(np.hstack([odometry.delta, odometry.std]).reshape(-1, 2, 3), -1, axis=2).reshape(-1, 6)
     rows = [[0.0] * 6, *table.tolist()]
     numbers = [[f"{x:.9g}" for x in row] for row in rows]

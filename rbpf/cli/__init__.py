@@ -28,7 +28,7 @@ BAD_INPUT, STOPPED = 2, 130  #: Exit codes; 0 is success, 1 a fault of the progr
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Printed):
-    """Render a desk that a camera moves over, run monocular SLAM on the images, write plots and the annotated video."""
+    """Render images of a desk, run monocular SLAM on them, and write plots and the annotated video."""
 
     out: Path = Path("demo")  #: folder for the images and the results.
     frames: Annotated[int, Range(ge=2, le=MOST)] = 240  #: number of images, 30 per second.
@@ -55,7 +55,7 @@ APP = Commands(
   check:     rbpf validate RUN --against gtsam; rbpf compare RUN OTHER; rbpf sweep plan.yaml
   machine:   rbpf doctor; eval "$(rbpf completion bash)"
 
-Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C.""",
+Exit codes: 0 success, 1 a fault of the program, 2 bad input (explained in one sentence), 130 stopped by Ctrl-C.""",
     {
         "demo": Demo,
         "simulate": SIMULATE,

@@ -16,13 +16,13 @@ LOOSE = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate(Printed):
-    """Find the camera's focal lengths, centre and distortion from pictures of a chessboard, and write camera.yaml."""
+    """Estimate a camera's focal lengths, principal point and distortion from images of a chessboard; write camera.yaml."""
 
     #: folder of images of the board, 15 or more from different directions, or a video of it.
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
-    board: str  #: inner corners of the chessboard, the places where four squares meet, as 9x6.
+    board: str  #: inner corners (columns x rows) of the chessboard, where four squares meet, such as 9x6.
     square: Positive  #: side of its squares, m.
-    #: of the camera; fisheye is an equidistant lens, for fields of view of some 110 degrees and more.
+    #: camera model; fisheye is an equidistant lens, for fields of view of about 110 degrees or more.
     model: Literal["pinhole", "fisheye"] = "pinhole"
     out: Path = Path("calibration")  #: folder for camera.yaml, calibration.png and calibration.json.
 
@@ -59,9 +59,9 @@ class Calibrate(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class Recalibrate(Printed):
-    """Find the focal length and k1 that a run's own measurements prefer, and write camera.yaml: for nominal cameras."""
+    """Estimate focal length and k1 from a run's own measurements, and write camera.yaml: for nominal calibrations."""
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder of a finished run of one camera.
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder of a finished monocular run.
     out: Path = Path("recalibration")  #: folder for camera.yaml.
 
     def __call__(self) -> None:

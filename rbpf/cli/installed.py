@@ -27,9 +27,9 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Printed):
-    """Show what is installed, in which versions, and which parts work here; compile the kernels."""
+    """Show installed versions and which parts work on this machine; compile the kernels."""
 
-    compile: bool = True  #: compile the kernels, once, so that the first run need not.
+    compile: bool = True  #: compile the kernels now, instead of at the first run.
 
     def __call__(self) -> None:
         from importlib.metadata import PackageNotFoundError, requires, version
@@ -145,9 +145,9 @@ _ZSH = (
 
 @dataclass(frozen=True, kw_only=True)
 class Completion:
-    """Print what makes a shell complete the commands and options of rbpf: eval "$(rbpf completion bash)"."""
+    """Print a script that completes the commands and options of rbpf in a shell: eval "$(rbpf completion bash)"."""
 
-    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]  #: which shell.
+    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]  #: the shell.
 
     def __call__(self) -> None:
         from rbpf.cli import APP, PROGRAM

@@ -1,4 +1,4 @@
-"""Commands about finished runs: compare them with something, build their page, export them, sweep over settings."""
+"""Commands about finished runs: compare them, build their report, export them, sweep over settings."""
 
 import math
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ Format = Literal["tum", "kitti", "ply", "colmap", "rerun", "npz"]
 
 @dataclass(frozen=True, kw_only=True)
 class Validate(Printed):
-    """Compare a run with the truth, an optimum or another path: JSON, pictures, and the lights on top of its report."""
+    """Compare a run with the truth, an optimum or another path: writes JSON, plots, and the lights on top of its report."""
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
-    #: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder written by `rbpf run`.
+    #: the recording's ground truth, the batch optimum of the same measurements, or a reconstruction of the images.
     against: Literal["groundtruth", "gtsam", "colmap"] = "groundtruth"
-    #: instead, a file of known relations between poses (t1 t2 x y z roll pitch yaw); by default none.
+    #: instead, a file of known relative poses (t1 t2 x y z roll pitch yaw); by default none.
     relations: Where = None
     path: Where = None  #: instead, another path of the same recording, in TUM format; by default none.
-    truth_std_m: NotNegative = 0.0  #: standard deviation per axis of the ground truth's own positions, m.
-    truth_std_deg: NotNegative = 0.0  #: of its rotations, degrees.
-    out: Where = None  #: a further folder for the JSON, which is always written into the run's own; by default none.
+    truth_std_m: NotNegative = 0.0  #: standard deviation of the ground truth's positions, per axis, m.
+    truth_std_deg: NotNegative = 0.0  #: standard deviation of its rotations, per axis, degrees.
+    out: Where = None  #: further folder for the JSON, which is always written to the run's folder; by default none.
 
     def __call__(self) -> None:
         from rbpf.runs.truth import Precision
@@ -53,9 +53,9 @@ class Validate(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Printed):
-    """Build the report of a run again, from the files in its folder."""
+    """Rebuild the report of a run from the files in its folder."""
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder written by `rbpf run`.
 
     def __call__(self) -> None:
         from rbpf.validation.report.page import write_report
@@ -65,12 +65,12 @@ class Report(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class Plot(Printed):
-    """Draw the pictures of a run, or paths, errors and consistency of several runs together, with a table of figures."""
+    """Plot a run, or paths, errors and consistency of several runs together, with a table of figures."""
 
-    #: folders that `rbpf run` left; several of one recording.
+    #: folders written by `rbpf run`, of one recording.
     runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN")]
-    out: Path = Path("plots")  #: folder for the pictures.
-    format: tuple[Literal["png", "pdf", "svg"], ...] = ("png",)  #: one or several; pdf and svg are vectors.
+    out: Path = Path("plots")  #: folder for the plots.
+    format: tuple[Literal["png", "pdf", "svg"], ...] = ("png",)  #: one or several; pdf and svg are vector graphics.
 
     def __call__(self) -> None:
         from rbpf.runs.files import prepare_folder
@@ -104,9 +104,9 @@ def _answer(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Printed):
-    """Write a run in the formats of other programs."""
+    """Export a run to the formats of other programs."""
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder written by `rbpf run`.
     #: one or several: trajectory as TUM or KITTI, map and path as PLY, a COLMAP model, a Rerun recording, everything
     #: as one NumPy archive.
     format: tuple[Format, ...]
@@ -126,12 +126,12 @@ def _require_workers(workers: int) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Printed):
-    """Run particles × seeds × sequences × options in parallel, to one table; call it again to go on."""
+    """Run particles × seeds × sequences × options in parallel, into one table; repeat the command to continue."""
 
     #: YAML file with system, sequences, particles, seeds, options and settings.
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
-    out: Path = Path("sweep")  #: folder for the rows and the table; what is finished there is not computed again.
-    workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes of this machine; -1 is one per core.
+    out: Path = Path("sweep")  #: folder for the rows and the table; runs finished there are not repeated.
+    workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: number of processes on this machine; -1 is one per core.
     scheduler: Text = None  #: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
 
     def __call__(self) -> None:
@@ -152,12 +152,12 @@ class Sweep(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(Printed):
-    """Which of two runs' settings explains their recording better: difference of log-evidence, with its error."""
+    """Which of two runs' settings explain their recording better: difference of log-evidence, with its error."""
 
-    run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]  #: folder that `rbpf run` left.
+    run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]  #: folder written by `rbpf run`.
     run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]  #: another one of the same recording.
-    seeds: Count = 5  #: runs of each, from which the error is estimated; parts of the draws where it is done in batch.
-    workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes; -1 is one per core.
+    seeds: Count = 5  #: repeated runs of each, which give the error; in batch, parts of the samples.
+    workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: number of processes; -1 is one per core.
 
     def __call__(self) -> None:
         from rbpf.validation.consistency.model_comparison import compare_runs

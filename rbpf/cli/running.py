@@ -34,22 +34,22 @@ if TYPE_CHECKING:
 class ResultOptions:
     """Folder and kinds of results."""
 
-    #: folder for the results; by default run, or run-2, run-3, … where there are runs already; the last of them to
-    #: resume or to overwrite.
+    #: folder for the results; by default run, or the next of run-2, run-3, … if there are runs already; with --resume
+    #: or --overwrite the latest of them.
     out: Where = None
-    resume: Flag = False  #: go on from the checkpoint in the results' folder, if there is one.
-    overwrite: Flag = False  #: write over the run that lies in the results' folder.
-    view: Flag = False  #: show the run in the Rerun viewer while it is made.
-    rerun: Where = None  #: also write a recording (.rrd) for the Rerun viewer, with its layout; by default none.
+    resume: Flag = False  #: continue from the checkpoint in the results' folder, if there is one.
+    overwrite: Flag = False  #: replace the run in the results' folder.
+    view: Flag = False  #: show the run live in the Rerun viewer.
+    rerun: Where = None  #: also write a Rerun recording (.rrd) with its layout; by default none.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageResultOptions(ResultOptions):
     """Folder and kinds of results."""
 
-    batch: bool = True  #: also adjust the same measurements in batch with GTSAM.
-    #: iterations after which the batch adjustment is given up (the run's results remain); by default as many that thirty
-    #: million observations are linearised.
+    batch: bool = True  #: also compute the batch optimum of the same measurements with GTSAM.
+    #: maximum iterations of the batch adjustment, which is given up after them (the run's results remain); by default as
+    #: many as linearise thirty million observations in total, at least 100.
     batch_limit: WholeCount = None
     video: bool = True  #: write the annotated video.
 
@@ -58,21 +58,21 @@ class ImageResultOptions(ResultOptions):
 class FilterOptions:
     """Settings of the filter and its computation."""
 
-    #: of the random generators; by default 0, or as in --config.
+    #: seed of the random generators; by default 0, or as in --config.
     seed: Annotated[Whole, Range(ge=0, le=2**63 - 1)] = None
-    config: Where = None  #: YAML file of settings, such as a former run's config.yaml; by default the system's own.
-    #: a setting as key=value, such as resampling.scheme=residual; may be given several times.
+    config: Where = None  #: YAML file of settings, such as that of an earlier run; by default the system's own.
+    #: a setting as key=value, such as resampling.scheme=residual.
     set: tyro.conf.UseAppendAction[tuple] = ()
-    threads: Annotated[Whole, Range(ge=1, le=4096)] = None  #: threads of the kernels; by default all.
+    threads: Annotated[Whole, Range(ge=1, le=4096)] = None  #: number of threads of the kernels; by default all.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
     """The used part of the recording."""
 
-    start: NotNegative = 0.0  #: use the frames from so many seconds after the first on; of a log without times, steps.
-    end: RealPositive = None  #: use the frames until so many seconds after the first; by default all.
-    every: Count = 1  #: of these use every n-th.
+    start: NotNegative = 0.0  #: skip this many seconds at the start; steps for a log without times.
+    end: RealPositive = None  #: stop this many seconds after the first frame; by default at the last one.
+    every: Count = 1  #: use every n-th of these frames.
 
     def part(self, resize: int | None = None) -> "Part":
         """The used part of the recording."""
@@ -85,35 +85,35 @@ class RecordingOptions:
 class ImageOptions(RecordingOptions):
     """The used part of the recording, and its camera."""
 
-    #: camera.yaml instead of the sequence's own, for the images before they are resized; by default the latter.
+    #: camera.yaml, for the images before they are resized; by default the sequence's own calibration.
     calibration: Where = None
-    #: make the images smaller, to this width in px, and the calibration with them; by default they stay as they are.
+    #: resize the images to this smaller width in px, and adapt the calibration; by default they keep their size.
     resize: Annotated[Whole, Range(ge=1, le=MOST_PX)] = None
-    #: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
+    #: for a ROS bag, the topic of the images, or LEFT,RIGHT; by default those in the bag.
     image_topic: Text = None
-    truth_topic: Text = None  #: of a ROS bag, the topic of the camera's true poses; by default none.
+    truth_topic: Text = None  #: for a ROS bag, the topic of the camera's ground-truth poses; by default none.
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
     """Prior knowledge of the world: points, a board, or a map of an earlier run."""
 
-    #: table of points of known position in the first image; by default none: the world is the first
-    #: camera's and its scale is arbitrary.
+    #: table of points of known position in the first image; by default none: the world is then the first camera's
+    #: frame, of arbitrary scale.
     known_points: Where = None
-    #: instead of known points, inner corners of a chessboard fully visible in the first image, as 9x6; the
-    #: world is then the board's; by default none.
+    #: instead of known points, inner corners (columns x rows) of a chessboard fully visible in the first image, such
+    #: as 9x6; the world is then the board's frame; by default none.
     board: Text = None
-    square: RealPositive = None  #: side of its squares, m; by default none.
-    #: instead of known points, a board of ArUco markers, as 5x7, some of them visible in the first image;
-    #: the world is then the board's; by default none.
+    square: RealPositive = None  #: side of the chessboard's squares, m; by default none.
+    #: instead of known points, a board of ArUco markers (columns x rows), such as 5x7, some of them visible in the first
+    #: image; the world is then the board's frame; by default none.
     aruco: Text = None
-    marker: RealPositive = None  #: side of a marker, its black border included, m; by default none.
-    gap: NotNegative = 0.01  #: between two markers, m.
-    dictionary: str = "4x4_50"  #: of the markers' patterns, as 4x4_50 or 6x6_250.
-    #: folder of a run, or its known_map.npz, in which the camera is localised; by default a map is made.
+    marker: RealPositive = None  #: side of a marker, including its black border, m; by default none.
+    gap: NotNegative = 0.01  #: gap between two markers, m.
+    dictionary: str = "4x4_50"  #: ArUco dictionary of the markers, such as 4x4_50 or 6x6_250.
+    #: folder of an earlier run, or its known_map.npz, with the map to localise in; by default a map is built.
     map: Where = None
-    localize: Flag = False  #: localise in the known map of --map, which is not changed.
+    localize: Flag = False  #: localise in the known map of --map, which stays fixed.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,16 +144,16 @@ class ImageRunOptions(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RunRangeBearing(RunOptions):
-    """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
+    """Range-bearing SLAM over a robot's log (FastSLAM 2.0), compared with the batch optimum of the same measurements."""
 
     #: recording: a folder of an MRCLAM or MRPT log, or a Victoria Park graph.
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
     particles: WholeCount = None  #: number of particles; by default 100, or as in --config.
-    #: known association by the log's names, or maximum likelihood; by default known, or as in --config.
+    #: data association: known, by the log's names, or ml, maximum likelihood; by default known, or as in --config.
     association: Annotated[
         Optional[Literal["known", "ml"]], tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
     ] = None
-    batch: bool = True  #: also solve for the batch optimum with GTSAM.
+    batch: bool = True  #: also compute the batch optimum of the same measurements with GTSAM.
 
     def __call__(self) -> None:
         from rbpf.runs.recordings import RobotRecording
@@ -172,13 +172,12 @@ class RunRangeBearing(RunOptions):
 class RunLaser(RunOptions):
     """Grid SLAM over a laser scanner's log (Grisetti et al. 2007: scan matching in each particle's own map)."""
 
-    #: recording: a CARMEN log (FLASER, ROBOTLASER, RAWLASER with ODOM), plain or packed by gzip, or a ROS bag with
-    #: LaserScan.
+    #: recording: a CARMEN log (FLASER, ROBOTLASER, RAWLASER with ODOM), plain or gzipped, or a ROS bag with LaserScan.
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
     particles: WholeCount = None  #: number of particles; by default 30, or as in --config.
-    scanner: Text = None  #: message (CARMEN) or topic (ROS) of the scans; by default the first that the log has.
+    scanner: Text = None  #: message (CARMEN) or topic (ROS) of the scans; by default the first in the log.
     max_range: RealPositive = None  #: maximum range, beyond which there is no return, m; by default the log's.
-    upside_down: Flag = False  #: the scanner is mounted upside down, or its readings run clockwise.
+    upside_down: Flag = False  #: the scanner is mounted upside down, or its readings are in clockwise order.
 
     def __call__(self) -> None:
         from rbpf.runs.recordings import LaserRecording
@@ -193,8 +192,8 @@ class RunLaser(RunOptions):
 class RunMono(ImageRunOptions):
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
 
-    #: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml), a video with a
-    #: camera.yaml beside it, a ROS bag, or the number of a camera at this computer, as 0.
+    #: images: a folder in a known format (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml), a video with a
+    #: camera.yaml beside it, a ROS bag, or the number of a connected camera, such as 0.
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
     particles: WholeCount = None  #: number of particles; by default 50, or as in --config.
     world: Group[WorldOptions] = WorldOptions()
@@ -231,8 +230,8 @@ class RunMono(ImageRunOptions):
 class RunStereo(ImageRunOptions):
     """Stereo SLAM over a sequence of pairs of images (SIFT landmarks in a joint map, visual odometry)."""
 
-    #: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0 and cam1,
-    #: of KITTI odometry with image_0 and image_1, or a ROS bag with two topics of images.
+    #: image pairs, rectified or with a calibration to rectify them: a folder of EuRoC ASL with cam0 and cam1, of KITTI
+    #: odometry with image_0 and image_1, or a ROS bag with two image topics.
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PAIRS")]
     particles: WholeCount = None  #: number of particles; by default 50, or as in --config.
     #: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default 6, or as in --config.
@@ -260,7 +259,7 @@ RUN = Commands(
   rbpf run laser robot.clf --out RUN
 
 `rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
-It is refused when the recording has changed. Further options are those of the run's system.""",
+It is refused if the recording has changed. Further options are those of the run's system.""",
     {"range-bearing": RunRangeBearing, "laser": RunLaser, "mono": RunMono, "stereo": RunStereo},
     compile_kernels,
 )

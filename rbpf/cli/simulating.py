@@ -22,7 +22,7 @@ class SimulateRangeBearing(Printed):
     """A log of a robot among landmarks, with ground truth."""
 
     out: Path  #: folder for the log.
-    seed: Seed = 0  #: of the random generator.
+    seed: Seed = 0  #: seed of the random generator.
     spatial: Flag = False  #: six degrees of freedom instead of three.
     steps: Annotated[int, Range(ge=2, le=MOST)] = 200  #: number of steps, one a second.
     landmarks: Count = 60  #: number of landmarks.
@@ -38,12 +38,12 @@ class SimulateRangeBearing(Printed):
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateLaser(Printed):
-    """A log of a robot with a laser scanner that drives round a corridor, with ground truth."""
+    """A log of a robot with a laser scanner that drives round a closed corridor, with ground truth."""
 
-    out: Path  #: folder for the log robot.clf, the path truth.tum, and robot.relations.
-    seed: Seed = 0  #: of the random generator.
+    out: Path  #: folder for the log robot.clf, the true path truth.tum, and robot.relations.
+    seed: Seed = 0  #: seed of the random generator.
     scans: Annotated[int, Range(ge=2, le=MOST)] = 400  #: number of scans.
-    laps: Annotated[int, Range(ge=1, le=1000)] = 2  #: number of rounds.
+    laps: Annotated[int, Range(ge=1, le=1000)] = 2  #: number of laps.
 
     def __call__(self) -> None:
         from rbpf.validation.simulation.laser import LaserWorld, simulate_laser
@@ -59,22 +59,22 @@ class RenderOptions(Printed):
     focal_fraction: ClassVar[float]  #: focal length by default, as a fraction of the width.
     #: folder for the sequence (EuRoC ASL, with camera.yaml and known_points.csv); must not exist, or be empty.
     out: Path
-    seed: Seed = 0  #: of the random generator.
-    width: Annotated[int, Range(ge=2, le=MOST_PX)] = 640  #: of the images, px.
-    height: Annotated[int, Range(ge=2, le=MOST_PX)] = 480  #: of the images, px.
+    seed: Seed = 0  #: seed of the random generator.
+    width: Annotated[int, Range(ge=2, le=MOST_PX)] = 640  #: width of the images, px.
+    height: Annotated[int, Range(ge=2, le=MOST_PX)] = 480  #: height of the images, px.
     focal_px: RealPositive = None  #: focal length, px; by default a fraction of the width.
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 of the lens.
-    #: k1, k2, k3, k4 of an equidistant lens instead; by default none. The ideal one has 0 0 0 0; it sees 140
-    #: degrees where the focal length is 0.41 of the width.
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3.
+    #: instead, k1, k2, k3, k4 of an equidistant lens; by default none. The ideal one has 0 0 0 0; its field of view is 140
+    #: degrees for a focal length of 0.41 of the width.
     fisheye: tuple[float, float, float, float] | None = None
-    baseline_m: Real = None  #: of a second camera to the right, m; None or nothing for none.
-    known: CountOrNone = 6  #: corners in the first image whose positions are given, at least 4; 0 for none.
-    noise_std: NotNegative = 3.0  #: of the sensor, grey levels.
-    blur_s: NotNegative = 0.01  #: the shutter is open this long, s.
-    exposure_drift: Fraction = 0.15  #: greatest change of the exposure, as a fraction.
-    vignetting: Fraction = 0.2  #: loss of light in the corners, as a fraction.
-    contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
-    #: first frame in the dark and number of frames; by default none.
+    baseline_m: Real = None  #: baseline to a second camera on the right, m; by default none.
+    known: CountOrNone = 6  #: number of known points, corners in the first image, at least 4; 0 for none.
+    noise_std: NotNegative = 3.0  #: standard deviation of the sensor noise, grey levels.
+    blur_s: NotNegative = 0.01  #: exposure time, s.
+    exposure_drift: Fraction = 0.15  #: largest relative change of the exposure.
+    vignetting: Fraction = 0.2  #: relative loss of light in the corners.
+    contrast: NotNegative = 1.0  #: contrast of all textures; 1 is rich, 0.1 poor.
+    #: first dark frame and number of dark frames; by default none.
     blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = None
     depth: Flag = False  #: also write depth images.
     #: quality of JPEG files, 1 to 100; 0 writes lossless PNG.
@@ -88,8 +88,8 @@ class ImagesOptions(RenderOptions):
     focal_fraction = 0.8
     frames: Annotated[int, Range(ge=2, le=MOST)] = 300  #: number of images, 30 per second.
     focal_px: RealPositive = None  #: focal length, px; by default 0.8 of the width.
-    board: Text = None  #: a chessboard of so many inner corners lies on the desk, as 9x6; by default none.
-    square: RealPositive = None  #: side of its squares, m; by default none.
+    board: Text = None  #: inner corners (columns x rows) of a chessboard on the desk, such as 9x6; by default none.
+    square: RealPositive = None  #: side of the chessboard's squares, m; by default none.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ class SimulateDesk(ImagesOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRoom(ImagesOptions):
-    """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
+    """Images of a room with pictures on its walls, taken by a camera carried in a circle, with ground truth."""
 
     def __call__(self) -> None:
         from rbpf.validation.simulation.desk_and_room import TexturedRoom
@@ -119,7 +119,7 @@ class SimulateRoom(ImagesOptions):
 
 
 SIMULATE = Commands(
-    "Make a recording of a world whose truth is known.",
+    "Simulate a recording, with ground truth.",
     {"range-bearing": SimulateRangeBearing, "laser": SimulateLaser, "desk": SimulateDesk, "room": SimulateRoom},
     compile_kernels,
 )

@@ -1,8 +1,8 @@
 """Numba only: linear algebra on blocks of particles, one observation at a time; no cameras, no files.
 
-A block is `BLOCK` particles side by side, stored field by field (`(fields, BLOCK)`), so that every innermost loop
-runs along particles and compiles to vector instructions. Lanes never mix: the result is the same bytes whatever
-the number of threads. The docstrings of the drivers give the mathematics; `rbpf.core.linearisation` is their NumPy twin.
+A block is `BLOCK` particles in structure-of-arrays layout, `(fields, BLOCK)`, so that every innermost loop runs along
+particles and compiles to vector instructions. Lanes never mix: the result is the same bytes on any number of threads.
+The docstrings of the drivers give the mathematics; `rbpf.core.linearisation` is their NumPy twin.
 """
 
 import atexit
@@ -21,13 +21,13 @@ discard_stale(Path(__file__).parent)
 
 
 def _use_a_cache() -> None:
-    """Where nothing compiled can be kept, a folder of this process takes it, so that everything runs all the same."""
+    """Uses a temporary folder of this process as Numba's cache if its usual one is not writable."""
     try:
         njit(cache=True)(_use_a_cache)
     except RuntimeError:
         folder = tempfile.mkdtemp(prefix="rbpf-kernels-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        # In the environment, too: Numba reads it again, and processes that are started from here use the same folder.
+        # Also in the environment: Numba reads it again, and child processes use the same folder.
         os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = folder
         warnings.warn(
             "compiled kernels cannot be kept, since no folder for them can be written to: they are compiled anew in every "

@@ -1,4 +1,4 @@
-"""Angles without a call or a branch, so that a loop over lanes compiles to vector instructions."""
+"""Trigonometry without calls or branches, so that a loop over lanes compiles to vector instructions."""
 
 import math
 
@@ -8,17 +8,17 @@ _STEEP = math.tan(math.pi / 8)
 _QUARTER = 0.5 * math.pi
 #: π/2 to 33 bits (W. Cody and W. Waite, 1980): its product with a whole number below 2²⁰ is exact.
 _QUARTER_HIGH = 1.57079632673412561417
-_QUARTER_REST = 6.07710050650619224932e-11  #: π/2 less that.
-_PAIRS = 10  #: Pairs of terms of arctan: the first one left out, z²⁰/41 with z ≤ tan²(π/8), is 1e−17.
-_NESTED = 8  #: Terms of sine and cosine: the first ones left out, (π/4)¹⁷/17! and (π/4)¹⁸/18!, are below 5e−17.
+_QUARTER_REST = 6.07710050650619224932e-11  #: The remainder of π/2.
+_PAIRS = 10  #: Pairs of terms of arctan: the first neglected one, z²⁰/41 with z ≤ tan²(π/8), is 1e−17.
+_NESTED = 8  #: Terms of sine and cosine: the first neglected ones, (π/4)¹⁷/17! and (π/4)¹⁸/18!, are below 5e−17.
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def cos_sin(angle):
     """Cosine and sine, within 2e−16 up to a million radians and within the angle's own rounding beyond.
 
-    The angle is taken to [−π/4, π/4] by quarter turns, where both Taylor series are short. From 1e15 rad on, where
-    neighbouring doubles are a radian apart, the result means nothing; at infinity it is not finite.
+    The angle is reduced to [−π/4, π/4] by quarter turns, where both Taylor series are short. From 1e15 rad on, where
+    neighbouring doubles are a radian apart, the result is meaningless; at infinity it is not finite.
     """
     quarters = math.floor(angle / _QUARTER + 0.5)
     rest = angle - quarters * _QUARTER_HIGH - quarters * _QUARTER_REST
@@ -37,10 +37,10 @@ def cos_sin(angle):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def arctan2(y, x):
-    """Angle of (x, y) in [−π, π], within 5e−16 of `math.atan2`; ±0 at the origin, NaN where x and y are infinite.
+    """Angle of (x, y) in [−π, π], within 5e−16 of `math.atan2`; ±0 at the origin, NaN if x and y are infinite.
 
-    The vector is mirrored to the first octant and, above π/8, turned back by π/4; then arctan t = t Σ (−t²)ᵏ/(2k + 1),
-    summed over even and odd k side by side. Comparisons take the place of `min` and `max`, which would lose a NaN.
+    The vector is reflected into the first octant and, above π/8, rotated by −π/4; then arctan t = t Σ (−t²)ᵏ/(2k + 1),
+    with separate sums over even and odd k. Comparisons replace `min` and `max`, which would lose a NaN.
     """
     above = abs(y) > abs(x)
     low, high = abs(x) if above else abs(y), abs(y) if above else abs(x)

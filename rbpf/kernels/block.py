@@ -1,6 +1,6 @@
 """Linear algebra on a block of particles: matrices are `(rows, columns, BLOCK)`, symmetric ones packed by rows.
 
-Sizes are small run-time numbers; the innermost loop always runs along the particles of the block.
+Sizes are small numbers known at run time; the innermost loop always runs along the particles of the block.
 """
 
 import math
@@ -20,9 +20,9 @@ def packed(a, b):
 
 @njit(cache=True, error_model="numpy")
 def lines(rows):
-    """Memory of as many rows of a block, end to end, that begins where a cache line does.
+    """Memory for this many rows of a block, concatenated, aligned to a cache line.
 
-    Eight numbers at a time are then one line each; from elsewhere they are parts of two, and a sum takes half as long again.
+    Each vector of eight numbers is then one line; unaligned, it spans two, and a sum takes half as long again.
     """
     held = np.empty(rows * BLOCK + 8)
     first = -(held.ctypes.data // 8) % 8
@@ -31,11 +31,11 @@ def lines(rows):
 
 @njit(cache=True, error_model="numpy")
 def workspace(size, p, dim, dim_map, size_const):
-    """Memory for a block that sees one landmark after another.
+    """Memory for a block that processes one landmark after another.
 
-    States (E, ·), a record's mean (D, ·), packed covariance and constants (A, ·), innovations (p, ·), Jacobians by the
-    state (p, d, ·) and by the landmark (p, D, ·), J P (p, D, ·) and S (p, p, ·). The Jacobian by the state is zero: a
-    kernel fills the leading columns, those of what it reads.
+    States (E, ·), a record's mean (D, ·), packed covariance and constants (A, ·), innovations (p, ·), Jacobians with
+    respect to the state (p, d, ·) and the landmark (p, D, ·), J P (p, D, ·) and S (p, p, ·). The Jacobian with respect
+    to the state is initially zero: a kernel fills the leading columns, those of the parts that it reads.
     """
     size_cov = dim_map * (dim_map + 1) // 2
     jac_state = lines(p * dim).reshape(p, dim, BLOCK)
@@ -55,7 +55,7 @@ def workspace(size, p, dim, dim_map, size_const):
 
 @njit(cache=True, error_model="numpy")
 def load_states(state, start, count, x):
-    """Gathers the states of the `count` particles from `start` on."""
+    """Gathers the states of `count` particles from `start` on."""
     for e in range(state.shape[1]):
         for i in range(count):
             x[e, i] = state[start + i, e]
@@ -63,12 +63,12 @@ def load_states(state, start, count, x):
 
 @njit(cache=True, error_model="numpy")
 def load_record(pool, slab, rows, start, count, mean, cov, const):
-    """Gathers one landmark's record for the `count` particles from `start` on: mean, packed covariance, constants."""
+    """Gathers one landmark's record for `count` particles from `start` on: mean, packed covariance, constants."""
     dim, size_cov, size_const = mean.shape[0], cov.shape[0], const.shape[0]
     first, apart = rows[start], False
     for i in range(count):
         apart |= rows[start + i] != first + i
-    if not apart:  # as before the first resampling after it was written
+    if not apart:  # consecutive rows, as before the first resampling after the record was written
         for f in range(dim):
             for i in range(count):
                 mean[f, i] = pool[slab, f, first + i]
@@ -92,7 +92,7 @@ def load_record(pool, slab, rows, start, count, mean, cov, const):
 
 @njit(cache=True, error_model="numpy")
 def expect_record(pool, slab, rows, start, count):
-    """Asks memory for what `load_record` will gather next, while something else is computed; a line holds eight numbers."""
+    """Prefetches the record that `load_record` will gather next; a cache line holds eight numbers."""
     for f in range(pool.shape[1]):
         field = pool.ctypes.data + 8 * (slab * pool.shape[1] + f) * pool.shape[2]
         for i in range(0, count, 8):
@@ -101,13 +101,13 @@ def expect_record(pool, slab, rows, start, count):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def flat(array):
-    """A block's rows end to end: row m starts at m · BLOCK, a constant that lets the compiler tell rows apart."""
+    """A block's rows concatenated: row m starts at m · BLOCK, a constant by which the compiler knows rows as distinct."""
     return array.reshape(array.size)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def store_by_state(a0, a1, a2, x, y, z, row, i):
-    """A row of ∂z/∂ξ, flat, from that of the slope a at a point (x, y, z) of the moving frame: a × p, then −a."""
+    """Stores a row of ∂z/∂ξ, flat, given the row a of ∂z/∂p at a point p = (x, y, z) in the moving frame: a × p, then −a."""
     row[i] = a1 * z - a2 * y
     row[BLOCK + i] = a2 * x - a0 * z
     row[2 * BLOCK + i] = a0 * y - a1 * x
@@ -126,7 +126,7 @@ def rotation_at(pose, i):
 def whiten(total, count, vector, scale, squared):
     """Replaces the lower triangle of `total` by its Cholesky factor L with INVERTED diagonal, and a vector by L⁻¹ times it.
 
-    `scale` is multiplied by the inverted pivots, the vector's square is added to `squared`. Three rows take a pass each.
+    `scale` is multiplied by the inverted pivots, the vector's squared norm is added to `squared`. Three rows are unrolled.
     """
     p = total.shape[0]
     for i in range(count):
@@ -203,7 +203,7 @@ def whiten_matrix(factor, count, matrix):
 
 @njit(cache=True, error_model="numpy")
 def subtract_gram(matrix, count, total):
-    """Total −= matrixᵀ matrix, packed; up to three rows in one pass: a sum is loaded and stored once for them."""
+    """Total −= matrixᵀ matrix, packed; up to three rows per pass, so that a sum is loaded and stored once for them."""
     p = matrix.shape[0]
     done = min(p, 3) if p > 1 else 0
     for e in range(matrix.shape[1]):
@@ -225,7 +225,7 @@ def subtract_gram(matrix, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_transposed_product(matrix, vector, count, total):
-    """Total += matrixᵀ vector; up to three rows in one pass, as in `subtract_gram`."""
+    """Total += matrixᵀ vector; up to three rows per pass, as in `subtract_gram`."""
     p = matrix.shape[0]
     done = min(p, 3) if p > 1 else 0
     for e in range(matrix.shape[1]):
@@ -243,7 +243,7 @@ def add_transposed_product(matrix, vector, count, total):
 
 @njit(cache=True, error_model="numpy")
 def _filled(row, count):
-    """First and end of the columns of a row (dim, BLOCK) between those that are zero in every lane."""
+    """Range of columns of a row (dim, BLOCK) without the leading and trailing ones that are zero in every lane."""
     first, end = 0, row.shape[0]
     while end > 0 and _is_zero(row[end - 1], count):
         end -= 1
@@ -262,7 +262,7 @@ def _is_zero(lanes, count):
 
 @njit(cache=True, error_model="numpy")
 def innovation_covariance(jac, cov, noise, count, cross, total):
-    """Cross = J P and the lower triangle of total = J P Jᵀ + R, of landmarks of two and three numbers in one pass for each."""
+    """Cross = J P and the lower triangle of total = J P Jᵀ + R; for landmarks of two or three numbers in one pass each."""
     dim = jac.shape[1]
     if dim == 2:
         _innovation_covariance_of_two(jac, cov, noise, count, cross, total)
@@ -306,9 +306,9 @@ def _innovation_covariance_of_three(jac, cov, noise, count, cross, total):
 
 @njit(cache=True, error_model="numpy")
 def _innovation_covariance_of_many(jac, cov, noise, count, cross, total):
-    """Three terms at a time: a sum is loaded and stored once for them.
+    """Three terms per pass, so that a sum is loaded and stored once for them.
 
-    Columns of zeros at both ends are left out: a measurement of several points of one record has rows that read one each.
+    Leading and trailing zero columns are skipped: if a measurement observes several points of one record, each row reads one.
     """
     p, dim = jac.shape[0], jac.shape[1]
     for a in range(p):
@@ -345,7 +345,7 @@ def _innovation_covariance_of_many(jac, cov, noise, count, cross, total):
 
 @njit(cache=True, error_model="numpy")
 def add_spread(jac, factor, start, count, column, total):
-    """Total += H L (H L)ᵀ, its lower triangle."""
+    """Adds H L (H L)ᵀ to the lower triangle of total."""
     p, dim = jac.shape[0], factor.shape[1]
     shared = factor.shape[0] == 1
     for r in range(factor.shape[2]):

@@ -1,4 +1,4 @@
-"""Linear algebra: Cholesky's factor of a small matrix, what is solved by it, products, and what stays symmetric."""
+"""Dense linear algebra: Cholesky factors of small matrices, solves, products, and updates that preserve symmetry."""
 
 import math
 
@@ -47,9 +47,9 @@ def solve(chol, vector):
 
 @njit(void(MATRIX, CUBE, int64, float64, VECTOR, MATRIX), cache=True, error_model="numpy")
 def fit_robustly(white, slope, rounds, scale, u, info):
-    """Fills u (r,), where 0 is expected with unit covariance, by K measurements (K, p) of slopes (K, p, r), and `info` (r, r).
+    """Fills u (r,), of standard normal prior, from residuals (K, p) and Jacobians (K, p, r), and its information (r, r).
 
-    Iteratively reweighted least squares with a Cauchy loss; what is as far off as `scale` keeps half of its weight.
+    Iteratively reweighted least squares with a Cauchy loss; a residual as large as `scale` keeps half of its weight.
     """
     (count, p, rank), total = slope.shape, np.empty(u.size)
     off = np.empty(p)
@@ -83,7 +83,7 @@ def fit_robustly(white, slope, rounds, scale, u, info):
 def increments(mean, factor, u, out):
     """Fills ε = μ + L u (N, d), of μ (N or 1, d), L (N or 1, d, r) and u (N or 1, r).
 
-    Terms of even and of odd number are added up apart, as `numpy.einsum` does.
+    Even and odd terms are summed separately, as in `numpy.einsum`.
     """
     rank = u.shape[1]
     for i in range(len(out)):
@@ -100,7 +100,7 @@ def increments(mean, factor, u, out):
 
 @njit(void(CUBE, CUBE, VECTOR, VECTOR), cache=True, error_model="numpy")
 def log_densities(nu, chol, log_det, out):
-    """Adds Σ log N(ν; 0, S) to `out` (N,), of innovations (N, K, p) with L (K, p, p) of S = L Lᵀ and log|S| (K,)."""
+    """Adds Σ log N(ν; 0, S) to `out` (N,), for innovations (N, K, p), with L (K, p, p) of S = L Lᵀ and log|S| (K,)."""
     white, constant = np.empty(nu.shape[2]), nu.shape[2] * math.log(2.0 * math.pi)
     for i in range(len(nu)):
         for k in range(len(chol)):
@@ -116,7 +116,7 @@ def log_densities(nu, chol, log_det, out):
 
 @njit(void(VECTOR, float64, INDICES), cache=True, error_model="numpy")
 def comb(weights, offset, ancestors):
-    """Fills the ancestors (N,), ascending, that the teeth at k + `offset` of a comb fall on, see `rbpf.core.resampling`."""
+    """Fills the ancestors (N,), ascending, selected by a comb with teeth at k + `offset`, see `rbpf.core.resampling`."""
     n, last, total = weights.size, 0, 0.0
     for i in range(n):
         total += weights[i]
@@ -136,8 +136,8 @@ def comb(weights, offset, ancestors):
 def refine(block, arguments):
     """Fills mean (N, r) and root (N, r, r) of u, |C⁻¹Lᵀη|² and log |M| (N,), see `rbpf.core.proposals`.
 
-    Of N particles with Λ (N, d, d) and η (N, d), and L (N or 1, d, r). Where M is not definite, all of these are NaN.
-    Parts are blocks of particles, along which the innermost loops run.
+    For N particles with Λ (N, d, d) and η (N, d), and L (N or 1, d, r). If M is not definite, all outputs are NaN. Parts
+    are blocks of particles, along which the innermost loops run.
     """
     info, vector, root_prior, mean, root, squared, log_det = arguments
     dim, rank = root_prior.shape[1], root_prior.shape[2]
@@ -154,7 +154,7 @@ def refine(block, arguments):
         white[r] = 0.0
         for s in range(r + 1):
             chol[r, s] = 1.0 if r == s else 0.0
-    # C of M = I + Lᵀ Λ L, row of Λ by row, and Lᵀη.
+    # C of M = I + Lᵀ Λ L, row by row of Λ, and Lᵀη.
     for a in range(dim):
         half[:] = 0.0
         for b in range(dim):
@@ -184,7 +184,7 @@ def refine(block, arguments):
                 white[r, i] -= chol[r, c, i] * white[c, i]
         for i in range(count):
             white[r, i] /= chol[r, r, i]
-    # Columns of C⁻¹, which are the rows of its transposed: zero before the diagonal.
+    # Columns of C⁻¹, the rows of its transpose: zero before the diagonal.
     for r in range(rank):
         for a in range(rank):
             inverse[r, a] = 0.0
@@ -237,11 +237,11 @@ def chart(jacobian, offset, info, vector, quad):
 
 @njit(cache=True, error_model="numpy")
 def product(left, right):
-    """(m, k) times (k, n), C-contiguous: the same bytes on any number of threads, which BLAS does not promise."""
+    """(m, k) times (k, n), C-contiguous: the same bytes on any number of threads, which BLAS does not guarantee."""
     m, count = left.shape
     out = np.zeros((m, right.shape[1]))
     whole = count - count % 4
-    for k in range(0, whole, 4):  # four rows of the right one stay in the cache
+    for k in range(0, whole, 4):  # four rows of the right matrix stay in the cache
         for i in range(m):
             a, b, c, d = left[i, k], left[i, k + 1], left[i, k + 2], left[i, k + 3]
             for j in range(right.shape[1]):
@@ -255,7 +255,7 @@ def product(left, right):
 
 @njit(cache=True, error_model="numpy")
 def add_principal(matrix, rows, part):
-    """Adds a part (k, k) to some rows (k,), none twice, and the same columns of a matrix."""
+    """Adds a part (k, k) to the principal submatrix of distinct rows (k,)."""
     for i in range(rows.size):
         row = matrix[rows[i]]
         for j in range(rows.size):
@@ -264,7 +264,7 @@ def add_principal(matrix, rows, part):
 
 @njit(cache=True, error_model="numpy")
 def principal(matrix, rows):
-    """Some rows (k,) and the same columns of a matrix, (k, k); `take` along columns is seven times as slow."""
+    """The principal submatrix (k, k) of some rows (k,); `take` along columns is seven times as slow."""
     out = np.empty((rows.size, rows.size))
     for i in range(rows.size):
         row = matrix[rows[i]]
@@ -275,7 +275,7 @@ def principal(matrix, rows):
 
 @njit(void(INDEX_MATRIX, MATRIX, MATRIX, MATRIX), cache=True, error_model="numpy")
 def gather(at, slope, matrix, out):
-    """Fills (R, m) with J times a matrix (n, m), where J has in each row q entries `slope` (R, q) in columns `at` (R, q)."""
+    """Fills (R, m) with J times a matrix (n, m); each row of the sparse J has q entries `slope` in columns `at` (R, q)."""
     for r in range(at.shape[0]):
         out[r] = 0.0
         for q in range(at.shape[1]):
@@ -287,7 +287,7 @@ def gather(at, slope, matrix, out):
 
 @njit(void(INDEX_MATRIX, MATRIX, MATRIX, MATRIX), cache=True, error_model="numpy")
 def add_inner(at, slope, rows, out):
-    """Adds rows (R, n) times Jᵀ, see `gather`, to a matrix (R, R), where that is symmetric."""
+    """Adds rows (R, n) times Jᵀ, see `gather`, to a matrix (R, R); the product must be symmetric."""
     for r in range(at.shape[0]):
         for s in range(r + 1):
             total = 0.0
@@ -300,7 +300,7 @@ def add_inner(at, slope, rows, out):
 
 @njit(void(CUBE, MATRIX, CUBE), cache=True, error_model="numpy")
 def add_turned(said, weight, turn):
-    """Adds to `said` (R, 1 + d, N), from its second column on, rows `weight` (R, d) times each particle's `turn` (N, d, d)."""
+    """Adds rows `weight` (R, d) times each particle's `turn` (N, d, d) to `said` (R, 1 + d, N), from its second column on."""
     count, size, particles = said.shape
     lanes = np.empty((size - 1, size - 1, particles))
     for a in range(size - 1):
@@ -316,7 +316,7 @@ def add_turned(said, weight, turn):
 
 @njit(void(CUBE, CUBE, MATRIX, VECTOR), cache=True, error_model="numpy")
 def grams(white, info, vector, quad):
-    """Fills HᵀH (N, d, d), Hᵀν (N, d) and νᵀν (N,) of each particle, of rows [ν H] in `white` (R, 1 + d, N)."""
+    """Fills each particle's HᵀH (N, d, d), Hᵀν (N, d) and νᵀν (N,), from rows [ν H] in `white` (R, 1 + d, N)."""
     count, size, particles = white.shape
     total = np.empty(particles)
     for a in range(size):
@@ -336,7 +336,7 @@ def grams(white, info, vector, quad):
 
 @njit(cache=True, error_model="numpy")
 def add_gram(matrix, rows, sign):
-    """Adds ± rowsᵀ rows, of rows (k, n), to the lower triangle of (n, n)."""
+    """Adds ± rowsᵀ rows, with rows (k, n), to the lower triangle of a matrix (n, n)."""
     count = rows.shape[0]
     whole = count - count % 4
     for i in range(matrix.shape[0]):  # a row stays in the cache
@@ -354,7 +354,7 @@ def add_gram(matrix, rows, sign):
 
 @njit(cache=True, error_model="numpy")
 def mirror(matrix):
-    """Replaces what is above the diagonal by what is below it; by tiles, which stay in the cache."""
+    """Copies the lower triangle to the upper one; by tiles, which stay in the cache."""
     n, tile = matrix.shape[0], 32
     for above in range(0, n, tile):
         for left in range(0, above + 1, tile):
@@ -365,14 +365,14 @@ def mirror(matrix):
 
 @njit(cache=True, error_model="numpy")
 def congruent(matrix, first, size, blocks):
-    """The lower triangle of T P Tᵀ (n, n), of a symmetric P; T is the identity but for K blocks on its diagonal.
+    """The lower triangle of T P Tᵀ (n, n), with P symmetric; T is the identity except for K diagonal blocks.
 
-    They are the first `size` (K,) rows and columns of `blocks` (K, m, m), from rows `first` (K,) on; none overlaps another.
+    They are the first `size` (K,) rows and columns of `blocks` (K, m, m), placed at rows `first` (K,), without overlap.
     """
     out, part = matrix.copy(), np.empty(blocks.shape[1])
     for k in range(first.size):
         for a in range(size[k]):
-            row = out[first[k] + a, : first[k] + size[k]]  # what is right of it is not read
+            row = out[first[k] + a, : first[k] + size[k]]  # entries to the right are not read
             row[:] = 0.0
             for b in range(size[k]):
                 weight = blocks[k, a, b]

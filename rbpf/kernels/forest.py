@@ -1,7 +1,7 @@
 """The forest of ancestors: one node per particle and generation, dead branches freed as soon as they die.
 
-A node is a row of four numbers, side by side in memory since all are needed together: PARENT (-1 at a root), CHILDREN
-(number of children, plus one for a current particle), GENERATION and ROW (the particle's index within its generation).
+A node is a row of four numbers, contiguous as all are needed together: PARENT (-1 at a root), CHILDREN (number of
+children, plus one for a current particle), GENERATION and ROW (the particle's index within its generation).
 P. Jacob, L. Murray, S. Rubenthaler, "Path storage in the particle filter" (2015), give the expected size, T + C·N log N nodes.
 """
 
@@ -11,13 +11,13 @@ from numba import boolean, int64, njit, types
 from rbpf.kernels.signature import INDEX_MATRIX, INDICES
 
 PARENT, CHILDREN, GENERATION, ROW = range(4)
-# Compiled as they are loaded, as the other drivers: the first history that is bounded need not wait for it.
+# Compiled on import, as the other drivers: the first bounded history need not wait for it.
 _FLAGS = types.Array(boolean, 1, "C")
 
 
 @njit(int64(INDEX_MATRIX, INDICES, int64, INDICES, INDICES, int64), cache=True)
 def advance(nodes, free, n_free, leaves, ancestors, now):
-    """Makes a node for each descendant and frees the lineages without one; returns the free-list's length."""
+    """Adds a node for each descendant and frees lineages without descendants; returns the free-list's length."""
     n = leaves.size
     fresh = np.empty(n, np.int64)
     for i in range(n):
@@ -44,9 +44,9 @@ def advance(nodes, free, n_free, leaves, ancestors, now):
 
 @njit(INDICES(INDEX_MATRIX, INDICES, int64, INDICES, INDICES, int64), cache=True)
 def rows_at(nodes, leaves, wanted, found, stamp, mark):
-    """Row of each particle's ancestor in generation `wanted`; each node of the way is climbed once.
+    """Row of each particle's ancestor in generation `wanted`; each node on the way is visited once.
 
-    `found` and `stamp` are scratch of the forest's size; `mark` is a number that `stamp` does not hold yet.
+    `found` and `stamp` are scratch arrays of the forest's size; `mark` is a number that is not in `stamp` yet.
     """
     out = np.empty(leaves.size, np.int64)
     for i in range(leaves.size):
@@ -64,7 +64,7 @@ def rows_at(nodes, leaves, wanted, found, stamp, mark):
 
 @njit(types.UniTuple(INDICES, 2)(INDEX_MATRIX, INDICES, int64), cache=True)
 def survivors(nodes, members, wanted):
-    """Of the nodes that generation `wanted` had, those that serve it still, and the rows of these."""
+    """The surviving nodes of generation `wanted` among its `members`, and their rows."""
     held, rows, count = np.empty(members.size, np.int64), np.empty(members.size, np.int64), 0
     for node in members:
         if nodes[node, GENERATION] == wanted:
@@ -75,7 +75,7 @@ def survivors(nodes, members, wanted):
 
 @njit(int64(INDEX_MATRIX, INDICES, int64, INDICES, _FLAGS, INDICES, int64), cache=True)
 def splice(nodes, free, n_free, leaves, needed, stamp, mark):
-    """Removes nodes with a single child that are not needed themselves; returns the free-list's length."""
+    """Removes nodes with one child that are not needed themselves; returns the free-list's length."""
     for i in range(leaves.size):
         node = leaves[i]
         while node >= 0 and stamp[node] != mark:

@@ -1,8 +1,8 @@
-"""Likelihoods inside the kernels: which lanes take an observation as an inlier, and at what log-density.
+"""Likelihoods and gating inside the kernels: the lanes in which an observation is an inlier, and its log-density.
 
 Forms: 0 Gaussian, 1 truncated Mahalanobis (parameter 0: T_l, parameter 1: limit of updates), 2 Gaussian with outliers
-(parameter 0: log(1−ε), parameter 1: log ε/V), 3 the truncated one for the look-ahead weight. `weight` is 1 where the lane
-uses the observation and 0 where it is left out.
+(parameter 0: log(1−ε), parameter 1: log ε/V), 3 the truncated one for the look-ahead weight. `weight` is 1 for lanes that
+use the observation and 0 for those that leave it out.
 """
 
 import math
@@ -16,9 +16,9 @@ from rbpf.kernels.signature import BLOCK
 
 @njit(cache=True, error_model="numpy")
 def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, count, weight, penalty):
-    """Gates with the predictive covariance S + H Q Hᵀ; a rejected lane gets the outlier's density and weight 0.
+    """Gates with the predictive covariance S + H Q Hᵀ; rejected lanes get the outlier density and weight 0.
 
-    Densities that are no part of a Mahalanobis distance go, times −2, into `penalty`.
+    Log-density terms other than the Mahalanobis distance are added to `penalty`, times −2.
     """
     if kernel_id == 0:
         return
@@ -35,12 +35,12 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
     add_spread(jac_state, factor, start, count, column, spread)
     whiten(spread, count, white, scale, squared)
     if kernel_id == 3:
-        # d² + log|S + H Q Hᵀ|/|S|, so that it is as probable as an outlier at the limit.
+        # d² + log|S + H Q Hᵀ|/|S|, which makes it as probable as an outlier at the limit.
         for i in range(count):
             squared[i] -= 2.0 * math.log(scale[i])
             scale[i] = 1.0
         _copy_lower(total, count, spread)
-        whiten(spread, count, white, scale, column[0])  # for the pivots alone
+        whiten(spread, count, white, scale, column[0])  # only for the pivots
         for i in range(count):
             squared[i] += 2.0 * math.log(scale[i])
     for i in range(count):
@@ -70,7 +70,7 @@ def gaussian_log_density(squared, scale, p):
 
 @njit(cache=True, error_model="numpy")
 def is_inlier(kernel_id, params, squared, scale, p):
-    """Whether the inlier's term is at least the outlier's; of the truncated kernel_id, whether it is within the limit."""
+    """Whether the inlier term is at least the outlier term; for the truncated form, whether it is within the limit."""
     if kernel_id == 1 or kernel_id == 3:
         return squared <= params[1 if kernel_id == 1 else 0]
     return kernel_id == 0 or gaussian_log_density(squared, scale, p) + params[0] >= params[1]

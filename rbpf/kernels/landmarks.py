@@ -1,7 +1,7 @@
-"""Drivers: observations of landmarks in many particles. `refine` and `update` make a filter's step.
+"""Drivers: landmark observations in many particles. `refine` and `update` make up a filter's step.
 
-Their NumPy twins are in `rbpf.core.linearisation`. A driver calls the model's kernel by its address, so that it is
-compiled once for all models.
+Their NumPy twins are in `rbpf.core.linearisation`. A driver calls the model's kernel by its address, so it is compiled
+once for all models.
 """
 
 import math
@@ -45,9 +45,9 @@ def refine(block, arguments):
     Parts are blocks of particles. `rows` (N,) counts the scalar measurements that entered.
 
     `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
-    `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
-    saw it; `kernel_id` and `kernel_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
-    `sizes` = (d, D, A).
+    `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N), or (0, 0) for all, selects the
+    particles that observe it; `kernel_id` and `kernel_params` specify the likelihood; `factor` (N or 1, d, r) is the
+    prior's, used only for gating; `sizes` = (d, D, A).
     """
     address, params, state = arguments[:3]
     pool, slabs, which, maps = arguments[3:7]
@@ -64,7 +64,7 @@ def refine(block, arguments):
     scale = np.ones(BLOCK)
     sum_info = lanes.lines(dim * (dim + 1) // 2).reshape(dim * (dim + 1) // 2, BLOCK)
     sum_vector = lanes.lines(dim).reshape(dim, BLOCK)
-    sum_info[:] = sum_vector[:] = 0.0  # the first with the sign reversed
+    sum_info[:] = sum_vector[:] = 0.0  # sum_info with reversed sign
     sum_quad = np.zeros(BLOCK)
     sum_log = np.zeros(BLOCK)
     penalty = np.zeros(BLOCK)
@@ -108,7 +108,7 @@ def refine(block, arguments):
 
 @njit(cache=True, error_model="numpy")
 def _store_record(pool, slab, source, rows, start, count, mean, cov):
-    """Writes a record; the fields behind mean and covariance follow their particle."""
+    """Writes a record; the fields after mean and covariance are copied from the particle's old record."""
     dim, size_cov = mean.shape[0], cov.shape[0]
     for f in range(dim):
         for i in range(count):
@@ -128,7 +128,7 @@ def update(block, arguments):
 
     Given the sampled pose, each landmark is an independent EKF: with S = J P Jᵀ + R = L Lᵀ, A = L⁻¹ J P and
     y = L⁻¹ν the update is m += Aᵀy, P −= AᵀA. Arguments as in `refine`; particle i reads row `maps[...][i]` of the
-    slab it inherits and writes row i of the target, so that descendants of one parent never share what they write.
+    slab it inherits and writes row i of the target, so that descendants of one parent never write to the same row.
     """
     address, params, state = arguments[:3]
     pool, slabs, which, maps = arguments[3:7]
@@ -196,9 +196,9 @@ def update(block, arguments):
 
 @observation_kernel
 def given_rows(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
-    """Hands on rows that were linearised before: of each observation p times (ν, ∂/∂state, ∂/∂landmark) in `state` (F, BLOCK).
+    """Passes on precomputed linearised rows: for each observation p times (ν, ∂/∂state, ∂/∂landmark) in `state` (F, BLOCK).
 
-    The `z` of an observation says where its rows begin, params how many columns ∂/∂state has; the others are zero.
+    An observation's `z` is the start of its rows, `params` the number of columns of ∂/∂state; the others are zero.
     """
     row, by_state = int(z[0]), int(params[0])
     for a in range(nu.shape[0]):
@@ -216,7 +216,7 @@ def given_rows(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 
 @njit(cache=True, error_model="numpy")
 def _add_between(weights, offset, mean, cov):
-    """Mean = Σ W o and cov += Σ W (o − mean)(o − mean)ᵀ, of one landmark."""
+    """Mean = Σ W o and cov += Σ W (o − mean)(o − mean)ᵀ, for one landmark."""
     p, n = offset.shape
     for a in range(p):
         total = 0.0
@@ -235,9 +235,9 @@ def _add_between(weights, offset, mean, cov):
 def project(fused, records, mode, weights, factor, sizes, mean, cov):
     """Fills `mean` (K, p) and `cov` (K, p, p) = within + between particles.
 
-    Predictions are relative to that of particle `mode`, so that angles need not be wrapped: the negative residual of that
-    prediction is a particle's difference from it. Within is J P Jᵀ + H L (H L)ᵀ, with the `factor` L (N or 1, d, r) of the
-    state. Other arguments as in `refine`.
+    Predictions are relative to that of particle `mode`, so that angles need no wrapping: a particle's difference from that
+    prediction is its negative residual. The covariance within is J P Jᵀ + H L (H L)ᵀ, with the state's `factor` L (N or 1,
+    d, r). Other arguments as in `refine`.
     """
     address, params, state = fused
     pool, slabs, which, maps = records
@@ -252,7 +252,7 @@ def project(fused, records, mode, weights, factor, sizes, mean, cov):
     offset = np.empty((p, n_particles))
     nothing = np.zeros((p, p))
     at, anchor = np.empty((size, BLOCK)), np.empty(p)
-    one = int64(1)  # for a literal all that takes it is compiled once more
+    one = int64(1)  # a literal would compile its callees once more
     lanes.load_states(state, mode, one, at)
     for k in range(mean.shape[0]):
         cov[k] = 0.0
@@ -290,7 +290,7 @@ def call_kernel(address, state, mean, const, z, params, n, nu, jac_state, jac_la
 
 @njit(cache=True, error_model="numpy")
 def _load(mean, columns, clone, origin, start, count, landmark, pose):
-    """Fills lanes with a landmark (D, BLOCK), and with where it is anchored: its origin, or a clone K Exp(δ) (7, BLOCK)."""
+    """Fills lanes with a landmark (D, BLOCK) and its anchor: its origin, or a clone K Exp(δ) (7, BLOCK)."""
     for i in range(count):
         own = mean[start + i]
         for j in range(columns.size):
@@ -309,7 +309,7 @@ def _load(mean, columns, clone, origin, start, count, landmark, pose):
 
 @njit(cache=True, error_model="numpy")
 def _add_by_clone(own, clone, state, anchor, i, by_state, weight, tangent, jacobian, out):
-    """Adds to out (p, 6) −weight H Ad(y⁻¹ C) J_r(δ), of lane i: how rows move with the δ of the clone C = K Exp(δ)."""
+    """Adds −weight H Ad(y⁻¹ C) J_r(δ) of lane i to out (p, 6): the Jacobian with respect to δ of the clone C = K Exp(δ)."""
     for j in range(6):
         tangent[0, j] = -own[clone[j]]
     left_jacobian(tangent, jacobian)
@@ -332,11 +332,11 @@ def _add_by_clone(own, clone, state, anchor, i, by_state, weight, tangent, jacob
 
 @njit(void(*_GROUP, MATRIX, int64, CUBE, MATRIX), cache=True, error_model="numpy")
 def linearise_group(address, params, state, mean, columns, clones, origins, z, first, said, slope):
-    """Fills rows from `first` on of `said` (R, 1 + d, N), ν and ∂z/∂state, and of slopes (R, q), averages over the particles.
+    """Fills ν and ∂z/∂state in `said` (R, 1 + d, N), and mean slopes over the particles (R, q), from row `first` on.
 
-    Of K landmarks, measured as z (K, p), in particles with states (N, E) and means (N, n): `columns` (K, D), the `clones`
-    (K, 6) that they are anchored at by their columns, (K, 0) where they are at none; and their constants, or K of the clones,
-    `origins` (K, A). The slopes are ∂z/∂landmark, then by the clone.
+    For K landmarks with measurements z (K, p), in particles with states (N, E) and means (N, n): `columns` (K, D) of the
+    landmarks; `clones` (K, 6), the columns of the clones that anchor them, or (K, 0) without; `origins` (K, A), their
+    constants, or the K of the clones. The slopes are ∂z/∂landmark, then ∂z/∂clone.
     """
     kernel = kernel_at(address)
     size, particles = said.shape[1:]
@@ -379,9 +379,9 @@ def linearise_group(address, params, state, mean, columns, clones, origins, z, f
 
 @njit(void(*_GROUP, MATRIX, CUBE, CUBE, HYPERCUBE), cache=True, error_model="numpy")
 def expect_group(address, params, state, mean, columns, clones, origins, cov, root, predicted, within):
-    """Fills what each particle expects to measure, `predicted` (N, K, p), and J P Jᵀ + H L Lᵀ Hᵀ, `within` (N, K, p, p).
+    """Fills each particle's predicted measurements (N, K, p), and J P Jᵀ + H L Lᵀ Hᵀ, `within` (N, K, p, p).
 
-    Arguments as of `linearise_group`; further the map's covariance (n, n), and L (N or 1, d, r) of the predicted states.
+    Arguments as of `linearise_group`, and the map's covariance (n, n) and the factor L (N or 1, d, r) of the predicted states.
     """
     kernel = kernel_at(address)
     particles, count, p = predicted.shape

@@ -1,6 +1,6 @@
-"""SE(2) row by row, for `rbpf.lie.SE2`: elements [theta, x, y], tangents [omega, v]; as complex numbers of the plane.
+"""SE(2) row by row, for `rbpf.lie.SE2`: elements [theta, x, y], tangents [omega, v]; in complex arithmetic.
 
-An argument with one row belongs to all rows of the other one. Results go to the last argument.
+An argument with one row is broadcast to all rows of the other one. Results go to the last argument.
 """
 
 import math
@@ -14,7 +14,7 @@ from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY
 
 @njit(cache=True, error_model="numpy")
 def _wrap(angle):
-    """To (−π, π]; what lies there comes back unrounded."""
+    """Wraps to (−π, π]; angles in this range are returned unrounded."""
     return min(angle - 2.0 * math.pi * np.ceil(angle / (2.0 * math.pi) - 0.5), math.pi)
 
 
@@ -30,7 +30,7 @@ def _phasor(angle):
 
 @njit(void(READ_ONLY, READ_ONLY, MATRIX), cache=True, error_model="numpy")
 def retract(x, xi, out):
-    """The product x Exp(ξ): the rotations exp(iθ) and exp(iω/2) of the increment are one."""
+    """The product x Exp(ξ): the rotations exp(iθ) and exp(iω/2) are combined into one."""
     for i in range(out.shape[0]):
         j, k = min(i, len(x) - 1), min(i, len(xi) - 1)
         half = 0.5 * xi[k, 0]
@@ -53,7 +53,7 @@ def local(x, y, out):
 def _blocks(xi, i):
     """V and q of the left Jacobian [[1, 0], [q, V]], q = v (θ c − i b) with b and c as in `rbpf.kernels.se3`."""
     sinc = _sinc(0.5 * xi[i, 0])
-    # b = (1 − cos θ)/θ² from the half angle, which does not cancel.
+    # b = (1 − cos θ)/θ² from the half angle, which avoids cancellation.
     slope = complex(xi[i, 0] * coefficients(xi[i, 0] * xi[i, 0])[0], -0.5 * sinc * sinc)
     return sinc * _phasor(0.5 * xi[i, 0]), complex(xi[i, 1], xi[i, 2]) * slope
 

@@ -1,10 +1,10 @@
 """SE(3) row by row, for `rbpf.lie.SE3`: elements [qx, qy, qz, qw, tx, ty, tz], tangents [omega, v].
 
-An argument with one row belongs to all rows of the other one. Results go to the last argument. At the top stands the
-scalar algebra of unit quaternions (x, y, z, w), for the loops of other compiled functions too.
+An argument with one row is broadcast to all rows of the other one. Results go to the last argument. The scalar algebra of
+unit quaternions (x, y, z, w) comes first, also for the loops of other compiled functions.
 
-Coefficients of the closed-form Jacobians, exact down to angle zero, with x = θ² and series below x = 1 where the
-closed forms cancel:
+Coefficients of the closed-form Jacobians, accurate down to angle zero, with x = θ² and series below x = 1, where the
+closed forms suffer from cancellation:
 
     b = (1 − cos θ)/θ²                       = Σ_k (−x)^k / (2k + 2)!
     c = (θ − sin θ)/θ³                       = Σ_k (−x)^k / (2k + 3)!
@@ -19,7 +19,7 @@ from numba import float64, int64, njit, types, void
 
 from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY
 
-TINY = 1e-300  #: Added to θ², so that no division sees zero: its root is far below any angle that changes a result.
+TINY = 1e-300  #: Added to θ² to avoid division by zero: its root is far below any angle that changes a result.
 
 _TERMS = 10
 _C = tuple((-1) ** k / math.factorial(2 * k + 3) for k in range(_TERMS))
@@ -74,13 +74,13 @@ def times(r, x, y, z):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def back(r, x, y, z):
-    """The transposed of a rotation matrix by rows times a vector."""
+    """The transpose of a rotation matrix by rows times a vector."""
     return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z
 
 
 @njit(cache=True, error_model="numpy")
 def multiply(a, b):
-    """Product of two, renormalised."""
+    """Quaternion product, renormalised."""
     x = a[3] * b[0] - a[2] * b[1] + a[1] * b[2] + a[0] * b[3]
     y = a[2] * b[0] + a[3] * b[1] - a[0] * b[2] + a[1] * b[3]
     z = -a[1] * b[0] + a[0] * b[1] + a[3] * b[2] + a[2] * b[3]
@@ -90,14 +90,14 @@ def multiply(a, b):
 
 @njit(cache=True, error_model="numpy")
 def unit(x, y, z, w):
-    """Divided by the norm."""
+    """Normalised quaternion."""
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     return x / norm, y / norm, z / norm, w / norm
 
 
 @njit(cache=True, error_model="numpy")
 def quaternion(r):
-    """Of a rotation matrix (3, ≥3): the row of 4 q qᵀ with the largest diagonal loses no digits."""
+    """Quaternion of a rotation matrix (3, ≥3): the row of 4 q qᵀ with the largest diagonal avoids cancellation."""
     x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
     trace = r[0, 0] + r[1, 1] + r[2, 2]
@@ -115,7 +115,7 @@ def quaternion(r):
 
 @njit(cache=True, error_model="numpy")
 def turned(q, p):
-    """A vector p turned: p + w t + u × t with t = 2 u × p."""
+    """A rotated vector, p + w t + u × t with t = 2 u × p."""
     u = (q[0], q[1], q[2])
     twice = cross(u, (p[0] + p[0], p[1] + p[1], p[2] + p[2]))
     across = cross(u, twice)
@@ -158,8 +158,8 @@ def _added(a, b):
 def exp_pair(w, v):
     """Quaternion and translation V v of Exp([ω, v]), with V = I + b W + c W².
 
-    From s = sin(θ/2)/θ and k = cos(θ/2): b = 2 s² and c = (1 − 2 s k)/θ². The cancellation in c needs no series,
-    because W² gives back the θ² that it divides by.
+    With s = sin(θ/2)/θ and k = cos(θ/2): b = 2 s² and c = (1 − 2 s k)/θ². The cancellation in c needs no series,
+    as c is multiplied by W², which is of order θ².
     """
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2] + TINY
     theta = math.sqrt(squared)
@@ -250,8 +250,8 @@ def retract(x, xi, out):
 def local(x, y, out):
     """Log(x⁻¹ y).
 
-    The difference of the translations is taken before the rotation, so that near points far from the origin lose no
-    digits.
+    Translations are subtracted before the rotation, so that no digits are lost for neighbouring points far from the
+    origin.
     """
     for i in range(out.shape[0]):
         j, k = min(i, len(x) - 1), min(i, len(y) - 1)
@@ -294,7 +294,7 @@ def inverse_transform(a, p, out):
 
 @njit(cache=True, error_model="numpy")
 def _fill_rotations(w, linear, square, out):
-    """Both 3x3 blocks on the diagonal: I + linear W + square W², with W² = ω ωᵀ − θ² I."""
+    """Fills both diagonal 3x3 blocks: I + linear W + square W², with W² = ω ωᵀ − θ² I."""
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     for j in range(3):
         for k in range(3):
@@ -316,7 +316,7 @@ def _add_skew(out, scale, w):
 
 @njit(cache=True, error_model="numpy")
 def _fill_coupling(w, v, c, d, e, out):
-    """The block Q of the left Jacobian, Barfoot (2017) (7.86).
+    """Fills the block Q of the left Jacobian, Barfoot (2017) (7.86).
 
     With the skew matrices W and V, Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW − 3 WVW) + e (WVWW + WWVW), and with
     s = ω · v the products are WVW = −s W, WV + VW = ω vᵀ + v ωᵀ − 2 s I, WWV + VWW = −θ² V − s W: none is left.
@@ -346,7 +346,7 @@ def left_jacobian(xi, out):
         w, v = (xi[i, 0], xi[i, 1], xi[i, 2]), (xi[i, 3], xi[i, 4], xi[i, 5])
         squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
         c, d, e = coefficients(squared)
-        # (1 − cos θ)/θ² from the half angle, which does not cancel.
+        # (1 − cos θ)/θ² from the half angle, which avoids cancellation.
         theta = math.sqrt(squared + TINY)
         fraction = math.sin(0.5 * theta) / theta
         _fill_rotations(w, 2.0 * (fraction * fraction), c, out[i])

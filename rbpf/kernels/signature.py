@@ -1,4 +1,4 @@
-"""What kernels share: the type of a fused observation kernel and the decorator that makes one, threads, stale copies."""
+"""Common to kernels: type and decorator of a fused observation kernel, threads, and stale copies in the cache."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,18 +13,18 @@ from numba import cfunc, float64, int64, njit, prange, types, void
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-#: Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache.
+#: Particles per block: enough that a loop's overhead is small, and few enough that a block fits in the L2 cache.
 BLOCK = 256
-#: Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double.
+#: Pivots multiplied before a logarithm is taken: 18 factors within 1e±16 stay in the range of a double.
 FACTORS_PER_LOG = 18
-#: Particle-observation pairs worth a thread: a quarter of a millisecond of work, far above a wake-up.
+#: Particle-observation pairs per thread: a quarter of a millisecond of work, far above a thread's wake-up time.
 PAIRS_PER_THREAD = 8192
 
 VECTOR = types.Array(float64, 1, "C")
 MATRIX = types.Array(float64, 2, "C")
 CUBE = types.Array(float64, 3, "C")
 HYPERCUBE = types.Array(float64, 4, "C")
-READ_ONLY = types.Array(float64, 2, "C", readonly=True)  #: A matrix that is not written: the caller's may be locked.
+READ_ONLY = types.Array(float64, 2, "C", readonly=True)  #: A read-only matrix: the caller's array may be locked.
 INDICES = types.Array(int64, 1, "C")
 INDEX_MATRIX = types.Array(int64, 2, "C")
 MASK = types.Array(types.boolean, 2, "C")
@@ -34,15 +34,15 @@ _SIGNATURE = void(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, C
 
 @final
 class ObservationKernel:
-    """A compiled kernel; the drivers take its address, a plain number, which costs nothing to hand over."""
+    """A compiled kernel; the drivers take its address, a plain number, which costs nothing to pass."""
 
     def __init__(self, compiled: Any) -> None:
-        self.compiled = compiled  #: Numba's object, which owns the machine code.
-        self.address = int(compiled.address)  #: Where the machine code starts.
+        self.compiled = compiled  #: Numba's object that owns the machine code.
+        self.address = int(compiled.address)  #: Address of the machine code.
 
 
 def _function_at(signature: Any, *given: Any) -> Any:
-    """Of an intrinsic that gives the function which starts at an address (int64), the first that it is given."""
+    """Implements an intrinsic that returns the function at an address (int64), its first argument."""
     kind = types.FunctionType(signature)
 
     def build(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
@@ -56,7 +56,7 @@ def _function_at(signature: Any, *given: Any) -> Any:
 
 @intrinsic
 def kernel_at(_typing: Any, address: Any) -> Any:
-    """The kernel at an address: the drivers call it so, and compile once for all models."""
+    """The kernel at an address, by which the drivers are compiled once for all models."""
     return _function_at(_SIGNATURE, address)
 
 
@@ -67,7 +67,7 @@ def _part_at(_typing: Any, address: Any, arguments: Any) -> Any:
 
 @intrinsic
 def prefetch(_typing: Any, address: Any) -> Any:
-    """Asks for the cache line at an address (int64), of memory that will be read; nothing waits for it."""
+    """Prefetches the cache line at an address (int64), without waiting for it."""
 
     def build(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -91,10 +91,10 @@ def _in_turn(address, parts, arguments):
 
 @final
 class Driver:
-    """A loop over parts, each done by `function(part, arguments)`, on threads or `alone`.
+    """A loop over parts, each processed by `function(part, arguments)`, on threads or `alone`.
 
-    A parallel loop that calls a function by its address compiles in a tenth of the time that the same loop takes with the body
-    in place, which Numba compiles four times over. What threads cost to be asked for is a twentieth of a small update.
+    A parallel loop that calls a function by its address compiles in a tenth of the time of one with the body in place, which
+    Numba compiles four times. Starting the threads costs a twentieth of a small update.
     """
 
     def __init__(self, function: Callable[..., None], arguments: Any) -> None:
@@ -108,37 +108,37 @@ class Driver:
         self._on_threads(self._address, parts, arguments)
 
     def alone(self, parts: int, *arguments: Any) -> None:
-        """The same by this thread."""
+        """Runs the loop on this thread."""
         self._in_turn(self._address, parts, arguments)
 
 
 def _of_its_own(loop: Any, function: Any) -> Any:
-    """A loop under a name of its own: programs that compile several at a time must not write into one file of the cache."""
+    """A loop under a unique name: processes that compile several at a time must not write to the same cache file."""
     own = FunctionType(loop.__code__, loop.__globals__)
     own.__qualname__ = f"{function.__module__}.{function.__name__}.{loop.__name__}"
     return own
 
 
 def in_parts(*arguments: Any) -> Callable[[Callable[..., None]], Driver]:
-    """Compiles what does one part, of arguments of these types, none of which is a tuple itself, into a `Driver`."""
+    """Compiles a function of a part and arguments of these types, none of which is itself a tuple, into a `Driver`."""
     return partial(Driver, arguments=types.Tuple(arguments))
 
 
 def observation_kernel(function: Callable[..., None]) -> ObservationKernel:
     """Compiles `function(state, mean, const, z, params, n, nu, jac_state, jac_landmark)` into a fused kernel.
 
-    Given one measurement `z` (p,) of one landmark, the kernel fills for the lanes 0..n-1
-    the innovation `nu` (p, BLOCK) and the Jacobians `jac_state` (p, d, BLOCK), in the right chart at the state,
-    and `jac_landmark` (p, D, BLOCK), from `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the
-    model's `params` (P,). The last columns of `jac_state`, of a part of the state that is not read, may be left
-    alone: they are zero. Write the body as a loop over lanes; it must not raise.
+    Given one measurement `z` (p,) of one landmark, the kernel fills, for lanes 0..n-1, the innovation `nu` (p, BLOCK)
+    and the Jacobians `jac_state` (p, d, BLOCK), in the right chart at the state, and `jac_landmark` (p, D, BLOCK), from
+    `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the model's `params` (P,). Trailing columns of
+    `jac_state`, for parts of the state that are not observed, are zero and may be left as they are. Write the body as a
+    loop over lanes; it must not raise.
     """
     discard_stale(Path(function.__code__.co_filename).parent)
     return ObservationKernel(cfunc(_SIGNATURE, cache=True, error_model="numpy")(function))
 
 
 def run_driver(driver: Driver, pairs: int, parts: int, *arguments: Any) -> None:
-    """Calls a driver on as many threads as `pairs` of particle and observation keep busy."""
+    """Calls a driver on as many threads as the number of particle-observation `pairs` keeps busy."""
     if pairs < 2 * PAIRS_PER_THREAD:
         driver.alone(parts, *arguments)
         return
@@ -160,15 +160,15 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def discard_stale(folder: Path) -> None:
     """Deletes compiled copies of the modules in a folder that are older than any kernel source of this package.
 
-    Numba's cache notices when a function's own file changes, not when a function or a constant that it uses does: an
-    old copy would go on with another block size and write outside its arrays.
+    Numba's cache detects changes in a function's own file, but not in the functions and constants that it uses: a stale
+    copy could run with another block size and write outside its arrays.
     """
     places = [folder / "__pycache__"]
     if numba.config.CACHE_DIR:
         places = [place for place in Path(numba.config.CACHE_DIR).glob("*") if place.is_dir()]
     for place in places:
         for index in place.glob("*.nbi"):
-            with suppress(FileNotFoundError):  # another process may be doing the same
+            with suppress(FileNotFoundError):  # another process may delete it at the same time
                 if index.stat().st_mtime < _newest_source():
                     index.unlink()
 

@@ -1,4 +1,4 @@
-"""What a state space must offer, and what it gets from that."""
+"""The interface of a state space, and the operations derived from it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from rbpf.arrays import Array, Float, Like
 from rbpf.errors import InputError
 
-States = Like[ArrayLike, "*#batch {self.size}"]  #: Elements (..., E), as they are given.
-Tangents = Like[ArrayLike, "*#batch {self.dim}"]  #: Tangent vectors (..., d), as they are given.
+States = Like[ArrayLike, "*#batch {self.size}"]  #: Elements (..., E), as arguments.
+Tangents = Like[ArrayLike, "*#batch {self.dim}"]  #: Tangent vectors (..., d), as arguments.
 #: Results: (..., E), (..., d) and (..., d, d).
 StateArray = Float[np.ndarray, "*batch {self.size}"]
 TangentArray = Float[np.ndarray, "*batch {self.dim}"]
@@ -19,7 +19,7 @@ TangentMatrix = Float[np.ndarray, "*batch {self.dim} {self.dim}"]
 
 
 def join(parts: Sequence[Array]) -> Array:
-    """Concatenation along the last axis, where the leading axes broadcast."""
+    """Concatenation along the last axis; the leading axes broadcast."""
     batch = parts[0].shape[:-1]
     if any(part.shape[:-1] != batch for part in parts):
         batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
@@ -28,7 +28,7 @@ def join(parts: Sequence[Array]) -> Array:
 
 
 def of_rows(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:
-    """A function of rows, (..., size) -> (..., *out_shape)."""
+    """Applies a function of rows, (..., size) -> (..., *out_shape)."""
     x = np.asarray(x, dtype=float)
     _require_size(x, size)
     out = np.empty((x.size // size, *out_shape))
@@ -39,7 +39,7 @@ def of_rows(function: Callable[[Array, Array], None], x: ArrayLike, size: int, o
 def of_pairs(
     function: Callable[[Array, Array, Array], None], x: ArrayLike, y: ArrayLike, sizes: tuple[int, int, int]
 ) -> Array:
-    """A function of rows of two arrays whose leading axes broadcast; `sizes` are those of their rows and of the result's."""
+    """Applies a function of the rows of two arrays that broadcast; `sizes`: lengths of their rows and of the result's."""
     x, y, (own, other, result) = np.asarray(x, dtype=float), np.asarray(y, dtype=float), sizes
     _require_size(x, own)
     _require_size(y, other)
@@ -56,10 +56,10 @@ def of_pairs(
 
 
 def _spread(x: Array, shape: tuple[int, ...]) -> Array:
-    """With the leading axes `shape`; a single row stays one, the kernels repeat it."""
+    """Broadcasts to the leading axes `shape`; a single row stays one, as the kernels repeat it."""
     if x.size == x.shape[-1]:
         return x
-    out = np.empty((*shape, x.shape[-1]))  # as np.broadcast_to, which takes as long as a kernel
+    out = np.empty((*shape, x.shape[-1]))  # like np.broadcast_to, which takes as long as a kernel
     out[...] = x
     return out
 
@@ -74,7 +74,7 @@ class LieGroup(ABC):
 
     size: int  #: Numbers stored per state, E.
     dim: int  #: Dimension of the tangent space, d.
-    mean_rule: ClassVar = 50, 1e-14  #: Of `mean`: iterations at most, and the step that ends them.
+    mean_rule: ClassVar = 50, 1e-14  #: Of `mean`: maximum number of iterations, and step size at convergence.
 
     @abstractmethod
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
@@ -95,15 +95,15 @@ class LieGroup(ABC):
     ) -> Float[np.ndarray, " {self.size}"]:
         """Weighted Fréchet mean: the m with sum_i w_i local(m, x_i) = 0, of points (N, E) whose weights (N,) sum to one.
 
-        Gauss-Newton from the heaviest point; a `Finite` part has its most probable value. It is unique where the points lie
-        within a quarter turn of one another; a wider cloud gives the stationary point next to its heaviest member. The sum
-        runs in the order of the rows: equal bytes.
+        Gauss-Newton from the heaviest point; for a `Finite` part the most probable value. The mean is unique if the points
+        lie within a quarter turn of one another; for a wider cloud it is the stationary point next to the heaviest point.
+        The sum runs in the order of the rows, so that results are reproducible to the byte.
         """
         points, weights = np.asarray(x, dtype=float), np.asarray(weights, dtype=float)
         return self._mean_from(self._first_guess(points, weights), points, weights)
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
-        """The stationary point next to a guess; a group may fuse the iteration."""
+        """The stationary point next to an initial guess; a group may fuse the iteration."""
         iterations, tolerance = self.mean_rule
         for _ in range(iterations):
             step = (weights[:, None] * self.local(mean, points)).sum(0)
@@ -113,7 +113,7 @@ class LieGroup(ABC):
         return mean
 
     def _first_guess(self, points: Array, weights: Array) -> Array:
-        """Where the mean is looked for: the heaviest point."""
+        """Initial guess of the mean: the heaviest point."""
         return points[np.argmax(weights)]
 
     @abstractmethod

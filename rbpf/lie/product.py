@@ -13,7 +13,7 @@ from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMat
 
 
 class Commutative(LieGroup):
-    """A group in which a b = b a: Exp and Log are the same everywhere, and to move a tangent changes nothing."""
+    """A group with a b = b a: its adjoint and Jacobians are identities."""
 
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         return np.zeros((*shape, self.size))
@@ -70,9 +70,9 @@ class Euclidean(Commutative):
 
 @final
 class Finite(Commutative):
-    """The numbers 0, …, n − 1, as a mode or an answer: a group without a tangent, by addition modulo n.
+    """The numbers 0, …, n − 1, such as a mode: a group under addition modulo n, without a tangent space.
 
-    What is discrete moves by `MotionModel.sample` alone; its mean is the most probable value.
+    Discrete states move only by `MotionModel.sample`; their mean is the most probable value.
     """
 
     def __init__(self, n: int) -> None:
@@ -85,7 +85,7 @@ class Finite(Commutative):
         return f"Finite({self.n})"
 
     def probabilities(self, x: States, weights: Like[ArrayLike, " N"]) -> Float[np.ndarray, " {self.n}"]:
-        """Of each value (n,), from particles (N, 1) and their weights (N,)."""
+        """Probability of each value (n,), from particles (N, 1) and their weights (N,)."""
         return np.bincount(np.asarray(x)[:, 0].astype(np.int64), np.asarray(weights, dtype=float), self.n)
 
     def _first_guess(self, points: Array, weights: Array) -> Array:
@@ -141,7 +141,7 @@ class Product(LieGroup):
         return join([group.identity(shape) for group in self.groups])
 
     def _each(self, name: str, *arrays: list[Array]) -> Array:
-        """What the factors' methods of this name make of their parts."""
+        """Applies the factors' methods of this name to their parts, and joins the results."""
         return join([getattr(group, name)(*parts) for group, *parts in zip(self.groups, *arrays, strict=True)])
 
     def _first_guess(self, points: Array, weights: Array) -> Array:
@@ -179,7 +179,7 @@ class Product(LieGroup):
         return self._blocks("left_jacobian_inverse", self.split_tangent(xi))
 
     def _blocks(self, name: str, parts: list[Array]) -> Array:
-        """Matrices (…, d, d) with what the factors' methods of this name make of their parts along the diagonal."""
+        """Block-diagonal matrices (…, d, d) of the results of the factors' methods of this name."""
         out = np.zeros((*parts[0].shape[:-1], self.dim, self.dim))
         for rows, group, part in zip(self._tangent, self.groups, parts, strict=True):
             out[..., rows, rows] = getattr(group, name)(part)

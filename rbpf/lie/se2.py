@@ -1,6 +1,6 @@
 """SE(2), rigid motions of the plane; storage [theta, x, y], tangent [omega, vx, vy].
 
-The plane is the complex numbers: a rotation is the factor exp(i theta), and Exp([omega, v]) has the translation V v with
+In complex numbers a rotation is the factor exp(i theta), and Exp([omega, v]) has the translation V v with
 V = sin(h) / h exp(i h), h = omega / 2.
 """
 
@@ -58,7 +58,7 @@ class SE2Group(LieGroup):
         return of_pairs(kernels.local, x, y, (3, 3, 3))
 
     def _mean_from(self, mean: Array, points: Array, weights: Array) -> Array:
-        # The angle does not depend on the place; once it is known, what is left is linear in the place.
+        # The angle does not depend on the position; given the angle, the rest is linear in the position.
         mean, points, angle = _contiguous(mean), _contiguous(points), float(mean[0])
         iterations, tolerance = self.mean_rule
         for _ in range(iterations):
@@ -117,7 +117,7 @@ class SE2Group(LieGroup):
 
 
 def _wrap(angle: Array) -> Array:
-    # An angle that is in (-pi, pi] already must come back unrounded; the minimum catches pi + 1 ulp.
+    # An angle already in (-pi, pi] must be returned unrounded; the minimum catches pi + 1 ulp.
     return np.minimum(angle - _TURN * np.ceil(angle / _TURN - 0.5), np.pi)
 
 

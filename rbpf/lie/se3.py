@@ -12,7 +12,7 @@ from rbpf.lie.base import LieGroup, StateArray, States, TangentArray, TangentMat
 
 @final
 class SE3Group(LieGroup):
-    """SE(3); element world_from_body = [quat_xyzw, translation], where q and -q are one rotation."""
+    """SE(3); element world_from_body = [quat_xyzw, translation], where q and -q are the same rotation."""
 
     size = 7
     dim = 6
@@ -95,7 +95,7 @@ class SE3Group(LieGroup):
     def from_matrix(self, m: Like[ArrayLike, "*batch row 4"]) -> Float[np.ndarray, "*batch 7"]:
         """Element of a homogeneous (or 3 x 4) matrix, (..., 4, 4) -> (..., 7), with qw >= 0."""
         m = np.asarray(m, dtype=float)
-        # An IndexError where there is no column of the translation, as in a 3 x 3 matrix of rotation.
+        # Raises IndexError without a translation column, as for a 3 x 3 rotation matrix.
         rows = np.concatenate([m[..., :3, :3], m[..., :3, 3][..., None]], axis=-1)
         return of_rows(kernels.from_matrix, rows.reshape(*m.shape[:-2], 12), 12, (7,))
 
@@ -128,7 +128,7 @@ class SE3Group(LieGroup):
     def closest(self, given: ArrayLike, world: ArrayLike, weights: ArrayLike | None = None) -> Array:
         """Poses (…, 7) that bring points (M, 3) closest to points (…, M, 3), by least squares (S. Umeyama, 1991).
 
-        `weights` (M,) sum to one; by default all count alike.
+        `weights` (M,) sum to one; by default they are equal.
         """
         given, world = np.asarray(given, dtype=float), np.asarray(world, dtype=float)
         if weights is None:

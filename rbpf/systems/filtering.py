@@ -18,13 +18,13 @@ class LikelihoodConfig(Ranged):
 
     #: Gaussian, truncated Mahalanobis (S05 (6)), Gaussian with outliers, or Student's t; by default the system's.
     kind: Literal["gaussian", "truncated", "outliers", "student"] | None = None
-    truncation: Positive = 4.0  #: T_l of the truncated form: it bounds the weight.
+    truncation: Positive = 4.0  #: T_l of the truncated form, which bounds the weight.
     #: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated; 16.3 holds
     #: 99.9 % of a Gaussian in three dimensions.
     update_limit: Positive = 16.3
-    outlier_rate: Probability = 0.02  #: ε.
-    outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0  #: V, of the measurement space, in its units.
-    dof: Positive = 4.0  #: of Student's t: fewer degrees of freedom have heavier tails.
+    outlier_rate: Probability = 0.02  #: outlier probability ε.
+    outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0  #: volume V of the measurement space, in its units.
+    dof: Positive = 4.0  #: degrees of freedom of Student's t: fewer have heavier tails.
 
     def build(self) -> Likelihood:
         if self.kind == "truncated":
@@ -54,7 +54,7 @@ class ProposalConfig(Ranged):
 class ResamplingConfig(Ranged):
     """When and how particles are resampled."""
 
-    scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"  #: how.
+    scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"  #: resampling scheme.
     #: resample when the effective sample size falls below this fraction of the particles.
     ess_threshold: Fraction = 0.5
 
@@ -70,10 +70,10 @@ class RunConfig(Ranged):
     """Settings common to the runs of all systems; a frame is an image, a pair, a step of a robot's log or a scan."""
 
     particles: Count = 100  #: number of particles.
-    seed: Seed = 0  #: of all random generators.
+    seed: Seed = 0  #: seed of all random generators.
     _: KW_ONLY  # a system's own settings are positional, such as dof of a stereo camera
     #: frames of the particles' paths that are kept (of stereo pairs only those that update the filter); None keeps all of a
     #: recording, and the last 150 of a source without a known end. With a joint map only one is kept.
     lag: Count | None = None
     checkpoint_every: Count = 500  #: frames (images, pairs, steps, scans) between checkpoints.
-    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
+    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how particles are resampled.

@@ -1,7 +1,7 @@
 """Reconstruction by COLMAP, and its comparison with a run's path and map, or the truth.
 
 It is made from key frames of a sequence: its own features, no knowledge of the filter. SIFT, sequential matching, incremental
-mapping; the calibration is held fixed. What it finds shares the images and the calibration with the filter and nothing else.
+mapping; the calibration is fixed. It shares only the images and the calibration with the filter.
 Of a stereo sequence both images take part as if two cameras had been there, and the known baseline gives the scale.
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 
@@ -49,7 +49,7 @@ class ReconstructionOptions(Ranged):
     """How images are reconstructed."""
 
     every: Count = 5  #: every n-th frame is a key frame, from the first on.
-    features: Count = 4096  #: most of them per image.
+    features: Count = 4096  #: maximum number per image.
     least_angle_deg: Angle = 16.0  #: between the rays of the two images that it begins with.
     seed: Seed = 0  #: of RANSAC.
 
@@ -202,7 +202,7 @@ class CloudDistance:
 @final
 @dataclass(frozen=True, eq=False)
 class ColmapComparison:
-    """COLMAP beside a reference: the filter, or the truth."""
+    """COLMAP compared with a reference: the filter, or the truth."""
 
     reconstruction: Reconstruction
     path: AbsoluteError  #: distances of the camera centres, after the alignment that fits these best.

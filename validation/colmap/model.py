@@ -1,11 +1,11 @@
-"""COLMAP's cameras, pixels and poses in ours; a reconstruction made of a path, a map and its observations; its images.
+"""Conversion of cameras, pixels and poses to COLMAP's; a reconstruction from a path, a map and observations; its images.
 
-COLMAP writes poses as camera-from-world and puts the centre of the top-left pixel at (0.5, 0.5); here poses are
-world-from-camera and it is at (0, 0). The half pixel is added and taken away in this module and nowhere else.
+COLMAP's poses are camera-from-world and its top-left pixel's centre is (0.5, 0.5); here poses are world-from-camera and
+it is (0, 0). The half pixel is added and subtracted in this module only.
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 
-In a reconstruction, image t + 1 is frame t (of a stereo pair, images 2t + 1 and 2t + 2 on one rig), point j + 1 is row
-j of the map.
+In a reconstruction, image t + 1 is frame t (images 2t + 1 and 2t + 2 on one rig for a stereo pair), and point j + 1 is
+row j of the map.
 """
 
 from collections.abc import Mapping
@@ -25,18 +25,18 @@ from rbpf.sensors.readers.images.sequence import Source
 from rbpf.sensors.readers.part import Chosen
 from rbpf.validation.gtsam.observations import ObservationTable
 
-HALF_PX = 0.5  #: Added to our pixels it gives COLMAP's.
+HALF_PX = 0.5  #: Added to our pixels to obtain COLMAP's.
 LEFT, RIGHT = 1, 2  #: Numbers of the cameras.
-OVER_IMAGES = "mono", "stereo"  #: Systems whose runs have images.
+OVER_IMAGES = "mono", "stereo"  #: Systems that use images.
 Names = dict[tuple[int, int], str]  #: Names of images by frame and side.
-_UPRIGHT = 1  #: What a photo's tag of its orientation says where it is not turned.
+_UPRIGHT = 1  #: Value of the EXIF orientation tag of an image that is not rotated.
 
 
 def to_colmap_camera(camera: Pinhole, camera_id: int = 1) -> Any:
-    """The `pycolmap.Camera` that is exactly our camera, with a known focal length.
+    """The `pycolmap.Camera` equal to our camera, with a known focal length.
 
-    PINHOLE without distortion; OPENCV with k1, k2, p1, p2; FULL_OPENCV, whose denominator is left at 1, with k3;
-    OPENCV_FISHEYE where it is equidistant.
+    PINHOLE without distortion; OPENCV with k1, k2, p1, p2; FULL_OPENCV, with denominator 1, with k3; OPENCV_FISHEYE
+    for an equidistant lens.
     """
     import pycolmap
 
@@ -60,7 +60,7 @@ def from_colmap_pose(cam_from_world: Any) -> Array:
 
 
 def image_name(frame: int, side: int = LEFT) -> str:
-    """Name of a frame's image in a model, by which it is found again."""
+    """Name of a frame's image in a model, which identifies it."""
     return f"{'left' if side == LEFT else 'right'}/{frame:06d}.png"
 
 
@@ -71,11 +71,11 @@ def build_model(
     colours: NDArray[np.uint8] | None = None,
     names: Names | None = None,
 ) -> Any:
-    """A `pycolmap.Reconstruction` of observations of T frames, of which the right pixel of a pair becomes one of its own.
+    """A `pycolmap.Reconstruction` of observations of T frames; the right pixel of a pair becomes an observation of its own.
 
-    `world_from_camera` (T, 7) is of the (left) camera; `points` (L, 3), in the order of the table's names, are grey
-    unless they have `colours` (L, 3) RGB. Images without a name, by frame and side, are left out; by default
-    `image_name` names all.
+    `world_from_camera` (T, 7) are poses of the (left) camera; `points` (L, 3), in the order of the table's names, are
+    grey without `colours` (L, 3) RGB. Images without an entry in `names`, by frame and side, are left out; by default
+    all are named by `image_name`.
     """
     import pycolmap
 
@@ -91,7 +91,7 @@ def build_model(
         sensors[side] = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, side)
     rig.add_ref_sensor(sensors[LEFT])
     if isinstance(camera, RectifiedStereo):
-        # A point at depth z is baseline · f / z further left in the right image.
+        # In the right image a point at depth z is baseline · f / z further left.
         shift = np.array([-camera.baseline_m, 0.0, 0.0])
         rig.add_sensor(sensors[RIGHT], pycolmap.Rigid3d(pycolmap.Rotation3d(), shift))
     model.add_rig(rig)
@@ -119,7 +119,7 @@ def build_model(
         for image in images:
             model.add_image(image)
         model.register_frame(step + 1)
-        # An observation is its image and its place among this image's pixels.
+        # An observation is its image and its index among this image's pixels.
         for place, index in enumerate(table.index[rows].tolist()):
             tracks[index] += [pycolmap.TrackElement(image.image_id, place) for image in images]
     grey = np.full((len(points), 3), 128, dtype=np.uint8)
@@ -135,17 +135,17 @@ def image_id(frame: int, side: int = LEFT, stereo: bool = False) -> int:
 
 
 def recorded_images(config: Mapping[str, Any]) -> ImageSequence:
-    """The images that a run's config.yaml names; an InputError where they are not where they were."""
+    """The images named by a run's config.yaml. Raises InputError: they have been moved."""
     opened = open_stereo if config["system"] == "stereo" else open_images
     topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
     return opened(Path(str(config["recording"])), config.get("calibration"), topics=topics, part=Part.of(config))
 
 
 def lay_out(sequence: ImageSequence, folder: Path, count: int) -> Names:
-    """Links to the files of the first images of a recording, or the images as they were filtered, as PNG files.
+    """Links to the files of the first images of a recording, or the images as filtered, as PNG files.
 
-    A file is linked to under its own name where the system saw it as it is: not one of a video or a bag, rectified,
-    resized or turned. A missing one is left out. Returned are the names as paths below `folder`.
+    A file is linked under its own name if the system used it unchanged: not from a video or a bag, nor rectified, resized
+    or rotated. Missing files are left out. Returns the names as paths below `folder`.
     """
     stereo = sequence.baseline_m is not None
     prefixes = {LEFT: "left/", RIGHT: "right/"} if stereo else {LEFT: ""}
@@ -173,7 +173,7 @@ def lay_out(sequence: ImageSequence, folder: Path, count: int) -> Names:
 
 
 def _files(source: Source, size: tuple[int, int]) -> list[list[Path]] | None:
-    """The files of one camera or two that hold the images as they are filtered; None where there are none."""
+    """The files, of one camera or two, of the images exactly as filtered; None if there are no such files."""
     rows: list[int] | None = None
     if isinstance(source, Chosen):
         rows, source = source.rows.tolist(), source.source
@@ -184,7 +184,7 @@ def _files(source: Source, size: tuple[int, int]) -> list[list[Path]] | None:
         try:
             with Image.open(files[0]) as first:
                 upright = first.getexif().get(ExifTags.Base.Orientation, _UPRIGHT) == _UPRIGHT
-                # An image made smaller is no file.
+                # A resized image has no file.
                 if first.size != size or not upright:
                     return None
         except (OSError, IndexError):

@@ -22,9 +22,9 @@ from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, NOISE_FACTOR, Statistic, motion_statistics, step_ratio
 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
-#: By system, where its configuration holds the one standard deviation of all measurements, px.
+#: By system, the setting with the common standard deviation of all measurements, px.
 SETTINGS = {"mono": ("search", "noise_px")}
-COMPARISON = "validation_"  #: What the names of their files begin with.
+COMPARISON = "validation_"  #: Prefix of their files' names.
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def innovation_statistics(
     They do not detect particles that agree on a wrong path that explains the measurements.
 
     `nis` (T,) with its degrees of freedom; corrections (T, r), (T, r, r) are those of `rbpf.core.diagnostics.Correction`,
-    r = 0 where the system does not tell them.
+    r = 0 if the system does not provide them.
     """
     innovations = step_ratio(INNOVATIONS, nis, nis_dof)
     motion = motion_statistics(correction, cov_correction) if correction.shape[1] else []
@@ -85,7 +85,7 @@ def compare_with_itself(record: RunFolder) -> Comparison:
     if not {"nis", "nis_dof"} <= table.keys():
         raise InputError(f"{record.folder / 'diagnostics.csv'} has no columns nis and nis_dof")
     correction, cov = np.zeros((0, 0)), np.zeros((0, 0, 0))
-    with suppress(InputError):  # a folder of another version has no such file; whoever needs the poses says so
+    with suppress(InputError):  # a folder of another version has no such file; readers that need the poses report it
         correction, cov = record.corrections
     statistics = innovation_statistics(table["nis"], table["nis_dof"], correction, cov)
     figures = {statistic.name: statistic.value for statistic in statistics if np.isfinite(statistic.value)}
@@ -177,7 +177,7 @@ class PathGrade:
     """The accuracy of a path."""
 
     grade: Grade = "not known"  #: the light.
-    #: how far it is from what, and how many frames were lost.
+    #: distance from the reference, and number of lost frames.
     sentence: str = "How far the path is from the right one is not known: the run was compared with nothing."
 
 
@@ -208,11 +208,11 @@ def grade_path(
 class Verdict:
     """The verdict on a run."""
 
-    path: PathGrade  #: how good the path is.
+    path: PathGrade  #: accuracy of the path.
     trust: Trust  #: whether its uncertainty can be trusted.
-    reason: str  #: why, a clause.
+    reason: str  #: the reason, a clause.
     leaning: Leaning = ""  #: direction in which an untrusted uncertainty is wrong, if known.
-    advice: str = ""  #: what to try next, a sentence; empty where there is nothing to say.
+    advice: str = ""  #: suggestion for the next run, a sentence; or empty.
 
     @property
     def said(self) -> list[str]:
@@ -221,7 +221,7 @@ class Verdict:
 
     @property
     def sentences(self) -> tuple[str, str]:
-        """Of the path and of its uncertainty, each with its full stop."""
+        """Sentences on the path and on its uncertainty, each with a full stop."""
         return self.path.sentence, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."
 
 
@@ -353,7 +353,7 @@ def _distance(statistic: Statistic) -> float:
 
 
 def distance(metres: float) -> str:
-    """In a readable unit."""
+    """A distance in a readable unit."""
     return f"{1e3 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"
 
 

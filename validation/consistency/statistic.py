@@ -1,11 +1,11 @@
 """Consistency statistics: values that are known for a consistent filter, with confidence intervals.
 
-Most of them are a ratio r of squared errors to what the filter expects of them: 1 for a consistent filter, 9 where its
+Most of them are a ratio r of squared errors to their expectation by the filter: 1 for a consistent filter, 9 if its
 standard deviations are three times too small. From ν effective degrees of freedom, the 95 % interval of r is
 
     [r ν / χ²_ν(0.975), r ν / χ²_ν(0.025)]
 
-The zone of a statistic is the tolerated error of standard deviations, the interval tells whether that can be decided
+The zone of a statistic is the tolerated error of standard deviations, the interval shows whether this can be decided
 (docs/how_to/report.md); no threshold depends on a run.
 
 Errors of a filter are correlated in time, so that T steps count for less than T independent ones. For a sum of squares of
@@ -44,14 +44,14 @@ _NOTHING = 1e-12  #: Variances below this fraction of the largest, or of one, co
 class Statistic:
     """One number about a filter's consistency."""
 
-    name: str  #: what it is, in few words.
+    name: str  #: short description.
     value: float  #: of this run.
     low: float  #: end of its 95 % interval;  high: the other.
     high: float
     zone: tuple[float, float]  #: tolerated range.
     samples: float  #: effective degrees of freedom or number of independent samples behind it.
-    #: a ratio of variances, a bias in standard deviations, a fraction of cases, or how many standard deviations a stated
-    #: calibration is from what is measured.
+    #: a ratio of variances, a bias in standard deviations, a fraction of cases, or the deviation of a stated calibration from
+    #: the measured one, in standard deviations.
     kind: Literal["ratio", "bias", "share", "calibration"] = "ratio"
 
     @property
@@ -229,7 +229,7 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
     # The least-squares bias b of the corrections, û = cov b: its most significant informed component.
     values, vectors = np.linalg.eigh(cov.sum(axis=0))
     informed = values > 1.0
-    sizes = [] if size is None else [size]  # no single step need tell anything for all together to do
+    sizes = [] if size is None else [size]  # all steps together may be informative even if no single one is
     if not informed.any():
         return sizes
     along = (vectors.T @ correction.sum(axis=0))[informed] / values[informed]

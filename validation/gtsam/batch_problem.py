@@ -31,8 +31,8 @@ OnIteration = Callable[[int, float], None]  #: Called before each iteration, wit
 LEAST = 4  #: Least landmarks of a frame, known or shared with other frames: three leave several poses.
 #: Exact known points get errors of this fraction of their extent, as constraints take GTSAM far longer.
 SOFTENED = 1e-4
-#: Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work
-#: is counted and not the time, so that a result does not depend on what else the machine does.
+#: Number of linearised observations, over all iterations, after which an adjustment is given up: some minutes of work.
+#: Work is counted instead of time, so that results do not depend on the machine's load.
 WORK = 30_000_000
 LEAST_ITERATIONS = 100  #: Iterations allowed for any number of observations.
 #: Relative gain that ends the adjustment. Landmarks with little parallax creep on: a thousand times as exact moves the path
@@ -47,7 +47,7 @@ class Optimum:
     """The batch optimum of a problem."""
 
     problem: Problem  #: the solved problem: the connected part.
-    #: path and map with marginal covariances; only landmarks that the measurements determine. Where not all are
+    #: path and map with marginal covariances; only landmarks determined by the measurements. If not all variables are
     #: determined, poses have no covariances and those of landmarks are NaN.
     estimate: PathAndMap
     steps: NDArray[np.intp]  #: (B,) steps of the run that took part, one per pose.
@@ -73,14 +73,14 @@ def solve_problem(
     marginals: bool = True,
     twice: bool = True,
 ) -> Optimum:
-    """GTSAM's optimum: of a robot's run, or of all frames of a camera's that landmarks connect with the first one.
+    """GTSAM's optimum of a robot's run, or of all frames of a camera's run that landmarks connect with the first one.
 
-    A camera's adjustment begins at `start` (T, E), poses of the filter, a robot's at its odometry. With `twice`, where
-    points are known, it begins at these and the filter's motions, too, and the better optimum is taken, so that it does
-    not hang on where the filter went; not needed near the optimum. `robust` is Huber's threshold in standard deviations;
-    None takes all as Gaussian, as the filter does. After `most` iterations, by default as many as `WORK` allows, a
-    camera's is given up; `on_iteration` is called with the number of each and the error before it. Without `marginals`
-    the optimum has no covariances of poses, NaN of landmarks.
+    A camera's adjustment is initialised at `start` (T, E), poses of the filter, a robot's at its odometry. With `twice`
+    and known points it is also initialised at these with the filter's motions, and the better optimum is taken, so that
+    it does not depend on the filter's path; not needed near the optimum. `robust` is Huber's threshold in standard
+    deviations; None is Gaussian, as in the filter. A camera's adjustment is given up after `most` iterations, by default
+    as many as `WORK` allows; `on_iteration` is called before each, with its number and the error. Without `marginals`
+    poses have no covariances, and those of landmarks are NaN.
 
     Raises InputError: the measurements do not determine everything, too few frames are connected, it takes too many
     iterations, or it does not converge.
@@ -122,7 +122,7 @@ def solve_problem(
 
 
 def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> dict[str, float]:
-    """How well an estimate's own poses and landmarks explain the observations of the named landmarks.
+    """Fit of an estimate's own poses and landmarks to the observations of the named landmarks.
 
     Σ log N(z − h(x̂, m̂); 0, R) [nats], root mean square of a whitened residual per measured number, number of
     observations.
@@ -147,7 +147,7 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
 
 
 def softened(known: KnownPoints | None) -> KnownPoints | None:
-    """The known points, with small errors where they have none."""
+    """The known points, with small errors if they are exact."""
     if known is None or known.cov.any():
         return known
     extent = float(np.ptp(known.positions, axis=0).max())
@@ -157,7 +157,7 @@ def softened(known: KnownPoints | None) -> KnownPoints | None:
 def connected_frames(log: FeatureLog) -> NDArray[np.intp]:
     """Frames (B,) that can be adjusted together with the first one, or with most of the others.
 
-    Each sees `LEAST` landmarks that are known or seen in another of them, and they are connected by these.
+    Each observes `LEAST` landmarks that are known or observed in another of them, and they are connected by these.
     """
     counts = np.array([frame.landmarks.size for frame in log.frames])
     steps = np.repeat(np.arange(counts.size), counts)

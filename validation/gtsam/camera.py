@@ -12,8 +12,8 @@ F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017). The facto
 The distance is that from the first camera to the one farthest from it at the start. The gauge only selects one of many
 equivalent solutions: it costs nothing at the optimum.
 
-GTSAM's own projection factors are taken where they are exactly our camera: Cal3DS2 has no k₃. Factors written in
-Python are evaluated all at once and handed out one by one, which makes them nearly as fast as GTSAM's.
+GTSAM's own projection factors are used if they are exactly our camera model: Cal3DS2 has no k₃. Factors written in
+Python are evaluated all at once and returned one by one, which makes them nearly as fast as GTSAM's.
 """
 
 from collections.abc import Callable
@@ -151,7 +151,7 @@ class CameraProblem:
         return solvers.explaining(self.name, "frame", self.table.names, advice)
 
     def observation_factors(self) -> list[Any]:
-        """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
+        """One factor per row of the table, with our residual in GTSAM's order: u, right u, v of a pair."""
         camera, z = self.table.camera, self.table.z
         if isinstance(camera, RectifiedStereo):
             left = camera.camera
@@ -184,7 +184,7 @@ class CameraProblem:
         return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
 
     def factors_by_row(self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None) -> list[Any]:
-        """A factor of each row of the table, made of row, noise model with its loss, key of the pose and key of the landmark.
+        """A factor per row of the table, from row, noise model with its loss, and keys of pose and landmark.
 
         A factor's residual is ours[order]; by default ours.
         """
@@ -206,7 +206,7 @@ class Adjusted(NamedTuple):
     values: Any  #: GTSAM's.
     graph: Any  #: likewise.
     loose: NDArray[np.bool_]  #: (L,) landmarks with a weak prior.
-    iterations: int  #: in all.
+    iterations: int  #: total number.
     converged: bool  #: whether it converged.
 
     @property
@@ -218,7 +218,7 @@ class Adjusted(NamedTuple):
 def adjust(
     problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: solvers.OnMisfit | None = None
 ) -> Adjusted:
-    """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
+    """Levenberg-Marquardt, a few rough steps at a time until undetermined landmarks are identified.
 
     Those of undetermined depth get a weak prior. One drawn into its camera by an outlier is left out: there it would explain
     any pixel, and block convergence. Raises InputError: a variable is not determined; it is named.
@@ -285,20 +285,18 @@ def solve_features(
     which does not measure the scale, its distance from the camera that starts farthest from it; the covariances are then
     relative to these.
 
-    Landmarks that the `initial` estimate lacks are triangulated. With `from_known` it begins at the known points, and takes
-    of the estimate only motions of frames that see too little, see `grown`. `robust` and `marginals` are as of
-    `rbpf.validation.gtsam.robot.solve`. `on_iteration` is given the error before each iteration, also of adjustments on
-    the way to where it begins; what it raises ends it all. `tolerance` is the fraction of the error that is no gain any
-    more.
+    Landmarks missing in the `initial` estimate are triangulated. With `from_known` it is initialised at the known points, and
+    uses from the estimate only motions of frames with too few landmarks, see `grown`. `robust` and `marginals` are as of
+    `rbpf.validation.gtsam.robot.solve`. `on_iteration` is called with the error before each iteration, also during the
+    initialisation; its exceptions end the adjustment. `tolerance` is the relative gain at convergence.
 
-    Raises InputError: a number makes no sense, the estimate puts a landmark behind its camera, a frame sees too few
-    landmarks or none that connect it, the known points are fewer than three or on a line, or the optimiser does not
-    converge.
+    Raises InputError: a number is invalid, a landmark of the estimate is behind its camera, a frame has too few landmarks
+    or is not connected by them, the known points are fewer than three or collinear, or the optimiser does not converge.
     """
     full = observations.observation_table(log)
     known = observations.known_by_name(log.known, full.names)
     problem = CameraProblem(log.name, len(log.frames), full.determined(known), known, robust)
-    # Enough observations of each frame, frames that hang together, known points that fix the world's frame.
+    # Check that each frame has enough observations, frames are connected, and known points fix the world's frame.
     table, name = problem.table, problem.name
     counts = np.bincount(table.steps, minlength=problem.frames)
     if (few := np.flatnonzero(counts < LEAST)).size:

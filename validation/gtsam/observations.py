@@ -36,7 +36,7 @@ _NONE = 1e-200  # information of a landmark behind its cameras
 class ObservationTable:
     """All measurements of a log, one row each, in the order of the frames."""
 
-    camera: Pinhole | RectifiedStereo  #: that took them.
+    camera: Pinhole | RectifiedStereo  #: of the measurements.
     steps: Index  #: (K,) frame of each.
     index: Index  #: (K,) its landmark's index in `names`.
     names: NDArray[np.int64]  #: (L,) names of the landmarks, ascending.
@@ -44,7 +44,7 @@ class ObservationTable:
     cov_z: Array  #: (K, p, p) [px^2].
 
     def rows(self, kept: NDArray[np.bool_] | Index) -> "ObservationTable":
-        """Some of the rows, with the landmarks that they show."""
+        """A subset of the rows, with their landmarks."""
         names, index = np.unique(self.names[self.index[kept]], return_inverse=True)
         return ObservationTable(self.camera, self.steps[kept], index, names, self.z[kept], self.cov_z[kept])
 
@@ -66,7 +66,7 @@ class ObservationTable:
 
 
 def observation_table(log: FeatureLog) -> ObservationTable:
-    """All measurements of a log; an InputError names one whose covariance is singular."""
+    """All measurements of a log. Raises InputError: one has a singular covariance."""
     counts = [len(frame.landmarks) for frame in log.frames]
     names, index = np.unique(np.concatenate([f.landmarks for f in log.frames]), return_inverse=True)
     steps = np.repeat(np.arange(len(counts)), counts)
@@ -80,7 +80,7 @@ def observation_table(log: FeatureLog) -> ObservationTable:
 
 
 def in_one_piece(steps: Index, index: Index, frames: int, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which frames (T,) landmarks connect with the known ones (L,), else with the first frame that sees any.
+    """Frames (T,) that landmarks connect with the known ones (L,), else with the first frame with any landmark.
 
     Observations (K,) are by their frame and by their landmark's row.
     """
@@ -133,7 +133,7 @@ def reprojection(table: ObservationTable, path: Array, points: Array) -> Residua
 
 
 def triangulate(table: ObservationTable, path: Array) -> Array:
-    """Huber's estimate (L, 3) from the distances to the rays, each in pixels of its image; near them without parallax."""
+    """Huber's estimate (L, 3) from the distances to rays, each in pixels of its image; near the rays without parallax."""
     # Centres and unit directions of the rays in the world, and noise as an angle; the right image of a stereo pair
     # gives a second ray.
     poses, camera, index = path[table.steps], table.camera, table.index
@@ -230,10 +230,10 @@ def misfit(table: ObservationTable, path: Array, points: Array) -> Array:
 
 
 def parallax(table: ObservationTable, path: Array, points: Array) -> Array:
-    """By how many standard deviations the inverse distance of each landmark (L,) differs from zero.
+    """Significance of each landmark's inverse distance (L,): its difference from zero in standard deviations.
 
-    It compares how well the observations fit the point and its direction at infinity, and so sees through a point that
-    only the scatter of the cameras' places has brought near.
+    It compares the fit of the observations to the point and to its direction at infinity, and so detects points that are
+    near only because of scatter in the camera positions.
     """
     origin, rays = first_centres(table, path), _directions(path[table.steps], table.bearings())
     mean = _sums(table.index, len(points), rays)

@@ -31,7 +31,7 @@ from rbpf.validation.gtsam.robot import RobotProblem
 DRAWS = 400
 #: Rms nonlinearity of a motion's whitened noise, over the draws, from which on the motion itself is drawn.
 BENT = 0.1
-_BLOCK = 300_000  #: Observations that are predicted at once.
+_BLOCK = 300_000  #: Number of observations predicted at once.
 
 
 @final
@@ -52,12 +52,12 @@ class PosteriorDraws:
 
     @property
     def log_evidence(self) -> float:
-        """Of the measurements, in nats."""
+        """Log-evidence of the measurements, in nats."""
         return float(np.logaddexp.reduce(self.log_ratio)) - float(np.log(self.log_ratio.size))
 
     @property
     def error(self) -> float:
-        """Standard error of the log-evidence, to be believed where many draws count."""
+        """Standard error of the log-evidence, reliable if the effective sample size is large."""
         return float((self.weights * self.weights.size).std(ddof=1) / np.sqrt(self.weights.size))
 
     @property
@@ -141,7 +141,7 @@ def _driven(problem: RobotProblem, path: Array, xi: Array) -> tuple[Array, Array
     drawn = np.where(noisy, np.einsum("sta,tab->stb", linear, axes), 0.0)
     for t in np.flatnonzero(bound):
         poses[:, t + 1] = space.retract(space.compose(poses[:, t], m.deltas[t]), drawn[:, t] @ axes[t].T)
-    # All others are where they were drawn, about the path.
+    # All others are as drawn, around the path.
     free = ~bound
     noise = space.local(space.compose(poses[:, :-1][:, free], m.deltas[free]), poses[:, 1:][:, free])
     drawn[:, free] = np.einsum("sta,tab->stb", noise, axes[free])

@@ -7,10 +7,10 @@ approximates. F. Dellaert and M. Kaess, "Factor graphs for robot perception" (20
     odometry:     Log(δ_t⁻¹ x_{t−1}⁻¹ x_t) ~ N(0, Q_t)
     observation:  h(x_t, l) − z ~ N(0, R), h and its derivatives as written in `Sensor`
 
-A singular Q_t (a robot that cannot slip sideways) is kept exactly: the residual is turned into Q_t's
-eigenvectors, and those without variance become hard constraints. A solver that starts far away would have to
-follow these constraints along a curve, therefore `RobotProblem.graph(soft=True)` first gives them a tenth of the largest
-standard deviation of the same step.
+A singular Q_t (a robot that cannot slip sideways) is exact: the residual is rotated into Q_t's eigenvectors, and
+directions without variance become hard constraints. A solver that starts far away would have to follow these constraints
+along a curve, so `RobotProblem.graph(soft=True)` first gives them a tenth of the largest standard deviation of the same
+step.
 """
 
 from collections.abc import Iterator
@@ -27,8 +27,8 @@ from rbpf.validation.gtsam import solvers
 from rbpf.validation.gtsam.observations import SINGULAR, Residuals
 
 SOFT = 0.1  #: Standard deviation of a softened constraint as a fraction of the step's largest.
-CHUNK = 50  #: Steps that an incremental start adds at once.
-MOVED = 1e-3  #: How far a variable may be from where `solve_online` linearised it [rad, m].
+CHUNK = 50  #: Number of steps added at once in an incremental initialisation.
+MOVED = 1e-3  #: Largest distance of a variable from its linearisation point in `solve_online` [rad, m].
 ADVICE = "check the covariances there"
 _PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
 
@@ -53,7 +53,7 @@ def solve(
     problem = RobotProblem(m, robust)
     with solvers.explaining(m.recording, "the pose of step", problem.names, ADVICE):
         graph = problem.graph()
-        if incremental:  # ISAM2 closes every loop from near by.
+        if incremental:  # ISAM2 closes every loop from a nearby estimate.
             *_, (_, isam) = _grown(problem, CHUNK)
             values = isam.calculateEstimate()
         else:
@@ -81,7 +81,7 @@ def solve(
 def solve_online(m: Measurements) -> Array:
     """The last pose of the optimum given all measurements up to each step: the best possible filter result.
 
-    By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
+    By ISAM2 (M. Kaess et al., 2012), which relinearises variables that moved; directions without noise are given a tenth
     of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
     """
     problem = RobotProblem(m)
@@ -92,8 +92,8 @@ def solve_online(m: Measurements) -> Array:
 def _grown(problem: "RobotProblem", chunk: int, moved: float | None = None) -> Iterator[tuple[Array, Any]]:
     """The newest pose (E,), and ISAM2, after every `chunk` steps.
 
-    With `moved`, all that has moved by so much [rad, m] is linearised anew every time, else as GTSAM usually does.
-    A new pose starts by odometry from the estimate of the one before, a new landmark by its first observation.
+    With `moved`, variables that moved by this [rad, m] are relinearised every time, else by GTSAM's default. A new pose
+    is initialised by odometry from the estimate of the one before, a new landmark by its first observation.
     """
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
@@ -131,7 +131,7 @@ class Sensor:
         self._polar, self._turn = m.measurement == "range_bearing", m.space.rotation(m.robot_from_sensor).T
 
     def residual(self, pose: Array, point: Array, z: Array) -> Array:
-        """What is expected of points (…, D) from poses (…, E), less what was measured (…, p); angles in (−π, π]."""
+        """Predictions of points (…, D) from poses (…, E) minus measurements (…, p); angles in (−π, π]."""
         at = self._space.inverse_transform(self._mount, self._space.inverse_transform(pose, point))
         if not self._polar:
             return at - z
@@ -160,7 +160,7 @@ class Sensor:
 
 @final
 class RobotProblem:
-    """Variables and factors of a run; see `solve`. An InputError names an observation whose covariance is singular."""
+    """Variables and factors of a run; see `solve`. Raises InputError: an observation's covariance is singular."""
 
     def __init__(self, m: Measurements, robust: float | None = None) -> None:
         variances = np.linalg.eigvalsh(m.cov_z)
@@ -202,7 +202,7 @@ class RobotProblem:
             graph.push_back(self._observation(row, together))
 
     def values(self, initial: InitialEstimate) -> Any:
-        """GTSAM's values of an estimate; an InputError says which pose or landmark it lacks."""
+        """GTSAM's values of an estimate. Raises InputError: a pose or landmark is missing."""
         shape, path = (len(self.m.stamps_ns), self.m.space.size), initial.world_from_body
         missing = [name for name in self.names.tolist() if name not in initial.landmarks]
         if path.shape != shape or missing:
@@ -251,7 +251,7 @@ class RobotProblem:
         poses = np.array([chart.storage(values, key) for key in self.pose_keys])[steps]
         points = np.array([chart.point(values, key) for key in self.landmark_keys])[self.index]
         by_pose, by_point = self.sensor.slopes(poses, points)
-        # GTSAM takes the memory of a Jacobian as it lies.
+        # GTSAM needs Jacobians contiguous in memory.
         by_gtsams_pose = np.ascontiguousarray(by_pose[..., chart.order])
         return self.sensor.residual(poses, points, self.m.z), [by_gtsams_pose, by_point]
 

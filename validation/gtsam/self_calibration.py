@@ -1,4 +1,4 @@
-"""A camera calibrated by what a run measured: the focal length and k1 that its batch adjustment prefers."""
+"""Self-calibration of a camera from a run's measurements: focal length and k1 of its batch adjustment."""
 
 from dataclasses import dataclass, replace
 from itertools import count
@@ -20,16 +20,16 @@ from rbpf.validation.gtsam.camera import FINE, SCALE, CameraProblem, CameraState
 from rbpf.validation.gtsam.observations import HUBER, Residuals, known_by_name, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals, together
 
-ITERATIONS = 200  #: Most of the adjustment.
-_STEP = 1e-6  #: Of focal length and k1, for the residuals' derivatives by them.
+ITERATIONS = 200  #: Maximum iterations of the adjustment.
+_STEP = 1e-6  #: Step of focal length and k1 for numeric derivatives of the residuals.
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A camera whose focal length and k1 explain the measurements best, and the optimum with it.
+    """A camera with the optimal focal length and k1, and the optimum with it.
 
-    `std` (2,) are standard deviations of the focal length, as a fraction, and of k1, with all poses and landmarks unknown;
-    NaN where the measurements do not determine them.
+    `std` (2,) are standard deviations of the focal length, as a fraction, and of k1, marginal over poses and landmarks; NaN
+    if the measurements do not determine them.
     """
 
     camera: Pinhole
@@ -40,7 +40,7 @@ class Calibrated:
 def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None = None) -> Calibrated:
     """Focal length and k1 adjusted together with all poses and landmarks, from the optimum with the given camera.
 
-    `on_round` is called with the iterations done, and the most that there can be. Errors as of `solve_problem`.
+    `on_round` is called with the number of iterations done and the maximum. Errors as of `solve_problem`.
     """
     assert isinstance(batch.problem, FeatureLog) and isinstance(batch.problem.camera, Pinhole)
     camera, key = batch.problem.camera, int(gtsam.symbol("c", 0))
@@ -63,7 +63,7 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnDone | None 
 
 
 def camera_problem(log: FeatureLog, batch: Optimum) -> tuple[CameraProblem, CameraState]:
-    """The problem of a log that is the batch's or nearly so, and the optimum there."""
+    """The problem of a log equal or close to the batch's, and its optimum."""
     full = observation_table(log)
     known = known_by_name(softened(log.known), full.names)
     problem = CameraProblem(log.name, len(batch.steps), full.determined(known), known, HUBER)
@@ -71,7 +71,7 @@ def camera_problem(log: FeatureLog, batch: Optimum) -> tuple[CameraProblem, Came
 
 
 def with_camera(problem: CameraProblem, camera: Pinhole, key: int) -> list[Any]:
-    """Factors of the observations that hang on the variable of a key, too: a change (2,) of the camera, see `changed`."""
+    """Factors of the observations that also depend on the variable of a key: a change (2,) of the camera, see `changed`."""
 
     def evaluate(values: Any) -> Residuals:
         state, change = problem.state(values), values.atVector(key)
@@ -96,14 +96,14 @@ def changed(camera: Pinhole, change: np.ndarray) -> Pinhole:
 
 
 def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
-    """The optimum of a log that is nearly the batch's, from the batch's."""
+    """The optimum of a log close to the batch's, initialised by the batch's."""
     path = np.tile(SE3.identity(), (len(log.frames), 1))
     path[batch.steps] = batch.estimate.world_from_body
     return solve_problem(log, path, HUBER, marginals=False, twice=False)
 
 
 def recalibrate(folder: Path, out: Path, on_round: OnDone | None = None) -> tuple[dict[str, Any], Calibrated]:
-    """Calibrates the camera of a finished monocular run; writes camera.yaml; returns what changed, and the camera."""
+    """Calibrates the camera of a finished monocular run; writes camera.yaml; returns the changes and the camera."""
     record = RunFolder.open(folder)
     problem = record.measurements
     if not isinstance(problem, FeatureLog) or not isinstance(problem.camera, Pinhole):

@@ -2,7 +2,7 @@
 
 Pose2 has the tangent [v, ω], Pose3 [ω, v]. In GTSAM 4.3 both retract by the exponential map on the right, so
 only the order differs from ours, and a BetweenFactor's residual is Log(δ⁻¹ x⁻¹ y) with exact derivatives.
-The tests check this of the installed build.
+The tests check this for the installed build.
 
 The loops are here because GTSAM's own optimisers copy all values at every call of a factor written in
 Python, a hundred times the cost; linearisation, elimination and retraction are GTSAM's.
@@ -99,8 +99,8 @@ SPATIAL = Chart(
 def explaining(name: str, pose: str, landmarks: NDArray[np.int64], advice: str) -> Iterator[None]:
     """GTSAM's complaint about a recording as an InputError in words, with the variable that it names.
 
-    The step of a pose is called `pose` in the recording, `landmarks` are the names of those that the keys count; `advice`
-    says what to do.
+    `pose` is the recording's word for the step of a pose, `landmarks` are the landmarks' names in order of the keys; `advice`
+    is appended.
     """
     try:
         yield
@@ -129,7 +129,7 @@ def huber(base: Any, threshold: float | None) -> Any:
 
 
 def together(evaluate: Callable[[Any], Residuals]) -> Callable[[int, list[int], Any], Any]:
-    """Makes factors by row, keys and noise; their residuals are evaluated for the first one asked, and kept for the others.
+    """Makes factors by row, keys and noise; the first evaluated one computes the residuals of all, which are cached.
 
     GTSAM passes the same values object to every factor as long as Python holds it, as the loops below do. An optimiser that
     changes its values in place, such as ISAM2, would get outdated residuals.
@@ -158,8 +158,8 @@ def levenberg_marquardt(
 ) -> tuple[Any, int, bool]:
     """Damped Gauss-Newton from some values; returns the values, the number of iterations, and whether it converged.
 
-    It ends when a step gains less than `tolerance`, a fraction of the error. `on_iteration` is called with the error before
-    each iteration; what it raises ends the optimisation.
+    It ends when the relative gain of a step is below `tolerance`. `on_iteration` is called with the error before
+    each iteration; its exceptions end the optimisation.
     """
     error, damping = graph.error(values), _DAMPING
     for count in range(1, iterations + 1):
@@ -228,8 +228,8 @@ def marginals_by_schur(
     adjustment: a modern synthesis", 2000, §6.) The information matrix squares the condition number: this is for problems with
     a measured scale, not for those in which a stiff prior fixes it.
 
-    The graph of a recording has factors between P poses and L points alone; some of them hard constraints hold by themselves.
-    An InputError says that the measurements do not determine everything.
+    The graph of a recording has only factors between P poses and L points, some of which are fixed by hard constraints.
+    Raises InputError: the measurements do not determine all variables.
     """
     undetermined = InputError(
         f"The measurements of {name} do not determine all poses and landmarks, so that they have no covariance; "

@@ -128,7 +128,7 @@ def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
 
 
 def _nees(run: RunFolder, errors: TruthErrors) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (R,) and the squared errors (R,) there, without those of which nothing is known."""
+    """Frames (R,) and their squared errors (R,), without unknown ones."""
     white = errors.whitened
     known = white.ranks > 0
     return run.truth.rows[known], white.nees[known]

@@ -1,10 +1,10 @@
-"""A run in the Rerun viewer (https://rerun.io), live or from a file that is written without a display.
+"""A run in the Rerun viewer (https://rerun.io), live, or as a file written without a display.
 
 world/camera                   the camera's pose; of a robot world/body
 world/camera/image             the frames, with searched and matched features
 world/uncertainty              3σ ellipsoid of the position
 world/seen                     points observed in the frame
-world/path, world/odometry     the path, and that of the odometry alone; in the end the truth beside it
+world/path, world/odometry     the path, and that of the odometry alone; at the end also the ground truth
 world/map                      the map: points with 3σ ellipsoids, rays as lines, walls; known points
 plots/…                        figures over the frames
 
@@ -32,7 +32,7 @@ from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.systems.system import Tracked
 from rbpf.validation.report.video import FEATURES, FOUND, MISSED, RAY, STARTED
 
-JPEG_QUALITY = 75  #: Of the JPEG images in the recording, in per cent.
+JPEG_QUALITY = 75  #: Quality of the JPEG images in the recording, in per cent.
 AXIS_M = 0.1  #: Length of the camera's drawn image plane from its centre.
 NEAREST = 0.02  #: Homogeneous weight below which an observed point counts as at infinity and is left out, 1/m.
 PATH, ODOMETRY, TRUE = (31, 119, 180), (127, 127, 127), (255, 255, 255)
@@ -41,7 +41,7 @@ GROWTH, LEAST_FRAMES = 0.05, 10
 
 
 def require_rerun() -> Any:
-    """The package; an InputError where it is not installed."""
+    """The package. Raises InputError: it is not installed."""
     try:
         import rerun
     except ImportError as error:
@@ -126,7 +126,7 @@ class RunView:
             stream.log("world/map/rays", rays, static=static)
 
     def finish(self, run: Run) -> None:
-        """The whole path and the last map, all of it in view; and the truth, in the run's own world."""
+        """Logs the whole path and the final map, all in view, and the ground truth in the run's own world."""
         self.map(run, static=True)
         self.stream.send_blueprint(blueprint(run))
         if run.truth is not None:
@@ -147,7 +147,7 @@ def blueprint(run: Run) -> Any:
 
     curves = {"plots/filter/ess": "effective sample size", "plots/filter/nis_per_dof": "NIS per degree of freedom"}
     if len(run.log) > 1 and not (run.log["nis_dof"] > 0.0).any():
-        del curves["plots/filter/nis_per_dof"]  # what is measured is no Gaussian innovation
+        del curves["plots/filter/nis_per_dof"]  # the measurements are not Gaussian innovations
     images = [rrb.Spatial2DView(origin="world/camera/image", name="image")] if run.system.name in DRAWN else []
     curves |= {"plots/tracking": "tracking"} if images else {}
     beside = [*images, *(rrb.TimeSeriesView(origin=origin, name=name) for origin, name in curves.items())]
@@ -163,14 +163,14 @@ def blueprint(run: Run) -> Any:
 
 
 def _places(run: Run) -> np.ndarray:
-    """(M, 3) of the map as it is now: of a scanner the middles of walls' cells, else the points of known depth."""
+    """Points (M, 3) of the current map: for a scanner the centres of wall cells, else points of known depth."""
     if not isinstance(run.system, LaserSlam):
         return run.system.map().points().in_space()[0]
     return np.pad(run.system.picture().walls(), ((0, 0), (0, 1)))
 
 
 def _lens(system: Any) -> Any:
-    """The camera that looks at the images, or None."""
+    """The camera of the images, or None."""
     return system.rig.camera if hasattr(system, "rig") else getattr(system, "camera", None)
 
 
@@ -205,13 +205,13 @@ def write_rerun(run: Run, path: Path) -> None:
 
 
 def _readable(name: str) -> str:
-    """A name without bytes that are no UTF-8, which a file's name may have."""
+    """A name without bytes that are not UTF-8, which file names may contain."""
     return name.encode(errors="replace").decode()
 
 
 @contextmanager
 def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
-    """The package and a stream into a file (.rrd); the file appears when it is complete. Errors as of `write_rerun`."""
+    """The package and a stream into a file (.rrd), which appears once it is complete. Errors as of `write_rerun`."""
     rr = require_rerun()
     try:
         str(path).encode()
@@ -225,13 +225,13 @@ def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
 
 
 def log_time(stream: Any, t: int, after_ns: int) -> None:
-    """Number of a frame and time since the first one [ns]; what is logged next belongs to it."""
+    """Sets a frame's number and time since the first one [ns] for the following logs."""
     stream.set_time("frame", sequence=t)
     stream.set_time("time", duration=1e-9 * float(after_ns))
 
 
 def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
-    """Where a camera or a robot is in the world, (7,)."""
+    """Logs the pose (7,) of a camera or a robot in the world."""
     turned = rr.Quaternion(xyzw=pose[:4])
     stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
 
@@ -251,7 +251,7 @@ def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
 
 
 def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
-    """Features that were looked for; Rerun's pixels start at a corner, not at a centre."""
+    """Logs the searched features; in Rerun, pixel coordinates start at a pixel's corner."""
     found = np.isfinite(seen["px"]).all(axis=1)
     ellipses = outline(seen["mean"], seen["cov"]) + 0.5
     for name, chosen, colour in (("found", found, FOUND), ("missed", ~found, MISSED)):
@@ -266,7 +266,7 @@ def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], 
 
 
 def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
-    """Features of the left image by what they were to the map, and where the pair itself has its landmarks."""
+    """Logs features of the left image by their role in the map, and landmarks triangulated from the pair alone."""
     for kind, (name, colour) in FEATURES.items():
         pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour], radii=rr.Radius.ui_points(3.0))
         stream.log(f"world/camera/image/{name}", pixels)

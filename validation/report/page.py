@@ -1,4 +1,4 @@
-"""The page of a run, report.html, made from the files in its folder, so that it can be rebuilt without the recording.
+"""The report of a run, report.html, made from the files in its folder, so that it can be rebuilt without the recording.
 
 At the top the run and two lights; then the results: the video, which is a file beside the page, the rotatable 3D map, each
 comparison with its plots, the run's own figures. The page needs no network: path and map are plotly traces, and plotly.js
@@ -59,7 +59,7 @@ _WORDS = {
 #: Entries of summary.json that are elsewhere on the page, or redundant.
 _ELSEWHERE = {"system", "recording", "finished", "alignment", "path_rmse_m", "remarks", "problems", "failure"}
 _UNITS = {"m": "m", "deg": "°", "px": "px", "mb": "MB", "ms": "ms", "s": "s", "rad": "rad", "frame": "ms"}
-_WIDE = 1.9  #: A picture that is so many times as wide as high takes the width of the page.
+_WIDE = 1.9  #: Aspect ratio from which on a plot takes the full width of the page.
 
 
 class Picture(NamedTuple):
@@ -69,7 +69,7 @@ class Picture(NamedTuple):
     data: str  #: PNG, as base64.
     caption: str
     wide: bool
-    vectors: str  #: Name of the file beside the page with the same as vectors; "" where there is none.
+    vectors: str  #: Name of the file beside the page with the same plot as vector graphics; "" for none.
 
 
 def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
@@ -97,7 +97,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     try:
         world = plots.World.of(record)
     except InputError:
-        world = plots.World()  # the truth is damaged, which is said among the problems
+        world = plots.World()  # the truth is damaged, which is reported as a problem
     try:
         turned = scene(record, world)
     except InputError:
@@ -177,7 +177,7 @@ def _beside(summary: Mapping[str, Any]) -> tuple[dict[str, list[str]], dict[str,
 
 
 def _told(figures: Mapping[str, Any]) -> dict[str, str]:
-    """Names and numbers as a reader wants them, without what has no value."""
+    """Readable names and numbers, without missing values."""
     found = {}
     for name, value in figures.items():
         if isinstance(value, Mapping):
@@ -194,7 +194,7 @@ def _label(name: str) -> str:
 
 
 def digits(value: Any, name: str = "") -> str:
-    """A figure with three digits and more only before the point, and its unit, which is the end of its name."""
+    """A figure with three significant digits, more only before the point, and its unit, from the end of its name."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return str(value)
     unit = _UNITS.get(name.rpartition("_")[2], "")
@@ -251,18 +251,18 @@ def scene(found: RunFolder, world: plots.World) -> str:
             traces.append(_line(_strips(_some(rings, ELLIPSOIDS)), name, "truth", 1))
         else:
             traces.append(_ellipsoids(_some(mean[near], ELLIPSOIDS), _some(cov[near], ELLIPSOIDS), name))
-    # Features whose depth is not known, by the ends of their rays (R, 2, 3).
+    # Features of unknown depth, by the ends of their rays (R, 2, 3).
     rays = np.zeros((0, 2, 3)) if landmarks.ray_ends is None else landmarks.ray_ends[landmarks.is_ray()]
     if len(rays):
         traces.append(_line(_strips(rays), "rays (depth not known yet)", "map", 1) | {"visible": "legendonly"})
-    # Everything in one scale, the longest side of the same length, whether the world is flat or not.
+    # Equal scale of all axes, with a longest side of fixed length, for planar and spatial worlds.
     margin = 0.05 * size
     sides = dict(zip("xyz", ((high - low + 2.0 * margin) / (size + 2.0 * margin)).tolist(), strict=True))
     axes = {
         f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "range": [a - margin, b + margin]}
         for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
     }
-    # As on the maps: from above and a little from the side, with what is up on top.
+    # As in the maps: from above and slightly from the side, with up on top.
     up = np.zeros(3)
     vertical = 2 if views.side is None else views.side[1]
     up[vertical] = -1.0 if views.down else 1.0
@@ -277,18 +277,18 @@ def scene(found: RunFolder, world: plots.World) -> str:
 
 
 def _some(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the rows, evenly chosen."""
+    """At most this many of the rows, evenly chosen."""
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]
 
 
 def _packed(rows: np.ndarray, names: str = "xyz", kind: str = "f4") -> dict[str, Any]:
-    """Places (M, 3), or rows of other three numbers, as plotly reads them in few bytes."""
+    """Positions (M, 3), or other rows of three numbers, in plotly's compact encoding."""
     columns = zip(names, rows.T.astype(f"<{kind}"), strict=True)
     return {name: {"dtype": kind, "bdata": b64encode(column.tobytes()).decode()} for name, column in columns}
 
 
 def _line(places: np.ndarray, name: str, colour: str, width: int) -> dict[str, Any]:
-    """A line, broken where a place is NaN."""
+    """A line, broken at positions that are NaN."""
     drawn = {"color": _COLOURS[colour], "width": width}
     places = places if np.isnan(places).any() else _some(places, PATH_POINTS)
     return {"type": "scatter3d", "mode": "lines", "name": name, "line": drawn, "hoverinfo": "name", **_packed(places)}
@@ -300,12 +300,12 @@ def _points(places: np.ndarray, name: str, colour: str, size: int) -> dict[str, 
 
 
 def _strips(lines: np.ndarray) -> np.ndarray:
-    """Lines (L, P, 3) as one with gaps."""
+    """Lines (L, P, 3) as one line with gaps."""
     return np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3)
 
 
 def _frustums(world_from_body: np.ndarray, system: str, size: float) -> np.ndarray:
-    """Some poses as pyramids, the base in the direction of view: of a camera along z, of a robot along x."""
+    """Some poses as pyramids, with the base in the viewing direction: z for a camera, x for a robot."""
     corners = size * _CORNERS
     if system in ("range-bearing", "laser"):
         corners = corners[:, [2, 0, 1]] * [1.0, 1.0, 0.0]

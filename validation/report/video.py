@@ -34,7 +34,7 @@ def drawn_size(width: int, height: int) -> tuple[int, int]:
 
 
 def drawn_scale(width: int) -> int:
-    """How many times an image of this width is enlarged."""
+    """Magnification of an image of this width."""
     return 2 if width < _SMALL_PX else 1
 
 
@@ -47,7 +47,7 @@ def annotate(
 ) -> np.ndarray:
     """The frame (H, W, 3) uint8 as shown, under a caption (figures, warning) and a legend of names and colours.
 
-    The image is (height, width) uint8 of a size (width, height), or None where it could not be read. `paint` is called with
+    The image is (height, width) uint8 of a size (width, height), or None if it could not be read. `paint` is called with
     PIL's drawing of the picture, and with the function from pixels to its points.
     """
     from PIL import Image, ImageDraw, ImageFont
@@ -168,7 +168,7 @@ PICTURES: dict[str, Callable[[Run, int, ImageFrame], np.ndarray]] = {
 
 
 def annotated_frames(run: Run) -> Iterator[np.ndarray]:
-    """The frames of a run (H, W, 3) uint8, as they are needed; its source is read once more."""
+    """Generates the frames of a run (H, W, 3) uint8; its source is read again."""
     draw = PICTURES[run.system.name]
     for t, frame in zip(range(len(run.log)), run.source.frames(), strict=False):
         yield draw(run, t, frame)
@@ -176,17 +176,17 @@ def annotated_frames(run: Run) -> Iterator[np.ndarray]:
 
 #: Bounds of the time per image, for sequences without useful stamps: photos, equal stamps.
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
-#: H.264 of constant quality: a rate factor of 18 is nearly without loss, 28 poor; the same pictures, the same bytes.
+#: H.264 of constant quality: a rate factor of 18 is nearly lossless, 28 poor; equal frames give equal bytes.
 ENCODING = "-an -vcodec libx264 -pix_fmt yuv420p -crf 23 -preset veryfast -fflags +bitexact -flags:v +bitexact"
 
 
 def write_video(
     pictures: Iterator[np.ndarray], stamps_ns: np.ndarray, path: Path, on_frame: OnDone | None = None
 ) -> None:
-    """Writes an MP4 of pictures (H, W, 3) uint8, one or more of one size, even numbers, as fast as their stamps (T,).
+    """Writes an MP4 of frames (H, W, 3) uint8, at least one, of one even size, at the rate of their stamps (T,).
 
-    It appears under its name when it is complete; an InputError says that the place cannot be written to. `on_frame` is called
-    with the pictures written and their number.
+    It appears under its name once it is complete. `on_frame` is called with the number of frames written and the total.
+    Raises InputError: the file cannot be written.
     """
     import imageio_ffmpeg
 
@@ -194,7 +194,7 @@ def write_video(
     raw = f"-y -v error -f rawvideo -pix_fmt rgb24 -s {first.shape[1]}x{first.shape[0]} -r {frame_rate(stamps_ns)} -i -"
     with whole(path) as partial:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), *f"{raw} {ENCODING}".split(), str(partial.absolute())]
-        # In a session of its own, so that Ctrl-C is for this program alone, which ends it.
+        # In a separate process session, so that Ctrl-C reaches only this program, which ends it.
         with Popen(command, stdin=PIPE, start_new_session=True) as encoder:
             assert encoder.stdin is not None
             for t, picture in enumerate(chain([first], pictures)):
@@ -206,7 +206,7 @@ def write_video(
 
 
 def frame_rate(stamps_ns: np.ndarray) -> float:
-    """Images per second of a video that runs as fast as the recording."""
+    """Images per second of a video at the recording's speed."""
     gaps = np.diff(stamps_ns) * 1e-9
     gaps = gaps[gaps > 0.0]
     typical = float(np.median(gaps)) if gaps.size else LONGEST_S

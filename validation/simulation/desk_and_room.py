@@ -1,4 +1,4 @@
-"""A textured desk with things on it, and a textured room, to take pictures of. The world's z axis points up."""
+"""Simulated scenes for cameras: a textured desk with objects on it, and a textured room. The z axis points up."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,9 +11,9 @@ from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.paths import HandHeld, Wave, eased, looking
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, apart, stamps_ns
 
-SHEET_M = 0.0001  #: Sheets of paper lie this much above each other.
+SHEET_M = 0.0001  #: Vertical distance between stacked sheets of paper.
 
-#: Size and print of what lies flat on a desk: pages, magazines, postcards, notes, cards, pencils.
+#: Size and texture of flat objects on a desk: pages, magazines, postcards, notes, cards, pencils.
 PAPERS = [
     ((0.21, 0.297), textures.page),
     ((0.30, 0.21), textures.picture),
@@ -23,38 +23,38 @@ PAPERS = [
     ((0.15, 0.014), textures.carton),
 ]
 
-DESK_M, HIGHEST_M = 0.75, 0.25  #: Height of a desk, and of the highest thing on it.
-BOOKS = 0.4  #: Fraction of books among the things; the others are boxes.
-COARSE = 4.0  #: Texels of the walls round a desk are larger by this: they are farther away.
+DESK_M, HIGHEST_M = 0.75, 0.25  #: Height of a desk, and of the tallest object on it.
+BOOKS = 0.4  #: Fraction of books among the objects; the others are boxes.
+COARSE = 4.0  #: Factor on the texel size of the walls around a desk, which are farther away.
 OVER_DESK = HandHeld(nearest_m=0.8, farthest_m=1.3, elevation_deg=50.0, wander=0.25)
-#: Nothing stands nearer to a chessboard's corners than this: it is seen whole from where the camera starts.
+#: Clearance around a chessboard's corners, so that the whole board is visible from the start pose.
 BOARD_CLEAR_M = 0.15
 
 
 @dataclass(frozen=True)
 class TexturedDesk(Ranged):
-    """A desk at a wall, with papers, books and boxes on it, seen by a camera in a hand that is held still at first.
+    """A desk at a wall, with papers, books and boxes on it, observed by a hand-held camera that starts at rest.
 
-    The middle of the desk's top is the origin; the wall is beyond its edge at the greatest y.
+    The origin is the centre of the desktop; the wall is beyond its edge of largest y.
     """
 
     frames: Annotated[int, Range(ge=2, le=MOST)] = 300  #: number of images.
     rate_hz: Positive = 30.0  #: images per second.
-    size_m: tuple[Positive, Positive] = (2.0, 2.0)  #: of the desk's top along x and y.
-    papers: CountOrNone = 42  #: number of flat things.
-    things: CountOrNone = 16  #: most books and boxes; as many as find a place.
-    #: squares (columns, rows) of a chessboard that lies in the middle; None for none.
+    size_m: tuple[Positive, Positive] = (2.0, 2.0)  #: of the desktop along x and y.
+    papers: CountOrNone = 42  #: number of flat objects.
+    things: CountOrNone = 16  #: maximum number of books and boxes; fewer if there is no room.
+    #: squares (columns, rows) of a chessboard in the middle; None for none.
     board: Annotated[tuple[int, int] | None, Range(ge=4, le=1000)] = None
     square_m: Positive = 0.03  #: side of its squares.
-    hand: HandHeld = OVER_DESK  #: that moves the camera.
+    hand: HandHeld = OVER_DESK  #: motion of the camera.
     texel_m: Positive = 0.001  #: side of a texel.
     contrast: NotNegative = 1.0  #: of all textures but the chessboard's; 1 is rich, 0.1 poor.
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
-        """Draws the textures, the things and the path."""
-        rng.random(3)  # skipped, so that a seed still gives the desk that earlier versions drew
+        """Draws the textures, the objects and the path."""
+        rng.random(3)  # skipped, so that a seed gives the same desk as in earlier versions
         path = self.hand.poses(np.arange(self.frames) / self.rate_hz, (*self.size_m, HIGHEST_M), rng)
-        # What is round the desk's top.
+        # The surroundings of the desktop.
         x, y = 0.5 * np.array(self.size_m)
         room = np.array([[-x - 2.0, -y - 2.5, -DESK_M], [x + 2.0, y + 0.01, 2.6 - DESK_M]])
         around = Furniture(rng, COARSE * self.texel_m, self.contrast)
@@ -64,7 +64,7 @@ class TexturedDesk(Ranged):
         for fraction in (0.5 + (np.arange(4) - 1.5) * 0.35 * x / (x + 2.0)).tolist():
             size = (rng.uniform(0.25, 0.5, 2) * x).tolist()
             around.hang(room, 0, (fraction, rng.uniform(0.45, 0.55)), size, textures.picture)
-        # The top, papers, and the chessboard on top of them.
+        # The desktop, papers, and the chessboard on top of them.
         desk = Furniture(rng, self.texel_m, self.contrast)
         desk.flat(np.zeros(3), 0.0, self.size_m, textures.wood)
         for k in range(self.papers):
@@ -92,32 +92,32 @@ class TexturedDesk(Ranged):
         return TexturedScene("desk", stamps_ns(self.frames, self.rate_hz), path, rectangles, board)
 
 
-#: Size of a room along x, y and z, pictures on each of its walls, and most boxes on its floor.
+#: Size of a room along x, y and z, pictures on each wall, and maximum number of boxes on the floor.
 ROOM_M, PICTURES, BOXES = (6.0, 5.0, 2.6), 5, 14
-#: The circle that is walked in it, the camera's height, and how far it looks outwards from straight ahead, and down.
+#: Radius of the walked circle, height of the camera, and its gaze: outwards from straight ahead, and downwards.
 RADIUS_M, EYE_M, GAZE_DEG, DROP_DEG = 1.0, 1.4, 60.0, 10.0
-#: The hand shakes at these frequencies, moves and turns the camera by so much per axis at most.
+#: Frequencies of the hand's shake, and its largest translation and rotation per axis.
 SHAKE_HZ, SHAKE_M, SHAKE_DEG = (0.3, 1.5), 0.03, 3.0
-ALONG_M = 0.7  #: What stands along a room's walls stays within this distance of them.
+ALONG_M = 0.7  #: Objects along a room's walls are within this distance of them.
 
 
 @dataclass(frozen=True)
 class TexturedRoom(Ranged):
-    """A room with pictures on its walls and boxes along them; a camera is carried in a circle and looks outwards.
+    """A room with pictures on its walls and boxes along them; a camera is carried in a circle and faces outwards.
 
-    The middle of the floor is the origin. Walked anticlockwise from (`RADIUS_M`, 0).
+    The origin is the centre of the floor. The walk is counter-clockwise from (`RADIUS_M`, 0).
     """
 
     frames: Annotated[int, Range(ge=2, le=MOST)] = 600  #: number of images.
     rate_hz: Positive = 30.0  #: images per second.
-    speed_m_s: Positive = 0.4  #: of walking.
-    start_s: NotNegative = 1.0  #: the walk reaches its speed after this time.
+    speed_m_s: Positive = 0.4  #: walking speed.
+    start_s: NotNegative = 1.0  #: time until the walk reaches its speed.
     texel_m: Positive = 0.0025  #: side of a texel.
     contrast: NotNegative = 1.0  #: of all textures; 1 is rich, 0.1 poor.
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
-        """Draws the textures, the things and the path."""
-        # Walked in a circle, looking outwards, with a hand that shakes.
+        """Draws the textures, the objects and the path."""
+        # A circle, facing outwards, with a shaking hand.
         time = eased(np.arange(self.frames) / self.rate_hz, self.start_s)
         turn = self.speed_m_s * time / RADIUS_M
         eye = np.stack([RADIUS_M * np.cos(turn), RADIUS_M * np.sin(turn), np.full_like(turn, EYE_M)], axis=-1)

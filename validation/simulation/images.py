@@ -1,12 +1,12 @@
-"""Takes pictures of a textured world: an image sequence on disk, with ground truth and calibration.
+"""Renders a textured world to an image sequence on disk, with ground truth and calibration.
 
 The sequence is an EuRoC ASL folder (M. Burri et al., The EuRoC micro aerial vehicle datasets, 2016):
 
     mav0/cam0, mav0/cam1       data/<stamp>.png or .jpg, data.csv, sensor.yaml; the body is the left camera
-    mav0/depth0                the left camera's depth, 16 bits, 1/5000 m, 0 where there is none or too much
+    mav0/depth0                the left camera's depth, 16 bits, in 1/5000 m; 0 is no depth, or one out of range
     mav0/state_groundtruth_estimate0/data.csv
     camera.yaml                the left camera, and the baseline of a stereo pair
-    known_points.csv           corners of the first image whose positions are given
+    known_points.csv           corners of the first image with known positions
 """
 
 import os
@@ -32,30 +32,30 @@ from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
 
 DRIFT_HZ = 0.1, 0.5
-PROBES = 12, 16  #: Rows and columns of pixels at which the motion during an exposure is measured.
-MOST_RAYS = 8  #: Along each side of a pixel: more than 64 px of motion during an exposure is rendered with gaps.
+PROBES = 12, 16  #: Rows and columns of the pixels at which the motion blur is measured.
+MOST_RAYS = 8  #: Maximum along each side of a pixel; motion blur above 64 px shows gaps.
 
 
 @dataclass(frozen=True)
 class Imaging:
-    """How pictures are taken, and what is given along with them.
+    """Imaging conditions, and the files written beside the images.
 
-    The defaults are those of a small camera indoors: an exposure of a hundredth of a second, the noise of a raised
-    gain, an automatic exposure, a lens that is darker in the corners. `examples/studies/mono_realism.py` compares what
-    active search finds with them with real recordings.
+    The defaults model a small camera indoors: an exposure time of 10 ms, noise at high gain, automatic exposure and
+    vignetting. `examples/studies/mono_realism.py` compares the matches of active search in such images with those in
+    real recordings.
     """
 
-    noise_std: NotNegative = 3.0  #: of the sensor, grey levels.
-    exposure_drift: Rate = 0.15  #: greatest change of the exposure, as a fraction; it goes up and down within seconds.
-    lens_px: NotNegative = 0.5  #: standard deviation of the lens's point spread; 0 is sharper than any lens.
-    blur_s: NotNegative = 0.01  #: the shutter is open this long, half before and half after the stamp.
-    vignetting: Rate = 0.2  #: fraction of the light that is missing in the corner farthest from the principal point.
-    blackout: Sequence[int] = ()  #: frames in which the light is out, counted from 0.
+    noise_std: NotNegative = 3.0  #: standard deviation of the sensor noise, grey levels.
+    exposure_drift: Rate = 0.15  #: largest relative change of the exposure, which varies within seconds.
+    lens_px: NotNegative = 0.5  #: standard deviation of the lens's point spread; 0 is an ideal lens.
+    blur_s: NotNegative = 0.01  #: exposure time, centred on the stamp.
+    vignetting: Rate = 0.2  #: relative loss of light in the corner farthest from the principal point.
+    blackout: Sequence[int] = ()  #: dark frames, counted from 0.
     grid: Annotated[int, Range(ge=1, le=64)] = 2  #: rays per pixel along each side.
     depth: bool = False  #: whether depth images are written.
-    #: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
+    #: quality of JPEG files, 1 to 100; 0 writes lossless PNG.
     jpeg: Annotated[int, Range(ge=0, le=100)] = 0
-    known: CountOrNone = 6  #: number of corners in the first image whose positions are given, at least 4; 0 for none.
+    known: CountOrNone = 6  #: number of known points, corners in the first image, at least 4; 0 for none.
     known_std_m: Positive = 0.001  #: standard deviation of these positions, the root of their covariance's trace.
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class Imaging:
 
 
 class Shutter:
-    """Takes the pictures of a scene, in any order: a frame's noise depends on nothing but the seed."""
+    """Takes the images of a scene, in any order, as a frame's noise depends only on the seed."""
 
     def __init__(
         self, scene: TexturedScene, imaging: Imaging, camera: Pinhole, renderer: Renderer, rng: np.random.Generator
@@ -81,9 +81,9 @@ class Shutter:
         poses = scene.world_from_camera
         lapse = np.maximum(seconds[after] - seconds[before], np.finfo(float).tiny)[:, None]
         self._rates = SE3.local(poses[before], poses[after]) / lapse
-        #: (T, 3) of the camera in the world, m/s.
+        #: (T, 3) velocities of the camera in the world, m/s.
         self.velocities = (SE3.translation(poses[after]) - SE3.translation(poses[before])) / lapse
-        # Factors (H, W) that fall with the square of the distance from the principal point.
+        # Factors (H, W) that decrease with the squared distance from the principal point.
         at = np.indices((camera.height, camera.width))
         square = (at[1] - camera.cx) ** 2 + (at[0] - camera.cy) ** 2
         self._vignette = (1.0 - imaging.vignetting * square / square.max()).astype(np.float32)
@@ -93,7 +93,7 @@ class Shutter:
         self._seeds = rng.integers(2**63, size=len(frames))
 
     def images(self, frame: int, baseline_m: float | None = None) -> list[np.ndarray]:
-        """Pictures (H, W) uint8 of a frame: one, or two with a second camera so far to the right."""
+        """Images (H, W) uint8 of a frame: one, or two with a second camera `baseline_m` to the right."""
         import cv2
 
         rng, imaging = np.random.default_rng(self._seeds[frame]), self._imaging
@@ -102,7 +102,7 @@ class Shutter:
         if baseline_m is not None:
             views.append(SE3.compose(poses, SE3.exp([0.0, 0.0, 0.0, baseline_m, 0.0, 0.0])))
         pictures = []
-        for view in views:  # Grey levels of what the sensor receives.
+        for view in views:  # Grey levels of the light at the sensor.
             light = self._renderer.image(view)
             if imaging.lens_px > 0.0:
                 light = np.asarray(cv2.GaussianBlur(light, (0, 0), imaging.lens_px))
@@ -113,12 +113,12 @@ class Shutter:
         return pictures
 
     def _poses(self, frame: int, rng: np.random.Generator) -> np.ndarray:
-        """(K, 7) poses while the shutter is open: K is a square, and as great as the motion in pixels."""
+        """(K, 7) poses during the exposure; K is a square number that grows with the motion blur in pixels."""
         middle, least = self._scene.world_from_camera[frame], self._imaging.grid
         half = 0.5 * self._imaging.blur_s * self._rates[frame]
         if not half.any():
             return middle[None]
-        # The greatest distance [px] that what is seen moves from middle ⊖ half to middle ⊕ half.
+        # The largest image motion [px] from middle ⊖ half to middle ⊕ half.
         depth, row = cast(self._scene.rectangles, middle, self._probe)
         ray = np.concatenate([self._probe, np.ones((len(self._probe), 1))], axis=1)[row >= 0]
         points = SE3.transform(middle, depth[row >= 0, None] * ray)
@@ -129,32 +129,32 @@ class Shutter:
         if travel == 0.0:
             return middle[None]
         side = int(np.clip(np.ceil(np.sqrt(travel)), least, max(least, MOST_RAYS)))
-        # The renderer deals the rays of a pixel out in order of their columns, which must not follow the time.
+        # The renderer assigns the rays of a pixel to poses in order of their columns, which must not correlate with time.
         moment = (rng.permutation(side * side) + 0.5) / (side * side)
         return SE3.retract(middle, (2.0 * moment - 1.0)[:, None] * half)
 
 
-#: The corners keep this fraction of the image's size from its border: they stay in view when the camera begins to move.
+#: Distance of corners from the border, as a fraction of the image's size: they stay in view when the camera starts to move.
 MIDDLE = 0.15
-FLAT = 0.025  #: All within this fraction of the image's width of a corner lies in one plane: its patch can be warped.
-#: Sheets nearer to each other than this, with normals nearer than this [rad], lie in one plane.
+FLAT = 0.025  #: A corner's planar surroundings, as a fraction of the image width: its patch can be warped.
+#: Sheets within this distance, with normals within this angle [rad], are coplanar.
 THICK_M, PARALLEL = 0.005, 0.01
-#: Most corners to look for, and the least quality of one, as a fraction of the best (J. Shi, C. Tomasi 1994).
+#: Maximum number of corners detected, and their least quality, as a fraction of the best (J. Shi, C. Tomasi 1994).
 CANDIDATES, QUALITY = 300, 0.01
-STRONGEST = 0.5  #: Fraction of the corners found that are strong enough, if they are as many as asked for.
-#: Corners are on a line if they extend, in the image, less than this fraction of their length to the side.
+STRONGEST = 0.5  #: Fraction of the detected corners that is used, at least as many as requested.
+#: Corners are collinear if their extent across, in the image, is below this fraction of that along.
 LEAST_SPREAD = 0.05
 
 
 def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, count: int) -> tuple[Array, Array]:
-    """`count` strong corners spread over the middle of the first image; the first few of them spread as well as all.
+    """`count` strong corners spread over the middle of the first image; any first few of them are spread, too.
 
-    Pixels (M, 2) in the first image, and positions (M, 3) in the world, m; an InputError where they are too few or on a
-    line.
+    Returns pixels (M, 2) in the first image and positions (M, 3) in the world, m. Raises InputError: too few, or
+    collinear.
     """
     import cv2
 
-    # Which rectangles lie in one plane: each gets the number of the first one in its plane.
+    # Coplanar rectangles: each gets the number of the first one in its plane.
     rectangles, pose = scene.rectangles, scene.world_from_camera[0]
     normal = np.array([np.cross(r.across, r.down) for r in rectangles])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -164,7 +164,7 @@ def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, cou
     plane = ((np.abs(apart) < THICK_M) & (turned < PARALLEL)).argmax(axis=1)
     seen = renderer.depth(pose)[1]
     planes = np.where(seen >= 0, plane[seen], -1)
-    # Corners are looked for in the middle, where all around lies in one plane.
+    # Corners are detected in the middle, with planar surroundings.
     side = 2 * round(FLAT * camera.width) + 1
     window, label = np.ones((side, side), dtype=np.uint8), planes.astype(np.float32)
     flat = cv2.erode(label, window) == cv2.dilate(label, window)
@@ -180,8 +180,8 @@ def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, cou
             f"the first image of the {scene.name} has {len(px)} corners that can be known, expected {count}: "
             "ask for fewer known points or give the world more contrast"
         )
-    # Of the strongest those that are farthest from any stronger one (M. Brown, R. Szeliski and S. Winder, Multi-image
-    # matching using multi-scale oriented patches, 2005); the farthest first.
+    # Adaptive non-maximal suppression: of the strongest those farthest from any stronger one, the farthest first
+    # (M. Brown, R. Szeliski and S. Winder, Multi-image matching using multi-scale oriented patches, 2005).
     px = px[: max(count, round(STRONGEST * len(px)))]
     stronger = np.where(np.tri(len(px), k=-1, dtype=bool), np.linalg.norm(px[:, None] - px, axis=-1), np.inf)
     px = px[np.argsort(-stronger.min(axis=1), kind="stable")[:count]]
@@ -193,8 +193,8 @@ def known_corners(scene: TexturedScene, renderer: Renderer, camera: Pinhole, cou
     return px, SE3.transform(pose, depth[:, None] * np.concatenate([uv, np.ones((count, 1))], axis=1))
 
 
-DEPTH_PER_M = 5000.0  #: Of a depth image, as TUM's RGB-D recordings have it: out to 13 m.
-COMPRESSION = 1  #: Of PNG files, 0 to 9: noise does not become much smaller by trying harder.
+DEPTH_PER_M = 5000.0  #: Scale of a depth image, as in TUM's RGB-D recordings: up to 13 m.
+COMPRESSION = 1  #: Level of PNG files, 0 to 9: more does not compress noise much better.
 
 TRUTH_COLUMNS = [
     "#timestamp",
@@ -208,7 +208,7 @@ TRUTH_COLUMNS = [
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `folder`, not there before, when all is done, and vanishes if interrupted."""
+    """A temporary folder, renamed on success to `folder`, which must not exist, or be empty; deleted if interrupted."""
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists already: delete it or choose another folder for the images")
     partial = folder.with_name(folder.name + ".partial")
@@ -223,21 +223,21 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
-    """A .png or .jpg file of an image (H, W) uint8 or uint16, a JPEG of a quality of 1 to 100; its folder has to be there."""
+    """Writes an image (H, W) uint8 or uint16 as PNG, or as JPEG of quality 1 to 100; its folder must exist."""
     import cv2
 
     how = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if path.suffix == ".png":
         how = [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION]
         if image.dtype == np.uint8:
-            # What noise leaves to compress is found by Huffman's code alone, in less time.
+            # Huffman coding alone compresses noise as well, in less time.
             how += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
     _, encoded = cv2.imencode(path.suffix, image, how)
     path.write_bytes(encoded.tobytes())
 
 
 def write_sensor(folder: Path, sensor: str, scene: TexturedScene, camera: Pinhole, x_m: float, suffix: str) -> None:
-    """A sensor's folder (cam0, cam1 or depth0) with calibration and index; it stands so far along the body's x axis."""
+    """Writes a sensor's folder (cam0, cam1 or depth0) with calibration and index; `x_m`: its position on the body's x axis."""
     stamps_ns = scene.stamps_ns
     place = folder / "mav0" / sensor
     (place / "data").mkdir(parents=True)
@@ -247,7 +247,7 @@ def write_sensor(folder: Path, sensor: str, scene: TexturedScene, camera: Pinhol
     rate = (len(stamps_ns) - 1) / seconds if seconds else 0.0
     matrix = np.eye(4)
     matrix[0, 3] = x_m
-    # EuRoC has four coefficients; a fifth is written only where it says something.
+    # EuRoC has four coefficients; a fifth is written only if it is not zero.
     distortion = camera.distortion if any(camera.distortion[4:]) else camera.distortion[:4]
     lines = [
         "sensor_type: camera",
@@ -277,16 +277,15 @@ def simulate_images(
     on_frame: OnDone | None = None,
     baseline_m: float | None = None,
 ) -> None:
-    """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.
+    """Renders a world into an EuRoC ASL folder; the same arguments give the same bytes.
 
-    Beside mav0 there are camera.yaml; known_points.csv, if points are known; and chessboard.yaml, if there is a board. The
-    folder must not exist, or be empty; it appears when it is complete: an interrupted run leaves nothing there. The world's
-    path is that of the left camera;
-    `baseline_m` is that of a second one like a `Pinhole`, to its right; a `RectifiedStereo` has its own. `on_frame` is
-    called after every image, in order, with how many are done, and how many there will be.
+    Beside mav0 it holds camera.yaml; known_points.csv, if points are known; and chessboard.yaml, if there is a board. The
+    folder must not exist, or be empty; it appears once it is complete: an interrupted run leaves nothing. The path is that
+    of the left camera; `baseline_m` adds an equal one to the right of a `Pinhole`; a `RectifiedStereo` has its own.
+    `on_frame` is called after every image, in order, with the number done and the total.
 
-    Raises InputError: the folder exists, an option asks for frames that there are not, too few points can be known, or
-    the baseline is not positive.
+    Raises InputError: the folder exists, an option names frames beyond the last, too few corners qualify as known points,
+    or the baseline is not positive.
 
     Example:
         >>> import tempfile
@@ -315,7 +314,7 @@ def simulate_images(
         if imaging.depth:
             write_sensor(partial, "depth0", scene, left, 0.0, ".png")
         write_text(partial / "camera.yaml", camera_text(left, baseline_m=baseline_m))
-        # Ground truth: poses and velocities in the world [m/s]; there is no gyroscope: its biases are 0.
+        # Ground truth: poses and velocities in the world [m/s]; gyroscope biases, which EuRoC has, are 0.
         place, poses = partial / "mav0" / "state_groundtruth_estimate0", scene.world_from_camera
         place.mkdir(parents=True)
         wxyz, biases = np.roll(poses[:, :4], 1, axis=1), np.zeros((len(poses), 6))
@@ -344,7 +343,7 @@ def simulate_images(
                 coded = np.where(steps <= np.iinfo(np.uint16).max, steps, 0.0).astype(np.uint16)
                 write_image(partial / "mav0" / "depth0" / "data" / f"{stamp}.png", coded)
 
-        # All frames, several at a time; they are reported in order.
+        # All frames in parallel, reported in order.
         frames = len(scene.stamps_ns)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:

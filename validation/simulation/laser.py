@@ -1,7 +1,7 @@
-"""Simulates a robot with a laser scanner that drives round a corridor, and writes the log that `rbpf run laser` reads.
+"""Simulates a robot with a laser scanner that drives round a closed corridor, and writes a log for `rbpf run laser`.
 
-The folder holds `robot.clf`, a CARMEN log; `truth.tum`, the true path; and `robot.relations`, true relations between poses
-near in time and between poses at one place in different rounds (`rbpf.validation.metrics.relations`).
+The folder holds `robot.clf`, a CARMEN log; `truth.tum`, the true path; and `robot.relations`, true relative poses between
+poses near in time, and at one place in different laps (`rbpf.validation.metrics.relations`).
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ from rbpf.validation.simulation.paths import eased
 
 #: Corners of the walls around the corridor, counterclockwise [m].
 OUTER = ((0.0, 0.0), (16.0, 0.0), (16.0, 12.0), (0.0, 12.0))
-#: Corners of the block that it leads round, clockwise: the corridor is on the left of both.
+#: Corners of the block inside, clockwise: the corridor is on the left of both.
 INNER = ((2.0, 2.0), (2.0, 10.0), (14.0, 10.0), (14.0, 2.0))
-#: Along each wall, of the outer ones first: where a door begins, how wide and how deep it is [m]; below zero it juts
-#: out.
+#: Niches and pillars of each wall, outer walls first: start along the wall, width and depth [m]; a negative depth is a
+#: pillar.
 NICHES = (
     ((3.0, 1.0, 0.6), (8.5, 0.9, 0.25), (12.0, 2.0, 1.5)),
     ((2.5, 0.9, 0.3), (7.0, 1.4, 0.8)),
@@ -35,38 +35,38 @@ NICHES = (
     ((2.0, 1.0, 0.25), (6.0, 0.5, -0.3), (9.5, 0.9, 0.25)),
 )
 LANE_M, BEND_M, SPEED_M_S, RAMP_S = 1.0, 0.7, 0.5, 1.0
-NO_RETURN_M = 81.83  #: What SICK's scanners write.
+NO_RETURN_M = 81.83  #: Reading without a return, as written by SICK scanners.
 START_S, READINGS = 1_000_000_000, 10
 
 
-Error = Annotated[float, Range(gt=-0.5, lt=0.5)]  #: As a fraction of what is right.
+Error = Annotated[float, Range(gt=-0.5, lt=0.5)]  #: A relative error.
 
 
 @dataclass(frozen=True)
 class WheelOdometer(Ranged):
-    """Two driven wheels side by side, whose turns are counted.
+    """Odometry of a differential drive.
 
-    Wrong diameters and a wrong distance between the wheels err the same way all the time (J. Borenstein, L. Feng,
-    Measurement and correction of systematic odometry errors in mobile robots, 1996); slip is a random walk whose
-    variance grows with the way of each wheel (K. S. Chong, L. Kleeman, Accurate odometry and error modelling for a
-    mobile robot, 1997).
+    Wrong wheel diameters and a wrong wheelbase give systematic errors (J. Borenstein, L. Feng, Measurement and
+    correction of systematic odometry errors in mobile robots, 1996); slip is a random walk whose variance grows with
+    the distance driven by each wheel (K. S. Chong, L. Kleeman, Accurate odometry and error modelling for a mobile
+    robot, 1997).
     """
 
     wheelbase_m: Positive = 0.4  #: true distance between the wheels.
-    scale: Error = 0.01  #: both wheels report so much more than they went, as a fraction.
-    #: the right one reports so much more than the left one, as a fraction: a drift of the heading.
+    scale: Error = 0.01  #: relative scale error of both wheels: positive reports too much.
+    #: relative excess of the right wheel's reports over the left's, which makes the heading drift.
     inequality: Error = 0.002
-    #: the robot takes the distance between its wheels for so much greater, as a fraction.
+    #: relative error of the wheelbase that the robot assumes: positive is too large.
     wheelbase_error: Error = 0.02
-    #: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
+    #: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the distance.
     slip_m: NotNegative = 0.004
 
     def measure(self, way_m: Array, heading_rad: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Readings of a robot that drove so far (T,) and turned so far (T,); more of them leave the first as they are.
+        """Odometry from cumulative distance and heading (T,); further times leave the first readings unchanged.
 
         Returns:
-            Motions (T - 1, 3) from each time to the next, elements of SE(2), and standard deviations (T - 1, 3) of what is
-            random in their theta [rad], x and y [m].
+            Motions (T - 1, 3) between consecutive times, elements of SE(2), and standard deviations (T - 1, 3) of the
+            random errors of their theta [rad], x and y [m].
         """
         side = 0.5 * self.wheelbase_m * np.array([-1.0, 1.0])
         way = np.diff(way_m[:, None] + heading_rad[:, None] * side, axis=0)
@@ -81,25 +81,25 @@ class WheelOdometer(Ranged):
 
 
 def dead_reckoning(delta: np.ndarray) -> np.ndarray:
-    """(T, 3) poses by motions (T - 1, 3), elements of SE(2); the first is the identity."""
+    """Poses (T, 3) from motions (T - 1, 3), elements of SE(2); the first is the identity."""
     return np.array(list(accumulate(delta, SE2.compose, initial=SE2.identity())))
 
 
 @dataclass(frozen=True)
 class LaserWorld(Ranged):
-    """A robot with a scanner over 180° in a corridor of 16 m by 12 m."""
+    """A robot with a 180° scanner in a corridor of 16 m by 12 m."""
 
-    scans: Annotated[int, Range(ge=2, le=MOST)] = 400  #: how many, at equal times.
-    laps: Annotated[int, Range(ge=1, le=1000)] = 2  #: how many times round.
-    std_range_m: NotNegative = 0.01  #: noise of the ranges.
+    scans: Annotated[int, Range(ge=2, le=MOST)] = 400  #: number of scans, equally spaced in time.
+    laps: Annotated[int, Range(ge=1, le=1000)] = 2  #: number of laps.
+    std_range_m: NotNegative = 0.01  #: standard deviation of the ranges.
     dropouts: Rate = 0.01  #: fraction of the readings without a return.
     max_range_m: Positive = 20.0  #: farther walls give no return.
-    scanner_ahead_m: float = 0.2  #: of the robot's middle.
-    odometer: WheelOdometer = field(default_factory=WheelOdometer)  #: of the robot's wheels.
+    scanner_ahead_m: float = 0.2  #: position of the scanner ahead of the robot's centre.
+    odometer: WheelOdometer = field(default_factory=WheelOdometer)  #: of the wheels.
 
 
 def floor_plan() -> Array:
-    """(S, 2, 2) both ends of each piece of wall [m]."""
+    """End points (S, 2, 2) of the wall segments [m]."""
     walls = []
     for niches, corners in ((NICHES[:4], OUTER), (NICHES[4:], INNER)):
         line: list[Array] = []
@@ -116,7 +116,7 @@ def floor_plan() -> Array:
 
 
 def cast(walls: Array, world_from_sensor: Array, angles: Array) -> Array:
-    """(B,) distance to the nearest of the walls (S, 2, 2) along beams at angles (B,), inf where there is none."""
+    """Distances (B,) to the nearest wall segment (S, 2, 2) along beams at angles (B,); inf is none."""
     heading = world_from_sensor[0] + angles
     beam = np.stack([np.cos(heading), np.sin(heading)], axis=-1)[:, None]
     start, along = walls[:, 0] - world_from_sensor[1:], walls[:, 1] - walls[:, 0]
@@ -124,7 +124,7 @@ def cast(walls: Array, world_from_sensor: Array, angles: Array) -> Array:
     def cross(a: Array, b: Array) -> Array:
         return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
-    # Eye + distance · beam = start + fraction · along.
+    # Sensor position + distance · beam = start + fraction · along.
     with np.errstate(divide="ignore", invalid="ignore"):
         slant = cross(beam, along)
         distance, fraction = cross(start, along) / slant, cross(start, beam) / slant
@@ -133,10 +133,10 @@ def cast(walls: Array, world_from_sensor: Array, angles: Array) -> Array:
 
 
 def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
-    """Writes a log into a folder, created where it does not exist; files of that name are replaced."""
+    """Writes a log into a folder, which is created if necessary; existing files are replaced."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    # Round the middle of the corridor, from the middle of its first side: straights and quarter turns, each a constant twist.
+    # Along the centre of the corridor, from the middle of its first side: straights and quarter turns, each a constant twist.
     width, depth = np.array(OUTER[2]) - 2.0 * LANE_M
     sides = np.array([0.5 * width, *[depth, width] * (2 * world.laps - 1), depth, 0.5 * width])
     length = np.full(2 * sides.size - 1, 0.5 * np.pi * BEND_M)
@@ -145,7 +145,7 @@ def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
     twist = np.stack([turn, length, np.zeros_like(turn)], axis=-1)
     reached, turned = np.append(0.0, np.cumsum(length)), np.append(0.0, np.cumsum(turn))
     starts = SE2.compose(np.array([0.0, 0.5 * OUTER[1][0], LANE_M]), dead_reckoning(SE2.exp(twist)))
-    # The wheels are read more often than the scanner.
+    # The odometry's rate is higher than the scanner's.
     times = np.linspace(0.0, reached[-1] / SPEED_M_S + 0.5 * RAMP_S, READINGS * (world.scans - 1) + 1)
     way_m = SPEED_M_S * eased(times, RAMP_S)
     part = np.searchsorted(reached[1:-1], way_m, side="right")
@@ -155,7 +155,7 @@ def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
     readings, _ = world.odometer.measure(way_m, turned[part] + fraction * turn[part], rng)
     odometry = dead_reckoning(readings)[::READINGS]
     truth, way_m, stamps_ns = truth[::READINGS], way_m[::READINGS], stamps_ns[::READINGS]
-    # Scans: noise, then what gives no return.
+    # Scans: noise, then readings without a return.
     mount, angles, walls = np.array([0.0, world.scanner_ahead_m, 0.0]), np.radians(np.arange(-90.0, 91.0)), floor_plan()
     ranges = np.stack([cast(walls, SE2.compose(pose, mount), angles) for pose in truth])
     ranges = np.maximum(ranges + world.std_range_m * rng.standard_normal(ranges.shape), 0.0)
@@ -169,7 +169,7 @@ def simulate_laser(world: LaserWorld, folder: Path, seed: int) -> None:
         lines.append(f"FLASER {len(scan)} {_words(scan, 3)} {sensor} {robot} {time} simulated {time}")
     write_text(folder / "robot.clf", "\n".join(lines) + "\n")
     write_tum(folder / "truth.tum", Trajectory.from_planar(stamps_ns, truth))
-    # Relations: every tenth scan and the next tenth, and the one nearest to it of another round.
+    # Relations: every tenth scan with the next tenth, and with the nearest one of another lap.
     rows = np.arange(0, world.scans, 10)
     pairs = list(zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True))
     for row in rows.tolist():

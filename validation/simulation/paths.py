@@ -1,6 +1,6 @@
-"""Smooth paths of a camera in a hand: sums of sinusoids, a start from rest, and poses that look at something.
+"""Smooth paths of a hand-held camera: sums of sinusoids, a start from rest, and poses facing a target.
 
-They are infinitely differentiable but for the start, where the jerk is continuous.
+They are infinitely differentiable except at the start, where the jerk is continuous.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ TERMS = 3
 
 @dataclass(frozen=True)
 class Wave:
-    """C smooth random signals around zero, sums of sinusoids Σ a_k sin(2π f_k t + φ_k), |.| ≤ Σ a_k; parameters are (C, K)."""
+    """C smooth random zero-mean signals Σ a_k sin(2π f_k t + φ_k), with |.| ≤ Σ a_k; parameters are (C, K)."""
 
     amplitude: np.ndarray
     frequency_hz: np.ndarray
@@ -27,7 +27,7 @@ class Wave:
 
     @classmethod
     def random(cls, bound: np.ndarray, band_hz: tuple[float, float], rng: np.random.Generator) -> Self:
-        """Signals within bounds (C,); frequencies log-uniform in the band; all terms have the same speed."""
+        """Signals within bounds (C,); frequencies are log-uniform in the band; all terms have the same peak rate."""
         shape = (len(bound), TERMS)
         frequency = np.exp(rng.uniform(np.log(band_hz[0]), np.log(band_hz[1]), shape))
         fraction = 1.0 / frequency
@@ -41,7 +41,7 @@ class Wave:
 
 
 def eased(seconds: np.ndarray, start_s: float) -> np.ndarray:
-    """Time (T,) of a camera that is held still at first and reaches its pace after `start_s`.
+    """Path time (T,) of a camera that starts from rest and reaches its pace after `start_s`.
 
     The pace rises as the polynomial 6 x⁵ - 15 x⁴ + 10 x³, whose first two derivatives vanish at both ends.
     """
@@ -52,7 +52,7 @@ def eased(seconds: np.ndarray, start_s: float) -> np.ndarray:
 
 
 def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Poses world_from_camera (T, 7) of an upright camera at (T, 3) [m] that looks along directions (T, 3), not vertical."""
+    """Poses world_from_camera (T, 7) of an upright camera at (T, 3) [m] facing directions (T, 3), not vertical."""
     forward = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     right = np.cross(forward, UP)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
@@ -60,30 +60,30 @@ def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 ARM_HZ = 0.2, 0.8
-WRIST_HZ = 0.8, 2.0  #: Before the path is slowed down to the speed of a hand, to about a third.
+WRIST_HZ = 0.8, 2.0  #: Before the path is slowed down to a hand's speed, by a factor of about three.
 TREMOR_HZ = 1.0, 3.0
-#: Greatest turn about the point looked at to either side; up and down it is this fraction of that.
+#: Largest azimuth about the target to either side; elevation varies by this fraction of it.
 SWEEP_DEG, RISE = 40.0, 0.25
-#: Greatest rotation by the wrist, and rotation and displacement by the hand's tremor, per axis.
+#: Largest rotation by the wrist, and rotation and translation by tremor, per axis.
 WRIST_DEG, TREMOR_DEG, TREMOR_M = 10.0, 0.3, 0.002
 
 
 @dataclass(frozen=True)
 class HandHeld:
-    """A camera in a hand moves over a desk and looks at the things on it; it is held still at first.
+    """A hand-held camera that moves over a desk and faces the objects on it; it starts at rest.
 
-    The point looked at, the middle of the things' box at first, wanders over the desk, and the camera about that point.
-    The path is slowed down until neither `speed_m_s` nor `turn_rad_s` is passed; the hand's tremor comes on top.
+    The target, at first the centre of the objects' box, wanders over the desk, and the camera moves about it. The path
+    is slowed down so that it exceeds neither `speed_m_s` nor `turn_rad_s`; tremor is added afterwards.
     """
 
-    nearest_m: Positive = 1.0  #: least distance of the camera from the point that it looks at.
-    farthest_m: Positive = 1.5  #: greatest distance.
-    #: the camera looks down at this angle, on the average, and never along the vertical.
+    nearest_m: Positive = 1.0  #: least distance of the camera from its target.
+    farthest_m: Positive = 1.5  #: largest distance.
+    #: mean elevation of the camera above its target; never vertical.
     elevation_deg: Annotated[float, Range(gt=-80.0, lt=80.0)] = 55.0
-    wander: NotNegative = 0.3  #: greatest shift of the point looked at, as a fraction of the box's size.
-    speed_m_s: Positive = 0.3  #: highest speed.
-    turn_rad_s: Positive = 0.5  #: highest rate of turn.
-    start_s: NotNegative = 1.0  #: the camera reaches its pace after this time.
+    wander: NotNegative = 0.3  #: largest shift of the target, as a fraction of the box's size.
+    speed_m_s: Positive = 0.3  #: maximum speed.
+    turn_rad_s: Positive = 0.5  #: maximum turn rate.
+    start_s: NotNegative = 1.0  #: time until the camera reaches its pace.
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -91,7 +91,7 @@ class HandHeld:
             raise InputError(f"nearest_m = {self.nearest_m} must be less than farthest_m = {self.farthest_m}")
 
     def poses(self, seconds: np.ndarray, size_m: Sequence[float], rng: np.random.Generator) -> np.ndarray:
-        """(T, 7) at times (T,), over a box of a size (x, y, z) with its base on z = 0 and its middle over the origin."""
+        """Poses (T, 7) at times (T,), over a box of size (x, y, z) with its base on z = 0, centred on the origin."""
         turn = np.deg2rad(SWEEP_DEG) * np.array([1.0, RISE])
         reach = 0.5 * (self.farthest_m - self.nearest_m)
         arm = Wave.random(np.array([*(0.5 * self.wander * np.array(size_m)), *turn, reach]), ARM_HZ, rng)
@@ -100,7 +100,7 @@ class HandHeld:
         tremor = Wave.random(np.array([np.deg2rad(TREMOR_DEG)] * 3 + [TREMOR_M] * 3), TREMOR_HZ, rng)
 
         def sweep(time: np.ndarray) -> np.ndarray:
-            """Faster than a hand."""
+            """The path before it is slowed down."""
             wave = arm(time)
             side, rise = wave[:, 3], np.deg2rad(self.elevation_deg) + wave[:, 4]
             away = np.stack([np.sin(side) * np.cos(rise), -np.cos(side) * np.cos(rise), np.sin(rise)], axis=-1)
@@ -108,7 +108,7 @@ class HandHeld:
             target = wave[:, :3] - start
             return SE3.retract(looking(target + distance * away, -away), wrist(time))
 
-        # As slow as it takes that neither limit is passed.
+        # Slowed down to stay within both limits.
         poses, time = sweep(seconds), eased(seconds, self.start_s)
         step = SE3.local(poses[:-1], poses[1:]) / np.diff(seconds)[:, None]
         turn_rad_s, speed_m_s = (float(np.linalg.norm(part, axis=1).max()) for part in (step[:, :3], step[:, 3:]))

@@ -1,8 +1,7 @@
-"""Numba only: casts the ray of every pixel at textured rectangles, tile by tile.
+"""Numba only: casts the rays of all pixels at textured rectangles, tile by tile.
 
-With M = [across, down, corner] of a rectangle in the camera's frame, a ray (u, v, 1) hits it at depth z and at the
-fractions (s, t) of its sides where M (s, t, 1) = z (u, v, 1). So H = M⁻¹ takes the ray to (s, t, 1)/z; its last row gives
-1/z.
+With M = [across, down, corner] of a rectangle in the camera's frame, a ray (u, v, 1) hits it at depth z and fractions
+(s, t) of its sides where M (s, t, 1) = z (u, v, 1). H = M⁻¹ maps the ray to (s, t, 1)/z; its last row gives 1/z.
 """
 
 import math
@@ -10,8 +9,8 @@ import math
 import numpy as np
 from numba import float32, float64, int64, njit, types, uint8, void
 
-TILE = 16  #: Side of a tile, px: its rays and depths stay in the innermost cache.
-#: A footprint longer than this times its width is read as if it were shorter: less blur at grazing angles.
+TILE = 16  #: Side of a tile, px: its rays and depths fit in the L1 cache.
+#: Largest aspect ratio of a texture footprint; longer ones are shortened, for less blur at grazing angles.
 ELONGATED = 2.0
 _MATRIX = types.Array(float64, 2, "C")
 _HYPER = types.Array(float64, 4, "C")
@@ -26,17 +25,17 @@ _GAINS = types.Array(float64, 1, "C")
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _span(a, b, c, tile):
-    """Least and greatest of a u + b v + c over a tile (umin, umax, vmin, vmax)."""
+    """Minimum and maximum of a u + b v + c over a tile (umin, umax, vmin, vmax)."""
     p, q, r, s = a * tile[0], a * tile[1], b * tile[2], b * tile[3]
     return min(p, q) + min(r, s) + c, max(p, q) + max(r, s) + c
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _cover(m, tile):
-    """Greatest 1/z of a rectangle within a tile, 0 if it is not hit there; least 1/z if it fills the tile, else 0.
+    """Maximum 1/z of a rectangle within a tile, 0 without a hit; minimum 1/z if it fills the tile, else 0.
 
-    A ray hits where s, t, w - s and w - t are not negative. All are linear in (u, v), so that their least and greatest
-    values lie at the tile's corners.
+    A ray hits if s, t, w - s and w - t are not negative. All are linear in (u, v), so their extremes are at the tile's
+    corners.
     """
     low, high = _span(m[2, 0], m[2, 1], m[2, 2], tile)
     if high <= 0.0:
@@ -54,7 +53,7 @@ def _cover(m, tile):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _candidates(h, bounds, tile, chosen, nearest):
-    """Rectangles that may be seen in a tile; how many. One behind another that fills the tile is not."""
+    """Fills `chosen` with the rectangles possibly visible in a tile, without occluded ones; returns their number."""
     count, front = 0, 0.0
     u0, u1, v0, v1 = tile[0], tile[1], tile[2], tile[3]
     for r in range(bounds.shape[0]):
@@ -74,9 +73,9 @@ def _candidates(h, bounds, tile, chosen, nearest):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _nearest(h, chosen, count, u, v, n, near, row):
-    """For each of n rays the greatest 1/z of a hit and its rectangle; 0 and -1 where there is none.
+    """For each of n rays the nearest hit's 1/z and rectangle; 0 and -1 without a hit.
 
-    The loop over the rays has no branch and no division, so that it compiles to vector instructions.
+    The loop over the rays has no branch and no division, so it compiles to vector instructions.
     """
     for i in range(n):
         near[i] = 0.0
@@ -96,7 +95,7 @@ def _nearest(h, chosen, count, u, v, n, near, row):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _bilinear(texels, start, height, width, s, t):
-    """A level of a texture at the fractions (s, t); round it lies a border of one texel, equal to its outermost texels."""
+    """Bilinear interpolation in a texture level at fractions (s, t); the level has a border of repeated texels."""
     x, y = s * width + 0.5, t * height + 0.5
     i, j = int(x), int(y)
     a, b = x - i, y - j
@@ -109,7 +108,7 @@ def _bilinear(texels, start, height, width, s, t):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _footprint(h, s, t, w, slope, width, height):
-    """How many texels a pixel covers, along the longer side unless it is very elongated."""
+    """Length in texels of a pixel's footprint, along its longer axis unless it is very elongated."""
     su, sv = (h[0, 0] - s * h[2, 0]) / w * width, (h[0, 1] - s * h[2, 1]) / w * width
     tu, tv = (h[1, 0] - t * h[2, 0]) / w * height, (h[1, 1] - t * h[2, 1]) / w * height
     a, b = su * slope[0] + sv * slope[2], su * slope[1] + sv * slope[3]
@@ -121,9 +120,9 @@ def _footprint(h, s, t, w, slope, width, height):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _detail(footprint, last):
-    """Level of detail: that whose texels are nearest in size to the footprint, and the way to the next as its fraction.
+    """Level of detail for a footprint; the fraction interpolates towards the next level.
 
-    From one level to the next the texels double in size, and the fraction rises evenly with the footprint.
+    Texels double in size from level to level, and the fraction is linear in the footprint.
     """
     k = 0
     while footprint >= 2.0 and k < last:
@@ -134,7 +133,7 @@ def _detail(footprint, last):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _filtered(texels, levels, sheet, s, t, detail):
-    """A texture between two of its levels."""
+    """A texture value, interpolated between two levels."""
     k = int(detail)
     between = detail - k
     fine = _bilinear(texels, levels[sheet, k, 0], levels[sheet, k, 1], levels[sheet, k, 2], s, t)
@@ -147,7 +146,7 @@ def _filtered(texels, levels, sheet, s, t, detail):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rays(uv, slope, y0, x0, shift, u, v):
-    """Rays of a tile's pixels, shifted by a part of a pixel; how many."""
+    """Fills the rays of a tile's pixels with a subpixel shift; returns their number."""
     n, a, b = 0, shift[0], shift[1]
     for y in range(y0, min(y0 + TILE, uv.shape[0])):
         for x in range(x0, min(x0 + TILE, uv.shape[1])):
@@ -164,9 +163,9 @@ def _rays(uv, slope, y0, x0, shift, u, v):
     nogil=True,
 )
 def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, levels, texels, light):
-    """Fills `light` (H, W) with the mean of what a pixel's rays see: one per shift (px), each at its moment's pose.
+    """Fills `light` (H, W) with the mean over a pixel's rays: one per shift (px), each at its moment's pose.
 
-    A ray that leaves the world sees 0. The size of a pixel on a rectangle is worked out once for all its rays.
+    A ray without a hit is 0. The footprint of a pixel on a rectangle is computed once for all its rays.
     """
     side = TILE * TILE
     chosen, row, sized = (np.empty(bounds.shape[1], np.int64), np.empty(side, np.int64), np.empty(side, np.int64))
@@ -203,7 +202,7 @@ def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, le
 
 @njit(void(_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _ROW_IMAGE), cache=True, error_model="numpy", nogil=True)
 def trace(h, bounds, uv, slope, tiles, inverse_depth, rows):
-    """Inverse depth and rectangle (H, W) at the pixels' centres; 0 and -1 where the ray leaves the world."""
+    """Fills inverse depth and rectangle (H, W) at the pixels' centres; 0 and -1 without a hit."""
     side, centre = TILE * TILE, np.zeros(2)
     chosen, row = np.empty(bounds.shape[0], np.int64), np.empty(side, np.int64)
     u, v, near, nearest = np.empty(side), np.empty(side), np.empty(side), np.empty(bounds.shape[0])

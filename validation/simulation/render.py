@@ -1,4 +1,4 @@
-"""Renders pictures of textured rectangles by casting rays: exact geometry, filtered textures."""
+"""Renders textured rectangles by ray casting, with exact geometry and filtered textures."""
 
 import math
 from collections.abc import Sequence
@@ -9,14 +9,14 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides, sides
 
-NEAR_M = 1e-3  #: What is nearer to the camera's plane is not seen.
+NEAR_M = 1e-3  #: Distance of the near plane.
 
 
 class Renderer:
-    """Takes pictures of rectangles with one camera.
+    """Renders images of rectangles for one camera.
 
-    Grey levels are proportional to light. A pixel is the mean of grid² rays on a rotated grid within it; each reads
-    its texture at the level of detail of its fraction of the pixel, between the two nearest levels.
+    Grey levels are linear in light. A pixel is the mean of grid² rays on a rotated grid within it; each samples the
+    texture at the level of detail of its part of the pixel, interpolated between the two nearest levels.
     """
 
     def __init__(self, rectangles: Sequence[Rectangle], camera: Pinhole, grid: int = 2) -> None:
@@ -28,7 +28,7 @@ class Renderer:
         px = np.stack([columns, rows], axis=-1)
         self._uv = camera.unproject(px)
         self._slope = np.ascontiguousarray(camera.unproject_jacobian(px)).reshape(*px.shape[:2], 4)
-        # Least and greatest u and v (J, I, 4) of the pixels in each tile, out to their borders.
+        # Bounds of u and v (J, I, 4) of each tile, including its pixels' full area.
         reach = 0.5 * np.abs(self._slope).reshape(*self._uv.shape[:2], 2, 2).sum(axis=-1)
         around, side = np.concatenate([self._uv - reach, self._uv + reach], axis=-1), raster_kernel.TILE
         tops, lefts = range(0, camera.height, side), range(0, camera.width, side)
@@ -41,17 +41,17 @@ class Renderer:
         self._gain = np.array([r.gain for r in rectangles])
         self._levels, self._texels = _packed(list(sheets.values()))
         across, down, corner = np.moveaxis(self._sides, 1, 0)
-        # (S, 4, 3) in order round each rectangle.
+        # (S, 4, 3) in order around each rectangle.
         self._corners = np.stack([corner, corner + across, corner + across + down, corner + down], axis=1)
 
     def image(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """Grey levels (H, W) float32 of a picture taken at poses (7,), or (K, 7) of a moving camera.
+        """Grey levels (H, W) float32 of an image at a pose (7,), or at poses (K, 7) of a moving camera.
 
-        With K poses that is the mean over them: the rays of a pixel are dealt out, so that K has to be the square of a
-        whole number, at least grid².
+        With K poses it is the mean over them: the rays of a pixel are distributed over the poses, so K must be the square
+        of a whole number, at least grid².
         """
         poses = np.atleast_2d(world_from_camera)
-        # Places in a pixel [px], n² on a rotated grid: i/n² in one direction, n i mod (n² + 1) in the other, around 0.
+        # Subpixel shifts [px], n² on a rotated grid: i/n² in one direction, n i mod (n² + 1) in the other, centred on 0.
         side = max(self._grid, math.isqrt(len(poses)))
         i = np.arange(1, side * side + 1)
         shifts = (np.stack([i, side * i % (side * side + 1)], axis=-1) - 0.5) / (side * side) - 0.5
@@ -74,7 +74,7 @@ class Renderer:
         return light
 
     def depth(self, world_from_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth z (H, W) [m] at the pixels' centres, infinite where there is nothing; rectangles (H, W), then -1."""
+        """Depth z (H, W) [m] and rectangles (H, W) at the pixels' centres; infinite and -1 without a hit."""
         inverse = np.empty(self._uv.shape[:2])
         rows = np.empty(inverse.shape, dtype=np.int64)
         h, bounds = rays_to_sides(self._sides, world_from_camera), self._bounds(world_from_camera)
@@ -83,7 +83,7 @@ class Renderer:
             return 1.0 / inverse, rows
 
     def _bounds(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """(S, 4) least and greatest u and v of rectangles' parts before the camera; empty where there is none."""
+        """Bounds (S, 4) of u and v of the rectangles' parts in front of the camera; empty if there is none."""
         local = SE3.inverse_transform(world_from_camera, self._corners.reshape(-1, 3)).reshape(-1, 4, 3)
         following = np.roll(local, -1, axis=1)
         with np.errstate(all="ignore"):
@@ -98,18 +98,18 @@ class Renderer:
 
 
 def _extent(uv: np.ndarray) -> np.ndarray:
-    """(R, 4) least and greatest of (R, K, 2), NaN left out."""
+    """Bounds (R, 4) of (R, K, 2), ignoring NaN."""
     low = np.where(np.isnan(uv), np.inf, uv).min(axis=1)
     high = np.where(np.isnan(uv), -np.inf, uv).max(axis=1)
     return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=-1)
 
 
 def _packed(textures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Start, height and width (S, L, 3) of every level of each texture, the last one repeated, and all texels end to end.
+    """Start, height and width (S, L, 3) of every level of each texture, the last one repeated, and all texels concatenated.
 
-    A level has the means over 2 × 2 texels of the one before, until a side is one texel; an odd side is resampled to half of
-    it, rounded down, so that all levels cover the same sheet. Each level lies in a border of one texel that repeats the
-    outermost: interpolation needs no case for the edge.
+    A level averages 2 × 2 texels of the one before, until a side is one texel; an odd side is resampled to half of it, rounded
+    down, so that all levels cover the same rectangle. Each level has a border that repeats its outermost texels, so that
+    interpolation needs no special case at the edge.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Simulates a robot among landmarks and writes the log that `rbpf run range-bearing` reads.
+"""Simulates a robot among landmarks and writes a log for `rbpf run range-bearing`.
 
 The folder has the layout of `rbpf.sensors.readers.mrpt`: odometry, observations, sensor and both ground truths.
 """
@@ -19,25 +19,25 @@ from rbpf.sensors.readers.robot_log import UNNAMED
 
 @dataclass(frozen=True)
 class RobotWorld(Ranged):
-    """A robot that drives in a circle (planar) or along a tilted, waving loop (in space) among random landmarks."""
+    """A robot among random landmarks, on a circle (planar) or on a tilted, undulating loop (in space)."""
 
     steps: Annotated[int, Range(ge=2, le=MOST)] = 200  #: number of steps.
     landmarks: Count = 60  #: number of landmarks.
     spatial: bool = False  #: six degrees of freedom instead of three.
     radius_m: Positive = 5.0  #: of the circle.
-    laps: float = 2.0  #: how many times round.
-    extent_m: Positive = 9.0  #: landmarks lie within this of the circle's centre.
+    laps: float = 2.0  #: number of laps.
+    extent_m: Positive = 9.0  #: maximum distance of landmarks from the circle's centre, per axis.
     max_range_m: Positive = 6.0  #: of the sensor.
     half_field_of_view_deg: Angle = 60.0  #: in yaw (and pitch).
-    std_range_m: Positive = 0.02  #: noise of the range.
-    std_angle_deg: Positive = 0.3  #: noise of yaw and pitch.
-    std_translation_m: NotNegative = 0.03  #: noise of the odometry per step and axis.
+    std_range_m: Positive = 0.02  #: standard deviation of the range.
+    std_angle_deg: Positive = 0.3  #: standard deviation of yaw and pitch.
+    std_translation_m: NotNegative = 0.03  #: standard deviation of the odometry per step and axis.
     std_rotation_deg: NotNegative = 0.3  #: likewise.
-    unnamed: bool = False  #: the log does not say which landmark was observed.
+    unnamed: bool = False  #: whether the log leaves out the landmarks' names, for unknown association.
 
 
 def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
-    """Writes a log into a folder, created where it does not exist; files of that name are replaced."""
+    """Writes a log into a folder, which is created if necessary; existing files are replaced."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
     # True poses (T, 7), starting at the origin, and landmarks in a box around the circle's centre: in the plane z = 0
@@ -53,7 +53,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     write_csv(folder / "robot_path_groundtruth.csv", mrpt.PATH, ([t, *row] for t, row in enumerate(table)))
     named = ([i, *place] for i, place in enumerate(points.tolist(), 1))
     write_csv(folder / "landmarks_groundtruth.csv", mrpt.LANDMARKS, named)
-    # Odometry: noise is added to the increment's coordinates, as the log's covariance says.
+    # Odometry: noise is added to the increment's coordinates, in accordance with the log's covariance.
     delta = SE3.between(truth[:-1], truth[1:])
     yaw, pitch, roll = SE3.ypr(delta)
     turn = np.deg2rad(world.std_rotation_deg)
@@ -67,7 +67,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     cov = np.diag(std**2)[np.triu_indices(std.size)].tolist()
     header = mrpt.SPATIAL if world.spatial else mrpt.PLANAR
     write_csv(folder / "odometry.csv", header, ([t, *row, *cov] for t, row in enumerate(noisy.tolist(), 1)))
-    # Range, yaw and pitch of the landmarks that are near enough and in view.
+    # Range, yaw and pitch of the landmarks within range and in view.
     turn = np.deg2rad(world.std_angle_deg)
     std = np.array([world.std_range_m, turn, turn if world.spatial else 0.0])
     view = np.deg2rad(world.half_field_of_view_deg)
@@ -75,7 +75,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     for t, pose in enumerate(truth):
         x, y, h = SE3.inverse_transform(pose, points).T
         z = np.stack([np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1)
-        near = (z[:, 0] <= world.max_range_m) & (z[:, 0] > max(0.2, 4.0 * world.std_range_m))  # else 0 or less is read
+        near = (z[:, 0] <= world.max_range_m) & (z[:, 0] > max(0.2, 4.0 * world.std_range_m))  # else noise may give ≤ 0
         seen = near & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view)
         noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))
         rows.extend(
@@ -92,7 +92,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
 
 
 def simulated_log(world: RobotWorld, seed: int) -> RobotLog:
-    """What `simulate_robot` writes, in memory."""
+    """The log of `simulate_robot`, in memory."""
     with TemporaryDirectory() as folder:
         simulate_robot(world, Path(folder), seed)
         return open_log(folder)

@@ -1,6 +1,6 @@
-"""What a simulated camera takes pictures of: flat textured rectangles in space, and the camera's path.
+"""Scenes for a simulated camera: flat textured rectangles in space, and the camera's path.
 
-A world is anything with `build(rng) -> TexturedScene`. One of our own, a picture on a wall that a camera passes:
+A world is any object with `build(rng) -> TexturedScene`. A custom one, a picture on a wall that a camera passes:
 
     >>> import numpy as np
     >>> from rbpf.lie import SE3
@@ -29,13 +29,13 @@ from rbpf.ranges import NotNegative, check_ranges
 from rbpf.sensors.calibration import Board
 from rbpf.validation.simulation.textures import Paint, chessboard, faded
 
-#: Stamp of the first image: all stamps have as many digits, so that file names sort by time.
+#: Stamp of the first image: all stamps have equally many digits, so that file names sort by time.
 EPOCH_NS = 1_400_000_000_000_000_000
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A flat textured sheet, seen from both sides; seen from the front its texture reads as it is stored.
+    """A flat textured rectangle, visible from both sides; from the front its texture appears as stored.
 
     The centre of texel (row i, column j) of a texture (H, W) lies at corner + (j + ½)/W across + (i + ½)/H down.
 
@@ -47,7 +47,7 @@ class Rectangle:
     #: (3,) from there to the bottom left corner, m; not parallel to `across`, nor need it be perpendicular.
     down: np.ndarray
     texture: np.ndarray  #: (H, W) uint8 grey levels, at least 2 × 2.
-    gain: NotNegative = 1.0  #: brightness of the light on it, a factor on the grey levels.
+    gain: NotNegative = 1.0  #: illumination, a factor on the grey levels.
 
     def __post_init__(self) -> None:
         sides = np.array([self.corner, self.across, self.down], dtype=float)
@@ -66,21 +66,21 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class TexturedScene:
-    """A world with everything random about it drawn."""
+    """A realisation of a world."""
 
     name: str  #: of the world.
-    stamps_ns: np.ndarray  #: (T,) int64 times of the frames, rising.
-    world_from_camera: np.ndarray  #: (T, 7) true poses at these times, the middles of the exposures.
-    rectangles: Sequence[Rectangle]  #: what there is to see.
-    #: chessboards among it, and their poses world_from_board (7,): the first inner corner, x across, y down, z into it.
+    stamps_ns: np.ndarray  #: (T,) int64 times of the frames, ascending.
+    world_from_camera: np.ndarray  #: (T, 7) true poses at these times, the centres of the exposures.
+    rectangles: Sequence[Rectangle]  #: the visible surfaces.
+    #: chessboards and their poses world_from_board (7,): the first inner corner, x across, y down, z into the board.
     boards: Sequence[tuple[Board, np.ndarray]] = ()
 
 
 class ImageWorld(Protocol):
-    """What pictures can be taken of."""
+    """A random world for a simulated camera."""
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
-        """Draws everything random about the world."""
+        """Draws a realisation of the world."""
         ...
 
 
@@ -95,7 +95,7 @@ def sides(rectangles: Sequence[Rectangle]) -> np.ndarray:
 
 
 def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-    """H (R, 3, 3): a ray (u, v, 1) meets a rectangle at (s, t, 1)/z = H (u, v, 1); 0 if the camera is in its plane."""
+    """H (R, 3, 3): a ray (u, v, 1) hits a rectangle at (s, t, 1)/z = H (u, v, 1); 0 if the camera is in its plane."""
     rotation = SE3.matrix(world_from_camera)[:3, :3]
     seen_from = np.zeros((3, 3))
     seen_from[2] = world_from_camera[4:]
@@ -106,9 +106,9 @@ def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarra
 
 
 def cast(rectangles: Sequence[Rectangle], world_from_camera: Array, uv: Array) -> tuple[np.ndarray, np.ndarray]:
-    """What single rays (u, v) (K, 2) meet first: the same as a whole picture's depth, for a few pixels.
+    """First hits of single rays (u, v) (K, 2), as `Renderer.depth` for a few pixels.
 
-    Depth z (K,) in the camera's frame [m], infinite where there is nothing; row (K,) of the rectangle, then -1.
+    Returns depth z (K,) in the camera's frame [m] and row (K,) of the rectangle; infinite and -1 without a hit.
     """
     ray = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
     s, t, w = np.moveaxis(rays_to_sides(sides(rectangles), world_from_camera) @ ray.T, 1, 0)
@@ -121,32 +121,32 @@ def cast(rectangles: Sequence[Rectangle], world_from_camera: Array, uv: Array) -
         return 1.0 / inverse, np.where(inverse > 0.0, row, -1)
 
 
-LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])  #: Direction to the lamp.
-DIRECT = 0.25  #: Fraction of the light that comes from there.
-MOST_TRIES = 1000  #: Places drawn for things that do not touch.
-BOARD_TEXELS = 40  #: Per square of a chessboard; its white margin is one square wide.
+LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])  #: Direction to the light source.
+DIRECT = 0.25  #: Fraction of directional light; the rest is ambient.
+MOST_TRIES = 1000  #: Maximum number of places drawn for objects that do not overlap.
+BOARD_TEXELS = 40  #: Texels per square of a chessboard; its white margin is one square wide.
 
 
 class Furniture:
-    """Collects rectangles, each with a texture of its own: `texel_m` is the side of a texel, `contrast` a factor."""
+    """Collects rectangles, each with its own texture: `texel_m` is the side of a texel, `contrast` a factor."""
 
     def __init__(self, rng: np.random.Generator, texel_m: float, contrast: float) -> None:
         self.rectangles: list[Rectangle] = []
         self._rng, self._texel_m, self._contrast = rng, texel_m, contrast
 
     def sheet(self, corner: np.ndarray, across: np.ndarray, down: np.ndarray, paint: Paint) -> None:
-        """A rectangle in the light."""
+        """Adds an illuminated rectangle."""
         shape = [max(8, round(float(np.linalg.norm(side)) / self._texel_m)) for side in (down, across)]
         texture = faded(paint((shape[0], shape[1]), self._rng), self._contrast)
         self.rectangles.append(Rectangle(corner, across, down, texture, _gain(across, down)))
 
     def flat(self, middle: np.ndarray, yaw: float, size: Sequence[float], paint: Paint) -> None:
-        """A sheet (wide, long) that lies with its middle at (3,)."""
+        """Adds a horizontal sheet (width, length) centred at (3,)."""
         across, up = size[0] * _heading(yaw), size[1] * _heading(yaw + 0.5 * np.pi)
         self.sheet(middle - 0.5 * across + 0.5 * up, across, -up, paint)
 
     def box(self, foot: np.ndarray, yaw: float, size: Sequence[float], top: Paint, side: Paint) -> None:
-        """A box (wide, long, high) that stands with the middle of its foot at (3,)."""
+        """Adds a box (width, length, height) whose base is centred at (3,)."""
         x, y = 0.5 * size[0] * _heading(yaw), 0.5 * size[1] * _heading(yaw + 0.5 * np.pi)
         height = np.array([0.0, 0.0, size[2]])
         ring = [foot + height + corner for corner in (-x - y, x - y, x + y, y - x)]
@@ -155,7 +155,7 @@ class Furniture:
         self.sheet(ring[3], 2.0 * x, -2.0 * y, top)
 
     def shell(self, room: np.ndarray, wall: Paint, floor: Paint, ceiling: Paint) -> None:
-        """Walls, floor and ceiling of a room (2, 3), its least and greatest corner, seen from within."""
+        """Adds walls, floor and ceiling of a room (2, 3), its least and greatest corner, facing inwards."""
         (x0, y0, z0), (x1, y1, z1) = room
         height = np.array([0.0, 0.0, z1 - z0])
         ring = np.array([[x0, y1, z1], [x1, y1, z1], [x1, y0, z1], [x0, y0, z1]])
@@ -165,9 +165,9 @@ class Furniture:
         self.sheet(ring[3], ring[2] - ring[3], ring[0] - ring[3], ceiling)
 
     def hang(self, room: np.ndarray, wall: int, place: Sequence[float], size: Sequence[float], paint: Paint) -> None:
-        """A picture (wide, high) [m] on a wall of a room (2, 3), its least and greatest corner.
+        """Adds a picture (width, height) [m] on a wall of a room (2, 3), its least and greatest corner.
 
-        Walls 0 to 3 are those at the greatest y and x, then at the least y and x; `place` is that of the picture's middle, as
+        Walls 0 to 3 are those at the greatest y and x, then at the least y and x; `place` is the picture's centre, as
         fractions of the wall from the left and from the top.
         """
         (x0, y0, z0), (x1, y1, z1) = room
@@ -178,7 +178,7 @@ class Furniture:
         self.sheet(np.array(corner), size[0] * np.array([*along, 0.0]), np.array([0.0, 0.0, -size[1]]), paint)
 
     def board(self, middle: np.ndarray, squares: tuple[int, int], square_m: float) -> tuple[Board, np.ndarray]:
-        """A chessboard of squares (columns, rows) that lies with its middle at (3,); its x axis is the world's."""
+        """Adds a horizontal chessboard of squares (columns, rows) centred at (3,); its x axis is the world's."""
         across, down = np.diag([squares[0] + 2.0, -squares[1] - 2.0, 0.0])[:2] * square_m
         corner = middle - 0.5 * across - 0.5 * down
         paper = chessboard((squares[1], squares[0]), BOARD_TEXELS, BOARD_TEXELS)
@@ -191,7 +191,7 @@ class Furniture:
 def apart(
     draw: Callable[[], tuple[np.ndarray, float]], count: int, taken: list[tuple[np.ndarray, float]]
 ) -> list[tuple[np.ndarray, float]]:
-    """Places (middle (2,), radius) of up to `count` things that touch neither each other nor what is taken."""
+    """Places (centre (2,), radius) of up to `count` objects that overlap neither each other nor `taken` places."""
     found: list[tuple[np.ndarray, float]] = []
     for _ in range(MOST_TRIES):
         if len(found) == count:
@@ -207,6 +207,6 @@ def _heading(yaw: float) -> np.ndarray:
 
 
 def _gain(across: np.ndarray, down: np.ndarray) -> float:
-    """Light on a sheet that faces the viewer."""
+    """Illumination of a rectangle's front."""
     normal = np.cross(down, across)
     return float(1.0 - DIRECT + DIRECT * normal @ LIGHT / np.linalg.norm(normal))

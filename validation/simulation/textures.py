@@ -1,4 +1,4 @@
-"""Grey textures drawn from a seed, with the statistics of natural images: 1/f clouds, edges, blobs, marks.
+"""Random grey textures with the statistics of natural images: 1/f clouds, edges, blobs, marks.
 
 Every function takes a shape (rows, columns) of texels and a generator, and returns uint8.
 """
@@ -9,13 +9,13 @@ import numpy as np
 from numpy.random import Generator
 
 Shape = tuple[int, int]
-Paint = Callable[[Shape, Generator], np.ndarray]  #: Draws a texture of that shape.
+Paint = Callable[[Shape, Generator], np.ndarray]  #: Draws a texture of a shape.
 GLYPH = 7, 5  #: Cells of a mark, rows and columns.
-FINE = 4  #: Fractional bits of the corners of what is drawn.
+FINE = 4  #: Fractional bits of drawn coordinates.
 
 
 def clouds(shape: Shape, rng: Generator, exponent: float = 1.0) -> np.ndarray:
-    """(H, W) float32 noise of mean 0 and variance 1 whose amplitude falls as f^-exponent (D. Field 1987)."""
+    """Noise (H, W) float32 of mean 0 and variance 1 whose amplitude decreases as f^-exponent (D. Field 1987)."""
     from scipy import fft
 
     radius = np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])).astype(np.float32)
@@ -26,7 +26,7 @@ def clouds(shape: Shape, rng: Generator, exponent: float = 1.0) -> np.ndarray:
 
 
 def faded(texture: np.ndarray, contrast: float) -> np.ndarray:
-    """A texture with less contrast about its mean; 1 leaves it as it is."""
+    """Scales the contrast of a texture about its mean; 1 leaves it unchanged."""
     grey = np.asarray(texture, dtype=np.float32)
     return grey_levels(grey.mean() + contrast * (grey - grey.mean()))
 
@@ -132,7 +132,7 @@ def chessboard(squares: Shape, texels: int, margin: int) -> np.ndarray:
 
 
 def _scatter(image: np.ndarray, rng: Generator, per_texel: float, size: tuple[float, float], contrast: float) -> None:
-    """Draws polygons and discs at random, most of them small, each so much brighter or darker than what it covers."""
+    """Draws random polygons and ellipses, mostly small, brighter or darker than their background by up to `contrast`."""
     for _ in range(rng.poisson(per_texel * image.size)):
         place = rng.uniform(0.0, 1.0, 2) * image.shape[::-1]
         radius = 1.0 / rng.uniform(1.0 / size[1], 1.0 / size[0])
@@ -143,7 +143,7 @@ def _scatter(image: np.ndarray, rng: Generator, per_texel: float, size: tuple[fl
 
 
 def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: Generator) -> None:
-    """Three to six corners about a place (column, row)."""
+    """Draws a polygon of three to six corners around a place (column, row)."""
     import cv2
 
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, rng.integers(3, 7)))
@@ -154,7 +154,7 @@ def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, 
 
 
 def _disc(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: Generator) -> None:
-    """An ellipse about a place (column, row)."""
+    """Draws an ellipse centred at a place (column, row)."""
     import cv2
 
     centre = [round(float(x) * 2**FINE) for x in place]
@@ -164,7 +164,7 @@ def _disc(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng
 
 
 def _write(image: np.ndarray, rng: Generator, top: int, high: int, ink: float) -> None:
-    """A line of words: marks `high` texels high, ragged at the right."""
+    """Draws a line of words: marks `high` texels high, ragged at the right."""
     import cv2
 
     wide = max(2, high * GLYPH[1] // GLYPH[0])

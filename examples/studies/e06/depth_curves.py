@@ -1,4 +1,4 @@
-"""How likely each depth of a landmark is after some observations, on a grid, without any linearisation (figure 2)."""
+"""Likelihood of a landmark's depth after some observations, on a grid, without linearisation (figure 2)."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")
 
 
 class Prediction(NamedTuple):
-    """What each depth of a grid predicts for K later observations.
+    """Predictions of K later observations for each depth of a grid.
 
     Attributes:
-        px: (G, 2K), of the ray through the first pixel.
-        chol: (G, 2K, 2K) of the covariance, with the first observation's own noise.
+        px: (G, 2K), pixels of points on the ray through the first pixel.
+        chol: (G, 2K, 2K) of the covariance, including the first observation's noise.
     """
 
     px: np.ndarray
@@ -30,7 +30,7 @@ class Passing:
     """A camera that passes a point.
 
     Attributes:
-        camera: that sees it.
+        camera: of the observations.
         poses: (K, 7) first_camera_from_camera of the later observations.
         std_px: noise of each observation, per axis.
     """
@@ -53,7 +53,7 @@ class Passing:
         return Prediction(px.reshape(len(rho), -1), np.linalg.cholesky(cov))
 
     def log_likelihoods(self, first_px: np.ndarray, rho: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Of inverse depths (G,) after each of the K observations, (K, R, G), for R repetitions of the pixels (R, 2K).
+        """Log-likelihoods (K, R, G) of inverse depths (G,) after each of K observations, for R repetitions of pixels (R, 2K).
 
         The first rows of a Cholesky factor are the factor of the first rows: one solution serves any number of
         observations.
@@ -65,7 +65,7 @@ class Passing:
 
 
 class Shape(NamedTuple):
-    """Curves (R, G) over a grid, and what tells them from a Gaussian (R,)."""
+    """Curves (R, G) over a grid, and their differences from a Gaussian (R,)."""
 
     density: np.ndarray
     mean: np.ndarray
@@ -75,7 +75,7 @@ class Shape(NamedTuple):
 
 
 def shape_of(grid: np.ndarray, log_density: np.ndarray) -> Shape:
-    """Normalises; moments; Kullback-Leibler divergence from the Gaussian with the same mean and variance, in nats."""
+    """Normalises; computes moments and the Kullback-Leibler divergence from the Gaussian of these moments, in nats."""
     cell = np.gradient(grid)
     density = np.exp(log_density - log_density.max(axis=1, keepdims=True))
     density /= (density @ cell)[:, None]
@@ -88,11 +88,11 @@ def shape_of(grid: np.ndarray, log_density: np.ndarray) -> Shape:
 
 
 def draw_curves(curves: dict[str, tuple[np.ndarray, list[Shape]]], true_depth_m: float) -> Any:
-    """The first repetition's curves, over depth and over inverse depth: grids (G,) and shapes by name of the axis.
+    """Plots the first repetition's curves over depth and inverse depth: grids (G,) and shapes by name of the axis.
 
     Args:
         curves: "depth [m]" and "inverse depth [1/m]", each with a shape for every number of observations.
-        true_depth_m: where the truth is marked.
+        true_depth_m: marked in the plot.
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Figure 2 from images: depth and inverse depth of features that are followed from picture to picture."""
+"""Figure 2 from images: depth and inverse depth of features tracked from image to image."""
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from rbpf.validation.simulation.textured_scene import cast
 NEAREST_M, FARTHEST_M = 0.2, 20.0
 FEATURES = 40
 AROUND_PX = 4.0
-"""A feature is looked for within three times this of where it was last."""
+"""A feature is searched within three times this of its last position."""
 EARLY = 1
-"""Observations after which the paper's estimates of depth are far from Gaussian."""
+"""Number of observations after which the paper's depth estimates are far from Gaussian."""
 
 
 def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[np.ndarray, np.ndarray]:
-    """First places (F, 2) of corners, and where they were found in each later image (F, K, 2); NaN where not."""
+    """First positions (F, 2) of corners, and their tracked positions in later images (F, K, 2); NaN if not found."""
     images = [frame.image for frame in sequence.frames()]
     first = images[0]
     assert first is not None
@@ -45,7 +45,7 @@ def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[n
 
 
 def reproduce(setting: Setting) -> list[Row]:
-    """Follows corners past a desk, and compares how far both likelihoods are from Gaussians."""
+    """Tracks corners past a desk, and compares the differences of both likelihoods from Gaussians."""
     world = SidewaysDesk(texel_m=0.003 if setting.quick else 0.001)
     sequence, _ = setting.sequence("sideways", world)
     config = SearchConfig()

@@ -17,16 +17,16 @@ from rbpf.systems.system import Tracked
 
 FRAME_S = 1.0 / 30.0
 WARM_UP = 5
-"""First frames, which are not counted: kernels are loaded."""
+"""Number of first frames, not counted, in which kernels are loaded."""
 
 LAP = 430
-"""Frames of one round."""
+"""Frames of one lap."""
 
 WIDTH = 320
-"""Of the images: three thousand of them take long to render."""
+"""Width of the images, as three thousand of them take long to render."""
 
 LANDMARKS, LEAST, MOST, PARTICLES = 265, 20, 30, 50
-"""The paper's."""
+"""The paper's value."""
 
 
 def reproduce(setting: Setting) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Figure 5: a loop is closed, and the landmarks of the start are found again."""
+"""Figure 5: loop closure, with re-observation of the first landmarks."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,21 +13,21 @@ from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
 
 START = 15
-"""Landmarks that were started in so many first frames are those of the start."""
+"""Number of first frames whose new landmarks are the landmarks of the start."""
 
 AWAY = 30
-"""Frames without any of them that make an absence."""
+"""Least number of frames without any of them for an absence."""
 
 
 @dataclass(frozen=True)
 class Closure:
-    """How the landmarks of the start were found again.
+    """Re-observation of the landmarks of the start.
 
     Attributes:
         first: number of landmarks of the start.
-        again: how many of them were found after the longest absence.
+        again: number of them found after the longest absence.
         left: last frame in which one was found before it.
-        back: first frame in which one was found after it; −1 where there is none.
+        back: first frame in which one was found after it; −1 for none.
     """
 
     first: int
@@ -37,7 +37,7 @@ class Closure:
 
 
 def find_closure(frames: list[dict[str, np.ndarray]], first: int) -> Closure:
-    """From the observations of a run, frame by frame, for the features with rows below `first`.
+    """Computes the closure from a run's observations, frame by frame, for features with rows below `first`.
 
     The absence is the longest run of frames in which none of them was found.
     """
@@ -58,7 +58,7 @@ def find_closure(frames: list[dict[str, np.ndarray]], first: int) -> Closure:
 
 
 def started_until(frames: list[dict[str, np.ndarray]], until: int) -> int:
-    """Number of features that were started in the first frames, the known points among them."""
+    """Number of features initialised in the first frames, including known points."""
     return sum(frame["started"].size for frame in frames[:until])
 
 

@@ -1,4 +1,4 @@
-"""Figure 3: time per frame against the number of landmarks in the map."""
+"""Figure 3: time per frame by the number of landmarks in the map."""
 
 import time
 from typing import Any
@@ -19,20 +19,20 @@ from rbpf.systems.system import Tracked
 SIZES = 100, 300, 1000, 3000, 10_000
 AWAY_M = 2.0, 20.0
 ASIDE = float(np.cos(np.deg2rad(75.0)))
-"""Added landmarks are at least so far from the optical axis: they do not come into view."""
+"""Least distance of added landmarks from the optical axis, so that they do not come into view."""
 
 WARM_UP, FRAMES, SETTLE = 20, 20, 3
-"""Frames before the first figure is taken, frames with each size, and how many of these are not counted."""
+"""Number of frames before the first measurement, frames per size, and uncounted ones of these."""
 STD_M = 0.01
 FLAT = 1.25
-"""The time is called flat when it grows by no more than a quarter from the smallest map to the largest."""
+"""Largest growth of the time from the smallest to the largest map for which it counts as constant."""
 
 
 class _Watch:
-    """Notes the times of each frame, and fills the map up to the next size every `FRAMES` frames.
+    """Records the times of each frame, and fills the map up to the next size every `FRAMES` frames.
 
-    The whole frame is told in processor time, decoding included: a machine that does something else at the same time
-    does not spoil the comparison of sizes.
+    The whole frame is measured in processor time, including decoding, so that other load on the machine does not affect
+    the comparison of sizes.
     """
 
     def __init__(self, sizes: tuple[int, ...], rng: np.random.Generator) -> None:
@@ -41,7 +41,7 @@ class _Watch:
         self._last = time.process_time()
 
     def __call__(self, run: Run, _: Tracked) -> None:
-        """After a frame."""
+        """Called after a frame."""
         t = len(run.log) - 1
         whole = time.process_time() - self._last
         turn, since = divmod(t - WARM_UP, FRAMES)
@@ -56,7 +56,7 @@ class _Watch:
 
 
 def fill(run: Run, size: int, rng: np.random.Generator) -> None:
-    """Adds points all around but out of view, known alike to all particles, until the map holds `size` landmarks."""
+    """Adds points around but out of view, equal in all particles, until the map has `size` landmarks."""
     belief, table = run.system.filter.belief(), run.system.sensor.table
     count = size - belief.map.ids.size
     if count <= 0:
@@ -77,8 +77,8 @@ def fill(run: Run, size: int, rng: np.random.Generator) -> None:
 def measure_times(setting: Setting, sizes: tuple[int, ...], rounds: int) -> np.ndarray:
     """Median times (S, 4) of a frame by size of the map [s].
 
-    The columns: processor time of the whole frame, decoding included; then by the clock the filter, the search, and the
-    choice of what to look for, which is part of the search.
+    The columns: processor time of the whole frame, including decoding; then wall-clock times of the filter, of the search,
+    and of the selection of features, which is part of the search.
     """
     frames = WARM_UP + FRAMES * len(sizes)
     sequence, known = setting.sequence("times", flat_desk(frames, 0.002))

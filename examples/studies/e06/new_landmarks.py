@@ -19,15 +19,15 @@ from rbpf.systems.system import Tracked
 from rbpf.validation.report.video import draw_search
 
 FIRST = 20
-"""The frame is not looked for before this one: the camera is still at rest."""
+"""First frame to be considered: before, the camera is at rest."""
 
 NEAR_M = 1.5
-"""Rays are drawn to this distance from the middle of the map."""
+"""Distance from the centre of the map up to which rays are drawn."""
 
 
 @dataclass
 class Shown:
-    """The frame in which most landmarks without depth were seen to move: image, observations, map, path so far."""
+    """The frame with most epipolar lines of landmarks without depth: image, observations, map, path so far."""
 
     frame: int
     image: np.ndarray
@@ -38,7 +38,7 @@ class Shown:
 
 
 def found_rays(seen: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(K,) which features that were looked for were found and have no depth yet."""
+    """(K,) which searched features were found and have no depth yet."""
     return np.asarray(np.isfinite(seen["px"]).all(axis=1) & np.isfinite(seen["line"]).all(axis=(1, 2)))
 
 
@@ -53,15 +53,15 @@ def line_distances(observation: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def line_lengths(observation: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Lengths (K,) of the epipolar lines of the found rays, px: a camera at rest sees points."""
+    """Lengths (K,) of the epipolar lines of the found rays, px: points for a camera at rest."""
     rows = found_rays(observation)
     return np.asarray(np.linalg.norm(observation["line"][rows, 1] - observation["line"][rows, 0], axis=1))
 
 
 @cache
 def round_a_desk(setting: Setting) -> tuple[ImageSequence, Run, Shown]:
-    """The sequence of figures 5, 7 and 8, its run, and the frame with most epipolar lines with the map of that moment."""
-    # A part of the loop, at the pace of all of it.
+    """The sequence of figures 5, 7 and 8, its run, and the frame with most epipolar lines with the map at that time."""
+    # A part of the loop, at the whole loop's pace.
     world = LoopOverDesk(frames=50, laps=0.12, texel_m=0.003) if setting.quick else LoopOverDesk()
     sequence, known = setting.sequence("loop", world)
     best: list[Shown] = []

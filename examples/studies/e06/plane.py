@@ -1,4 +1,4 @@
-"""Figure 4: how well the landmarks of a flat desk lie in one plane."""
+"""Figure 4: coplanarity of the landmarks of a flat desk."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,12 +20,12 @@ LEAST = 4
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane through points (K, 3), by least squares.
+    """A least-squares plane through points (K, 3).
 
     Attributes:
         middle: (3,) their mean.
         axes: (3, 3) rows: two directions in the plane and its normal.
-        local: (K, 3) the points in these axes, from the middle.
+        local: (K, 3) the points in these axes, relative to the mean.
         area_m2: of their convex hull in the plane.
     """
 
@@ -41,12 +41,12 @@ class Plane:
 
     @property
     def worst_m(self) -> float:
-        """Greatest distance from it."""
+        """Largest distance from it."""
         return float(np.abs(self.local[:, 2]).max())
 
 
 def fit_plane(points: np.ndarray) -> Plane:
-    """The plane of least squared distances from points (K, 3).
+    """The least-squares plane of points (K, 3).
 
     Raises:
         InputError: there are fewer than four.
@@ -62,7 +62,7 @@ def fit_plane(points: np.ndarray) -> Plane:
 
 
 def unknown_points(run: Run, mapped: MapEstimate) -> np.ndarray:
-    """(M,) which landmarks of a map are full and were not known beforehand."""
+    """(M,) which landmarks of a map are full points and were not known points."""
     known = 0 if run.system.known is None else run.system.known.names.size
     return np.asarray(~mapped.is_ray() & (mapped.ids >= known))
 

@@ -1,4 +1,4 @@
-"""What the figures share: sizes, rendered sequences, and rows of the table."""
+"""Common to the figures: sizes, rendered sequences, and rows of the table."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,20 +14,20 @@ from rbpf.validation.simulation.textured_scene import ImageWorld
 
 QUICK_WIDTH = 320
 FOCAL_WIDTHS = 0.82
-"""Focal length as a fraction of the image's width: 63 degrees are seen."""
+"""Focal length as a fraction of the image's width: the field of view is 63 degrees."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table.
+    """A row of the table.
 
     Attributes:
         figure: of the paper.
-        what: is compared.
-        paper: its figure, in words.
-        ours: likewise.
-        value: ours as a number.
-        met: whether it is as good as asked for; None where nothing is asked.
+        what: the compared quantity.
+        paper: the paper's value, in words.
+        ours: our value, in words.
+        value: our value as a number.
+        met: whether it meets the requirement; None without one.
     """
 
     figure: str
@@ -39,21 +39,21 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """In words."""
+        """Whether the requirement is met, in words."""
         return "" if self.met is None else "yes" if self.met else "FALLS SHORT"
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Where the figures are made, and how large.
+    """Folder and sizes of the figures.
 
     Attributes:
-        out: folder for pictures; rendered sequences lie in its `sequences`.
+        out: folder for plots; rendered sequences are in its `sequences`.
         width: of the images, px.
         particles: of the filter.
         seed: of worlds, noise and filter.
         quick: few small frames, for a test.
-        map: the paper's, or "auto" for the system's default.
+        map: the paper's kind, or "auto" for the system's default.
     """
 
     out: Path
@@ -78,7 +78,7 @@ class Setting:
     def sequence(
         self, name: str, world: ImageWorld, imaging: Imaging | None = None
     ) -> tuple[ImageSequence, KnownPixels | None]:
-        """A world's images and the points that are known of it; rendered unless they have been before."""
+        """A world's images and known points; rendered unless they exist."""
         imaging = imaging or Imaging()
         folder = self.out / "sequences" / f"{name}_{self.camera.width}"
         if not folder.exists():
@@ -88,7 +88,7 @@ class Setting:
 
 
 def true_poses(sequence: ImageSequence) -> np.ndarray:
-    """(T, 7) world_from_camera of a sequence's images, of those whose truth is at the same instants or near."""
+    """(T, 7) true world_from_camera of a sequence's images that have ground truth at or near their times."""
     assert sequence.truth is not None
     after = np.searchsorted(sequence.truth.stamps_ns, sequence.stamps_ns).clip(1, sequence.truth.stamps_ns.size - 1)
     stamps = sequence.truth.stamps_ns

@@ -1,4 +1,4 @@
-"""Figure 9: what landmarks without depth say about a camera at rest that sees four points of a plane."""
+"""Figure 9: information of landmarks without depth about a camera at rest that observes four points of a plane."""
 
 from typing import Any, NamedTuple
 
@@ -17,12 +17,12 @@ from rbpf.validation.simulation.images import Imaging
 
 TREATMENTS = {"off": "four points alone", "epipolar": "epipolar constraint", "marginal": "2-D marginal"}
 NEVER = 1e-6
-"""`ready_ratio` of rays that stay rays: the camera does not move."""
+"""`promote_std_ratio` with which rays are never promoted, as the camera does not move."""
 KNOWN_STD_M = 0.001
 
 
 class Posterior(NamedTuple):
-    """Of the last frame: volumes √|P| of pose and position, NEES of the pose, camera positions (N, 3)."""
+    """Posterior of the last frame: volumes √|P| of pose and position, NEES of the pose, camera positions (N, 3)."""
 
     pose: float
     position: float
@@ -31,7 +31,7 @@ class Posterior(NamedTuple):
 
 
 def camera_cloud(filter_: Filter, rng: np.random.Generator) -> np.ndarray:
-    """Camera positions (N, 3) in the world of the known points, drawn from the posterior."""
+    """Camera positions (N, 3) in the world of the known points, sampled from the posterior."""
     particles, world = filter_.particles, world_of(filter_)
     rows = rng.choice(filter_.n, filter_.n, p=particles.weights)
     poses = particles.state[rows, :7]

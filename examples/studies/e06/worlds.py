@@ -1,4 +1,4 @@
-"""Worlds of the paper's figures, to take pictures of."""
+"""Simulated worlds of the paper's figures."""
 
 from dataclasses import dataclass, replace
 
@@ -15,11 +15,11 @@ from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, 
 RATE_HZ = 30.0
 TREMOR_HZ = 0.5, 2.0
 TREMOR = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
-"""Greatest motion of the hand beside the path, rad and m."""
+"""Largest deviation of the hand from the path, rad and m."""
 
 
 def flat_desk(frames: int, texel_m: float) -> TexturedDesk:
-    """Papers on a table, nothing that stands; so large that nothing else is seen. About 1 m² comes into view."""
+    """A table with papers and no other objects, large enough to fill the view. About 1 m² comes into view."""
     return TexturedDesk(
         frames=frames,
         size_m=(4.0, 4.0),
@@ -32,14 +32,14 @@ def flat_desk(frames: int, texel_m: float) -> TexturedDesk:
 
 @dataclass(frozen=True)
 class LoopOverDesk:
-    """A camera looks down on a desk, and is led round in a circle back to its start and on.
+    """A camera that faces down to a desk and moves in a circle, past its start.
 
     Attributes:
         frames: number of images.
         radius_m: of the circle.
-        away_m: distance of the camera from what it looks at.
-        down_deg: how steeply it looks down.
-        laps: times round.
+        away_m: distance of the camera from its target.
+        down_deg: angle at which it faces down.
+        laps: number of laps.
         texel_m: side of a texel.
     """
 
@@ -69,7 +69,7 @@ class LoopOverDesk:
 
 @dataclass(frozen=True)
 class SidewaysDesk:
-    """A desk that a camera passes in a straight line, to the right and a little forward.
+    """A desk that a camera passes in a straight line, to the right and slightly forwards.
 
     Attributes:
         frames: number of images.
@@ -93,15 +93,15 @@ class SidewaysDesk:
 
 @dataclass(frozen=True)
 class StillTarget:
-    """A camera at rest before a small flat poster, seen from afar, and other sheets nearer and farther (figure 9).
+    """A camera at rest facing a small flat poster at a distance, and other sheets nearer and farther (figure 9).
 
-    The camera is at the origin and looks along x.
+    The camera is at the origin and faces along x.
 
     Attributes:
         frames: number of images.
-        distance_m: of the poster's middle.
+        distance_m: of the poster's centre.
         side_m: of the poster.
-        tilt_deg: by which it is turned about the vertical.
+        tilt_deg: rotation of the poster about the vertical.
         sheets: number of others.
         texel_m: side of a texel on the poster.
     """
@@ -127,7 +127,7 @@ class StillTarget:
         return TexturedScene("target", stamps_ns(self.frames, RATE_HZ), path, [wall, *sheets, poster])
 
     def known(self, camera: Pinhole, std_m: float, noise_px: float, rng: np.random.Generator) -> KnownPixels:
-        """The corners of the poster's print, where the camera sees them, both with their errors."""
+        """The corners of the poster's print and their pixels, both with errors."""
         across, down = self._sides()
         signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         positions = np.array([self.distance_m, 0.0, 0.0]) + 0.5 * signs @ np.array([across, down])
@@ -138,7 +138,7 @@ class StillTarget:
         return KnownPixels(np.arange(1, 5), px, positions, np.full(4, std_m))
 
     def _poster(self, rng: np.random.Generator) -> Rectangle:
-        """A dark square with a grey, mottled margin: its corners are the known points."""
+        """A dark square, whose corners are the known points, with a grey, mottled margin."""
         texels = 6 * max(2, round(0.25 * self.side_m / self.texel_m))
         paper = textures.grey_levels(200.0 + 6.0 * textures.clouds((texels, texels), rng))
         edge = texels // 6

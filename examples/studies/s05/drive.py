@@ -1,4 +1,4 @@
-"""The robot's drive: rendered once, its features measured once, filtered as often as it takes."""
+"""The robot's drive: rendered once, its features measured once, and filtered repeatedly."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,22 +17,22 @@ FOCAL, BASELINE_M = 0.78125, 0.12
 """Focal length as a fraction of the image's width: that of `examples/studies/lab.py`."""
 
 NOISE_STD = 5.0
-"""Grey levels. With the other defaults of the simulator as many features agree from pair to pair as in a real room."""
+"""Sensor noise, grey levels. With the simulator's other defaults the inliers between pairs are as many as in a real room."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is rendered, and how it is filtered.
+    """Settings of rendering and filtering.
 
     Attributes:
-        out: folder for images, features, table and pictures.
-        frames: pairs, the first of the tour.
-        every: only each so many-th frame is a pair.
+        out: folder for images, features, table and plots.
+        frames: number of pairs, from the start of the tour.
+        every: every n-th frame is a pair.
         width: of the images, px.
         texel_m: side of a texel of the walls.
         particles: number of particles.
         dof: degrees of freedom; the paper's are 3.
-        trigger_m: way between updates.
+        trigger_m: distance between updates.
         seed: of the images and of the filter.
     """
 
@@ -64,14 +64,14 @@ class Setting:
 def measured_drive(
     setting: Setting, told: Callable[[str, int, int], None] = lambda what, done, total: None
 ) -> CachedSequence:
-    """The features of the drive; images and features that are there already are taken as they are.
+    """The features of the drive; existing images and features are reused.
 
     Args:
         setting: what is rendered.
-        told: called with what is being done, how many pairs are done, and their number.
+        told: called with a description, the number of pairs done, and the total.
 
     Raises:
-        InputError: what is there is of another drive, or shorter.
+        InputError: existing files are of another drive, or shorter.
     """
     if not setting.images.exists():
         width = setting.width

@@ -11,13 +11,13 @@ from rbpf.lie import SE3
 from rbpf.runs.run import Run
 
 MIDDLE = 0.98
-"""Share of the landmarks that the pictures hold along each axis."""
+"""Fraction of the landmarks within the plots, along each axis."""
 
 STAGES = "features", "odometry", "matching", "filter"
 
 
 def draw_maps(record: Record, paths: Paths, best: Best, file: Path) -> None:
-    """Beside one another: the best particle, the odometry alone, the wheels alone, each with the map that it builds."""
+    """Plots side by side: the best particle, visual odometry, and wheel odometry, each with its map."""
     figure = Figure(figsize=(18.0, 7.0), layout="constrained")
     shown = {
         "Fig. 4: best particle": (best.places, best.path),
@@ -41,7 +41,7 @@ def draw_maps(record: Record, paths: Paths, best: Best, file: Path) -> None:
 
 
 def draw_errors(paths: Paths, stamps_ns: np.ndarray, file: Path) -> None:
-    """Distance from the truth over the drive."""
+    """Plots the distance from the truth over the drive."""
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     axes = figure.subplots()
     true = SE3.translation(paths.truth)
@@ -54,7 +54,7 @@ def draw_errors(paths: Paths, stamps_ns: np.ndarray, file: Path) -> None:
 
 
 def draw_time(run: Run, seconds_features: np.ndarray, file: Path) -> None:
-    """Fig. 7: milliseconds of each pair, by stage."""
+    """Plots Fig. 7: milliseconds of each pair, by stage."""
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     axes: Any = figure.subplots()
     stages = {name: 1e3 * run.log[f"seconds_{name}"] for name in STAGES}

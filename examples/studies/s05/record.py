@@ -1,4 +1,4 @@
-"""What a run over the drive leaves: rows of Table I, observations, and the paths and maps that follow from them."""
+"""Record of a run over the drive: rows of Table I, observations, and the resulting paths and maps."""
 
 import time
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ KINDS = "filter", "odometry", "wheels"
 
 
 class Row(NamedTuple):
-    """A line of Table I after so many pairs: landmarks per particle, and candidates ever started."""
+    """A row of Table I after a number of pairs: landmarks per particle, and candidates ever initialised."""
 
     pairs: int
     landmarks: int
@@ -29,13 +29,13 @@ class Row(NamedTuple):
 
 @dataclass
 class Record:
-    """What happened pair by pair.
+    """Recorded data, pair by pair.
 
     Attributes:
         due: pairs after which a row of the table is due.
         rows: of the table.
-        observations: name (k,), pair, points (k, 3) in the camera.
-        cpu: (T,) processor time of each pair, its features not included.
+        observations: names (k,), pair, points (k, 3) in the camera's frame.
+        cpu: (T,) processor time of each pair, without its features.
     """
 
     due: tuple[int, ...]
@@ -45,7 +45,7 @@ class Record:
     _clock: float = field(default_factory=time.process_time)
 
     def __call__(self, run: Run, tracked: Tracked) -> None:
-        """After each pair."""
+        """Called after each pair."""
         now = time.process_time()
         self.cpu.append(now - self._clock)
         done, shown, manager = len(run.log), tracked.observed, landmarks_of(run).manager
@@ -58,7 +58,7 @@ class Record:
         self._clock = time.process_time()
 
     def places(self, path: np.ndarray, names: np.ndarray) -> np.ndarray:
-        """Mean places (M, 3) of landmarks (M,), ascending, along a path (T, 7)."""
+        """Mean positions (M, 3) of landmarks (M,), ascending, along a path (T, 7)."""
         total, count = np.zeros((names.size, 3)), np.zeros(names.size)
         for seen, t, points in self.observations:
             row = np.minimum(np.searchsorted(names, seen), names.size - 1)
@@ -79,13 +79,13 @@ class Paths(NamedTuple):
 
 @dataclass(frozen=True)
 class Best:
-    """The particle of highest weight at the end.
+    """The particle with the highest weight at the end.
 
     Attributes:
         names: (M,) of its landmarks.
-        places: (M, 3) of them in its world.
-        path: (U, 7) along its ancestors, at the updates.
-        cloud: (N, 3) where all particles are.
+        places: (M, 3) their positions in its world.
+        path: (U, 7) of its ancestors, at the updates.
+        cloud: (N, 3) positions of all particles.
     """
 
     names: np.ndarray
@@ -101,7 +101,7 @@ def slam_of(run: Run) -> StereoSlam:
 
 
 def landmarks_of(run: Run) -> DescriptorLandmarks:
-    """What is known of the landmarks of a run over images besides where they are."""
+    """Descriptors and other data of a run's landmarks besides their estimates."""
     landmarks = slam_of(run).front_end.landmarks
     assert isinstance(landmarks, DescriptorLandmarks)
     return landmarks
@@ -127,7 +127,7 @@ def best_particle(run: Run) -> Best:
 
 
 def errors(record: Record, paths: Paths, best: Best, updated: np.ndarray) -> dict[str, float]:
-    """Root mean square errors of paths and maps in metres: in the world of the first camera, then after alignment."""
+    """Root mean square errors of paths and maps in metres: in the first camera's world, then after rigid alignment."""
     pairs = {"path, best particle": (SE3.translation(best.path), SE3.translation(paths.truth[updated]))}
     true_places = record.places(paths.truth, best.names)
     pairs["map, best particle"] = best.places, true_places
@@ -146,5 +146,5 @@ def errors(record: Record, paths: Paths, best: Best, updated: np.ndarray) -> dic
 
 
 def rms(off: np.ndarray) -> float:
-    """Of lengths (K,)."""
+    """Root mean square length of vectors (K, D)."""
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))

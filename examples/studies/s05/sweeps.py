@@ -1,4 +1,4 @@
-"""What S05 left open: the number of particles, and the noise that is injected; beside them the likelihood."""
+"""Parameters left open by S05: the number of particles and the injected noise; and the likelihood."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -18,11 +18,11 @@ HEADER = ("setting", *ERROR, "at the end m", *NEES, "right", "s per pair")
 
 PARTICLES = 100, 1600
 NOISE = (1e-3, 5e-4), (5e-3, 2e-3)
-"""Injected per update: m, rad."""
+"""Noise injected per update: m, rad."""
 
 
 def settings(base: StereoConfig) -> dict[str, StereoConfig]:
-    """One thing changed at a time."""
+    """Settings with one change each."""
     outliers = replace(base.likelihood, kind="outliers")
     refined = ProposalConfig("ekf", iterations=1)
     clipped = LikelihoodConfig("truncated", update_limit=base.likelihood.truncation)
@@ -39,7 +39,7 @@ def settings(base: StereoConfig) -> dict[str, StereoConfig]:
 
 
 def sweep(drive: CachedSequence, base: StereoConfig, seeds: Sequence[int] = (0,)) -> Iterator[list[str | float]]:
-    """A row for each setting, and one for the odometry alone: medians over the seeds of the filter, least and most."""
+    """A row per setting, and one for odometry alone: median, minimum and maximum over the filter's seeds."""
     for name, config in settings(base).items():
         runs = [filter_cached(drive, replace(config, seed=seed)) for seed in seeds]
         off, end, nees, right, seconds = np.array([figures_of(run) for run in runs]).T
@@ -51,7 +51,7 @@ def sweep(drive: CachedSequence, base: StereoConfig, seeds: Sequence[int] = (0,)
 
 
 def figures_of(run: Run) -> Sequence[float]:
-    """Error of the path and of its end, median NEES of the pose, what is right, seconds by the clock."""
+    """Error of the path and of its end, median NEES of the pose, its expected value, wall-clock seconds."""
     log, truth = run.log, run.truth
     assert truth is not None
     rows = truth.rows[1:]

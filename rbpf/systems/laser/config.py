@@ -41,11 +41,11 @@ class LaserConfig(RunConfig):
     """A run of grid SLAM with a laser scanner."""
 
     particles: Count = 30  #: number of particles.
-    #: a scan is matched and inserted once the robot has moved this far since the last one (0: every scan); in between the
+    #: a scan is matched and inserted once the robot has moved this far since the last one (0: every scan); in between, the
     #: pose follows the odometry.
     distance_m: NotNegative = 0.5
-    angle_rad: NotNegative = 0.25  #: or has turned by this.
-    seconds: Positive = 10.0  #: or after this time.
+    angle_rad: NotNegative = 0.25  #: likewise once it has turned by this.
+    seconds: Positive = 10.0  #: likewise after this time.
     #: length of wall that counts as one measurement, see `rbpf.sensors.laser.Scanner.beams`.
     correlation_m: Positive = 0.25
     least_beams: Count = 10  #: a scan with fewer returns is not used.

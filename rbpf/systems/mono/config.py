@@ -34,41 +34,41 @@ class VelocityConfig(Ranged):
 class InverseDepthConfig(Ranged):
     """Features of unknown depth: rays with an inverse depth, E06 §5."""
 
-    #: how they constrain the pose: by their epipolar line (the paper's); by the 2-D marginal with finite depth variance once
-    #: depth is measured, and by the line before, if points that fix the scale are observed; or not at all.
+    #: how they constrain the pose. epipolar: by their epipolar line, as in the paper. marginal: by the 2-D marginal with its
+    #: depth variance; but by the line until depth is measured, if points that fix the scale are observed. off: not at all.
     pose_update: Annotated[Literal["epipolar", "marginal", "off"], Formerly("constrain")] = "marginal"
     #: mean inverse depth of a new feature, 1/m; without known points it sets the scale.
     mean_per_m: Annotated[Positive, Formerly("rho_per_m")] = 0.8
     std_per_m: Annotated[Positive, Formerly("std_rho_per_m")] = 0.6  #: its standard deviation.
-    #: a new feature starts at the median inverse depth of the points just observed, with the same relative deviation at
-    #: least, if there are four or more.
+    #: if at least four points are observed, a new feature starts at their median inverse depth, with at least the same
+    #: relative standard deviation.
     from_scene_depth: Annotated[bool, Formerly("adapt")] = True
     #: a ray is promoted to a point once the standard deviation of its inverse depth is below this fraction of it.
     promote_std_ratio: Annotated[Positive, Formerly("ready_ratio")] = 0.1
     #: fraction of the particles' weight in which this must hold.
     promote_weight: Annotated[Fraction, Formerly("ready_weight")] = 0.95
-    #: depth counts as measured once a change of ρ by its first standard deviation moves the image by this. Before, the
-    #: parallax depends more on the error of the sampled pose than on depth, and the prior of ρ, unchanged as long as depth is
-    #: not measured, would be counted again in every frame.
+    #: depth counts as measured once a change of ρ by its initial standard deviation moves the image by this. Before, the
+    #: parallax depends more on the error of the sampled pose than on depth. The prior of ρ, unchanged until depth is measured,
+    #: would be counted again in every frame.
     depth_parallax_px: Annotated[Positive, Formerly("least_px")] = 10.0
-    #: likewise, from where on a feature that moves in the image has an epipolar line. Before, the 2-D marginal is used, with
-    #: such a wide prior of ρ that it hardly matters; with the original prior for features that have not moved, if known
-    #: points are observed.
+    #: the same threshold from which a feature that moves in the image has an epipolar line. Before, the 2-D marginal is used,
+    #: with a prior of ρ wide enough to hardly matter; or with the original prior, if known points are observed and the
+    #: feature has not moved.
     epipolar_parallax_px: Annotated[Positive, Formerly("line_px")] = 0.3
 
 
 @dataclass(frozen=True)
 class StartConfig(Ranged):
-    """Batch adjustment of the first frames; without known points it resamples the particles, or starts the joint map."""
+    """Batch adjustment of the first frames: without known points it resamples particles or initialises the joint map."""
 
-    #: whether it is done without known points; else the particles continue with depths from their prior.
+    #: whether it is done without known points; if not, the particles continue with the depth prior.
     batch_adjust: Annotated[bool, Formerly("redraw")] = True
     first_adjustment: Annotated[int, Range(ge=3), Formerly("first")] = 6  #: frames before the first adjustment …
-    growth: Annotated[float, Range(gt=1.0, le=100.0)] = 1.25  #: … and factor from each adjustment to the next.
+    growth: Annotated[float, Range(gt=1.0, le=100.0)] = 1.25  #: … and their factor from each adjustment to the next.
     #: maximum number of frames in an adjustment, evenly chosen.
     max_frames: Annotated[int, Range(ge=3), Formerly("frames")] = 60
-    #: the start ends once half of the depths in view have a standard deviation below this fraction of them; or below three
-    #: times that, if there are more frames than are adjusted, and depths are no better than in the adjustment before.
+    #: initialisation ends once half of the depths in view have a relative standard deviation below this; or below three times
+    #: this, if there are more frames than `max_frames`, and depths are no better than in the previous adjustment.
     depth_std_ratio: Annotated[Positive, Formerly("depth_share")] = 0.01
 
     def is_due(self, count: int) -> bool:
@@ -87,7 +87,7 @@ class StartConfig(Ranged):
 class SearchConfig(Ranged):
     """Active search in images, E06 §4.1."""
 
-    measurements: Count = 25  #: maximum features searched in a frame.
+    measurements: Count = 25  #: maximum number of features searched in a frame.
     noise_px: Positive = 1.0  #: standard deviation of a match, per axis.
     template_px: Annotated[int, Range(ge=3, le=21, odd=True)] = 11  #: side of the compared patch, odd.
     #: orientation of a patch in space: facing the first camera, or learnt from later views (learnt).
@@ -96,67 +96,67 @@ class SearchConfig(Ranged):
     min_correlation: Annotated[float, Range(ge=-1.0, le=1.0), Formerly("accept")] = 0.8
     #: size of the searched ellipse, in standard deviations.
     ellipse_sigmas: Annotated[Positive, Formerly("sigmas")] = 3.0
-    #: maximum distance from the centre at which an ellipse is searched.
+    #: maximum search radius in an ellipse.
     max_radius_px: Annotated[float, Range(gt=0.0, le=10000.0), Formerly("largest_px")] = 40.0
     #: features are initialised while fewer than this are in view.
     min_in_view: Annotated[CountOrNone, Formerly("in_view")] = 35
     new_per_frame: CountOrNone = 3  #: maximum features initialised in a frame; in the first one `measurements`.
-    #: squared Mahalanobis distance from the consensus motion beyond which a match is dropped.
+    #: gate: squared Mahalanobis distance from the consensus motion beyond which a match is an outlier.
     gate_chi2: Annotated[Positive, Formerly("gate")] = 9.2
-    spacing_px: NotNegative = 20.0  #: new features keep this distance from others.
+    spacing_px: NotNegative = 20.0  #: least distance of new features from others.
     border_px: Annotated[NotNegative, Formerly("margin_px")] = 8.0  #: features this close to the border are not used.
     #: a feature is not searched once its viewing direction has changed by this.
     max_turn_deg: Annotated[Angle, Formerly("turn_deg")] = 50.0
-    #: nor once its distance has changed by this factor.
+    #: a feature is not searched once its distance has changed by this factor.
     max_scale_change: Annotated[Ratio, Formerly("scale")] = 2.0
-    #: a feature's last appearance is renewed once its viewing direction has changed by this …
+    #: a feature's patch is renewed once its viewing direction has changed by this …
     appearance_turn_deg: Annotated[Angle, Formerly("look_deg")] = 10.0
     #: … or its distance by this factor.
     appearance_scale_change: Annotated[Ratio, Formerly("look_scale")] = 1.15
-    #: searches before a feature may be dropped.
+    #: least number of searches before a feature may be dropped.
     min_attempts: Annotated[Count, Formerly("trial")] = 10
-    #: it is dropped from all particles once it was missed in more than this fraction.
+    #: a feature is dropped from all particles once more than this fraction of its searches failed.
     max_failure_ratio: Annotated[Fraction, Formerly("failure_ratio")] = 0.5
-    #: a feature is used to localise the camera only while its success rate, (1 + found) / (2 + attempts), is at least this:
-    #: moving objects soon fall below it. A feature that has not been searched before is used, but not for testing other
+    #: a feature localises the camera only while its success rate, (1 + found) / (2 + attempts), is at least this: features
+    #: on moving objects soon fall below it. A feature that has not been searched before is used, but not to test other
     #: matches.
     trusted_fraction: Annotated[Fraction, Formerly("trusted_share")] = 0.6
     #: the camera is lost if fewer than this fraction of the searched features is matched …
     lost_fraction: Annotated[Fraction, Formerly("lost_share")] = 0.25
-    lost_frames: Count = 3  #: … in this many frames in a row.
-    #: it has recovered once at least this fraction is matched …
+    lost_frames: Count = 3  #: … in this many consecutive frames.
+    #: tracking has recovered once at least this fraction is matched …
     recovered_fraction: Annotated[Fraction, Formerly("regained_share")] = 0.5
-    recovered_features: Annotated[CountOrNone, Formerly("regained")] = 6  #: … and so many features.
+    recovered_features: Annotated[CountOrNone, Formerly("regained")] = 6  #: … and at least this many features.
 
 
 @dataclass(frozen=True)
 class RelocalisationConfig(Ranged):
     """Tracking loss: the pose prior while the camera is lost, and relocalisation in the map."""
 
-    #: while lost it stays at its last trusted pose, with a rotational standard deviation that grows by this.
+    #: pose prior while lost: the last trusted pose, with a standard deviation of the rotation that grows by this.
     drift_rad_s: NotNegative = 0.25
-    drift_m_s: NotNegative = 0.25  #: likewise of its position.
-    #: around the trusted pose features are searched with this standard deviation; farther away the camera is relocalised by
-    #: matching descriptors.
+    drift_m_s: NotNegative = 0.25  #: likewise of the position.
+    #: standard deviation of the rotation for active search around the trusted pose; farther away the camera is relocalised
+    #: by matching descriptors.
     search_std_rad: Annotated[NotNegative, Formerly("reach_rad")] = 0.05
-    search_std_m: Annotated[NotNegative, Formerly("reach_m")] = 0.05  #: likewise of its position.
-    #: maximum corners of a lost image that are compared with the map's features.
+    search_std_m: Annotated[NotNegative, Formerly("reach_m")] = 0.05  #: likewise of the position.
+    #: maximum number of corners matched with the map's features, in an image without tracking.
     max_corners: Annotated[Count, Formerly("corners")] = 500
     spacing_px: NotNegative = 6.0  #: their least distance.
-    #: largest ratio of a feature's descriptor distances to its best and its second match (D. Lowe).
+    #: ratio test: largest ratio of descriptor distances of the best and the second match (D. Lowe).
     descriptor_ratio: Annotated[Fraction, Formerly("ratio")] = 0.9
-    #: features are used if the standard deviation of their depth is below this fraction of it.
+    #: largest relative standard deviation of depth of the features used.
     depth_std_ratio: Annotated[Positive, Formerly("depth_share")] = 0.3
     #: radius around projections within which features are matched, given a candidate pose.
     match_radius_px: Annotated[Positive, Formerly("around_px")] = 15.0
     #: inlier radius around a projection.
     inlier_px: Annotated[Positive, Formerly("within_px")] = 4.0
-    #: number of triples of matches from which poses are computed (RANSAC).
+    #: number of RANSAC samples: triples of matches from which poses are computed.
     p3p_samples: Annotated[int, Range(ge=1, le=100000), Formerly("triples")] = 300
-    min_inliers: Annotated[int, Range(ge=4), Formerly("inliers")] = 8  #: least inliers of a pose.
-    #: least inliers if the last image before the loss confirms the motion.
+    min_inliers: Annotated[int, Range(ge=4), Formerly("inliers")] = 8  #: least number of inliers of a pose.
+    #: least number of inliers if the last image before the loss confirms the motion.
     min_inliers_with_last_view: Annotated[int, Range(ge=4), Formerly("few")] = 5
-    #: inliers with which fewer of the features then in view have to be matched.
+    #: number of inliers from which on fewer features in view need to be matched afterwards.
     certain_inliers: Annotated[int, Range(ge=4), Formerly("sure")] = 12
     #: least inlier fraction of the matches.
     min_inlier_fraction: Annotated[Fraction, Formerly("inlier_share")] = 0.25
@@ -164,7 +164,7 @@ class RelocalisationConfig(Ranged):
     min_spread: Annotated[NotNegative, Formerly("spread")] = 0.03
     #: inflation of the pose's standard deviations, as errors of neighbouring landmarks are correlated.
     std_inflation: Annotated[Positive, Formerly("inflation")] = 3.0
-    #: of a joint map: frames between attempts at place recognition for a tracked camera of uncertain pose.
+    #: for a joint map: frames between attempts at place recognition while the camera is tracked with an uncertain pose.
     ask_every: Count = 10
 
 
@@ -172,9 +172,9 @@ class RelocalisationConfig(Ranged):
 class CalibrationConfig(Ranged):
     """Priors of a camera's self-calibration, as standard deviations from the given calibration."""
 
-    focal: Positive = 0.1  #: of both focal lengths together, as a fraction.
-    aspect: Positive = 0.01  #: of their ratio, as a fraction.
-    distortion: Positive = 0.1  #: of k1 and of k2.
+    focal: Positive = 0.1  #: relative error of both focal lengths together.
+    aspect: Positive = 0.01  #: relative error of each focal length on its own.
+    distortion: Positive = 0.1  #: error of k1 and of k2.
 
     def cov(self) -> np.ndarray:
         """Covariance (4, 4) of log fx, log fy, k1 and k2."""
@@ -189,42 +189,42 @@ class MonoConfig(RunConfig):
 
     particles: Count = 50  #: number of particles.
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
-    #: prior standard deviation of the start position around the resected one, before the known points are used.
+    #: prior standard deviation of the start position around the one from resection, before the update by the known points.
     start_std_m: NotNegative = 1.0
-    start_std_rad: NotNegative = 0.5  #: likewise its rotation.
-    #: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world whose pose each
-    #: particle samples in the first frame (E06).
+    start_std_rad: NotNegative = 0.5  #: likewise of the rotation.
+    #: frame: the known points are one rigid group whose frame is marginalised. points: they are separate landmarks, and each
+    #: particle samples its pose among them in the first frame (E06).
     known: Literal["frame", "points"] = "frame"
-    #: once depths are known, one Gaussian of all landmarks, velocity and frame, given the last few frames (joint), which
-    #: stays consistent; or per-particle landmarks, Gaussians given the whole sampled path (particles, E06). By default (auto)
-    #: joint, but particles if a lag is set, the velocity is sampled, or a user-defined `UnknownDepth` is given. A run
-    #: localised in a known map is never joint.
+    #: joint: once depths are known, one Gaussian of all landmarks, velocity and frame, given the last few frames, which stays
+    #: consistent. particles: per-particle landmarks, Gaussians given the whole sampled path (E06). auto: joint, but particles
+    #: if a lag is set, the velocity is sampled, or a user-defined `UnknownDepth` is given. A run localised in a known map is
+    #: never joint.
     map: Literal["auto", "joint", "particles"] = "auto"
-    #: of a joint map: maximum frames sampled before they are merged into it; fewer if the effective sample size falls below
-    #: the threshold of resampling, which does not take place.
+    #: for a joint map: number of frames sampled before they are merged into it. Below the effective sample size of the
+    #: resampling threshold they are merged earlier, instead of resampling.
     window: Count = 2
-    #: of a joint map: it starts once an adjustment of the first frames determines depths, and restarts once half of those in
-    #: view were known in this many consecutive frames; until then particles have their own maps.
+    #: for a joint map: it starts once an adjustment of the first frames determines depths, and restarts once half of those
+    #: in view were known in this many consecutive frames; until then particles have their own maps.
     settled_frames: Count = 30
-    #: of a joint map: landmarks beyond which a sub-map ends; those in view, and others up to half of these, are passed on to
-    #: the next one; old ones return when they are in view. No point is dropped; rays left behind are.
+    #: for a joint map: maximum number of landmarks of a sub-map. Those in view, and others up to half of this number, are
+    #: passed on to the next sub-map; old ones return when they are in view. Points are never dropped; rays left behind are.
     submap: Annotated[Count, Formerly("active")] = 300
-    #: of a joint map: the measurement noise is the stated one, or a larger one if the residuals show that it is larger by a
-    #: tenth or more (at_least); or always that of the residuals (learnt); in both, features worse than most have more. Or as
-    #: stated (stated). With self-calibration, learnt is at_least, and for features worse than most alone.
+    #: for a joint map: the measurement noise. stated: as stated. learnt: as the residuals show. at_least: as stated, or larger
+    #: if the residuals show that it is larger by a tenth or more. With learnt and at_least, features worse than most have more
+    #: noise. With self-calibration, learnt is at_least, and only for features worse than most.
     noise: Literal["at_least", "learnt", "stated"] = "at_least"
-    #: of a joint map: self-calibration, estimating focal lengths, k1 and k2 with everything else.
+    #: for a joint map: self-calibration, which estimates focal lengths, k1 and k2 together with the map.
     calibrate: Literal["off", "online"] = "off"
-    #: maximum landmarks initialised in one frame.
+    #: maximum number of landmarks initialised in one frame.
     max_new_per_frame: Annotated[CountOrNone, Formerly("births_per_frame")] = 1000
     velocity: VelocityConfig = field(default_factory=VelocityConfig)  #: motion model.
-    #: features whose depth is not known yet.
+    #: features of unknown depth.
     inverse_depth: Annotated[InverseDepthConfig, Formerly("ray")] = field(default_factory=InverseDepthConfig)
-    start: StartConfig = field(default_factory=StartConfig)  #: without known points.
-    search: SearchConfig = field(default_factory=SearchConfig)  #: of features in images.
+    start: StartConfig = field(default_factory=StartConfig)  #: initialisation without known points.
+    search: SearchConfig = field(default_factory=SearchConfig)  #: active search of features in images.
     #: priors of the self-calibration.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    #: when the camera is lost.
+    #: tracking loss and relocalisation.
     relocalisation: Annotated[RelocalisationConfig, Formerly("recovery")] = field(default_factory=RelocalisationConfig)
     #: the proposal distribution.
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))

@@ -17,10 +17,11 @@ from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, RunConfig
 
 @dataclass(frozen=True)
 class AssociationConfig(Ranged):
-    """Unknown association."""
+    """Unknown data association."""
 
-    accept_probability: Probability = 0.999  #: of the χ² gate within which a landmark may explain an observation.
-    #: of the χ² gate beyond which an observation may start a landmark; with a joint map under its noise alone.
+    accept_probability: Probability = 0.999  #: probability of the χ² gate for a landmark's observations.
+    #: probability of the χ² gate beyond which, for all landmarks, an observation may be of a new one; with a joint map the
+    #: gate is of the noise alone.
     isolate_probability: Probability = 0.999999
     #: density of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
     new_density: Positive = 1e-3
@@ -28,9 +29,9 @@ class AssociationConfig(Ranged):
     max_range_m: Positive | None = None  #: beyond it a landmark is not expected to be observed; None is unlimited.
     half_field_of_view_deg: Annotated[float, Range(gt=0.0, le=180.0)] = 180.0  #: likewise in yaw.
     hit: NotNegative = 1.0  #: added to a landmark's log-odds by an observation.
-    miss: NotNegative = 0.0  #: subtracted if it was expected and not observed.
+    miss: NotNegative = 0.0  #: subtracted if the landmark was expected and not observed.
     drop: float = -2.0  #: log-odds below which a landmark is deleted.
-    #: of a joint map: maximum number of association hypotheses.
+    #: for a joint map: maximum number of association hypotheses.
     hypotheses: Annotated[int, Range(ge=1, le=4)] = 4
     least_weight: Probability = 1e-4  #: weight below which a hypothesis is dropped or not started.
 
@@ -45,15 +46,15 @@ class AssociationConfig(Ranged):
 
 @dataclass(frozen=True)
 class CalibrationConfig(Ranged):
-    """Priors of a robot's self-calibration, as standard deviations; 0 is known exactly.
+    """Priors of a robot's self-calibration, as standard deviations; 0 means known exactly.
 
-    Of the sensor's given mounting pose, in the sensor's axes, and of systematic odometry errors.
+    They are of the sensor's given mounting pose, in the sensor's axes, and of systematic odometry errors.
     """
 
-    x_m: NotNegative = 0.1  #: ahead.
-    y_m: NotNegative = 0.1  #: to the left.
-    z_m: NotNegative = 0.1  #: up, in space.
-    yaw_deg: NotNegative = 0.0  #: turned to the left.
+    x_m: NotNegative = 0.1  #: mounting position, ahead.
+    y_m: NotNegative = 0.1  #: mounting position, to the left.
+    z_m: NotNegative = 0.1  #: mounting position, up, in space.
+    yaw_deg: NotNegative = 0.0  #: mounting yaw, to the left.
     heading_deg_per_m: NotNegative = 1.0  #: heading drift per metre ahead, in the plane.
     turn: NotNegative = 0.05  #: relative error of rotations, separately to the left and to the right.
     distance: NotNegative = 0.05  #: relative error of distances; with calibrate=online they are exact.
@@ -65,29 +66,28 @@ class RangeBearingConfig(RunConfig):
 
     #: known association by the log's names, or maximum likelihood in several hypotheses on a joint map.
     association: Literal["known", "ml"] = "known"
-    #: one Gaussian of all landmarks and the frame, given the last few steps (joint), which stays consistent; or per-particle
-    #: landmarks, Gaussians given the whole sampled path (particles). By default (auto) joint, but particles if a lag is set.
+    #: joint: one Gaussian of all landmarks and the frame, given the last few steps, which stays consistent. particles:
+    #: per-particle landmarks, Gaussians given the whole sampled path. auto: joint, but particles if a lag is set.
     map: Literal["auto", "joint", "particles"] = "auto"
-    #: of a joint map: maximum steps sampled before they are merged into it; fewer if the effective sample size falls below
-    #: the threshold of resampling, which does not take place. 1 is best if the sensor's mounting pose is estimated, and then
-    #: the default.
+    #: for a joint map: number of steps sampled before they are merged into it. Below the effective sample size of the
+    #: resampling threshold they are merged earlier, instead of resampling. If the sensor's mounting pose is estimated, 1 is
+    #: best, and the default.
     window: Count = 5
-    #: of a joint map: landmarks with which a sub-map ends and the next begins, which bounds the cost of a step however large
-    #: the map becomes; with 20 it ends at an extent of three times the sensor's range. None keeps one Gaussian of all.
+    #: for a joint map: maximum number of landmarks of a sub-map, which bounds the cost of a step however large the map
+    #: becomes. From 20 landmarks on, it also ends at an extent of three times the sensor's range. None: one Gaussian of all.
     submap: Count | None = 150
-    #: of a joint map with known association: what is estimated with everything else: in the plane systematic odometry errors
-    #: (odometry), or the sensor's mounting pose (sensor), or both (online; in space the mounting pose alone). By default
-    #: (auto) the odometry is taken as unbiased until observations show a significant systematic error, and from then on as
-    #: with odometry.
+    #: for a joint map with known association: self-calibration together with the map. odometry: systematic odometry errors,
+    #: in the plane. sensor: the sensor's mounting pose. online: both; in space only the mounting pose. auto: odometry is
+    #: assumed unbiased until observations show a significant systematic error, and from then on as with odometry.
     calibrate: Literal["auto", "off", "odometry", "sensor", "online"] = "auto"
     #: priors of the self-calibration.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
     proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: the proposal distribution.
-    #: of an innovation; by default Gaussian. For logs with wrong associations (MRCLAM) with outliers, if the log's names are
-    #: used: particles that differ in what no reading measures, such as the heading after driving blind, are else selected by
-    #: the first wrong association.
+    #: likelihood of an innovation: by default Gaussian, or with outliers for logs with wrong associations (MRCLAM), if the
+    #: log's names are used. Otherwise the first wrong association would select among particles that differ in unobserved
+    #: directions, such as the heading after driving without observations.
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
     unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
 

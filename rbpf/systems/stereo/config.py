@@ -27,19 +27,19 @@ class OdometryConfig(Ranged):
     estimate: VoConfig = field(default_factory=VoConfig)  #: how a motion is estimated from matches.
     #: the motion prior, assumed if the estimate fails.
     prior: Annotated[MotionPrior, Formerly("prediction")] = field(default_factory=MotionPrior)
-    limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors of two pairs.
-    std_added_rad: NotNegative = 0.0  #: added per update (S05 §V), standard deviation of the rotation about each axis.
-    std_added_m: NotNegative = 0.0  #: likewise of the translation along each axis.
-    #: S05 uses each feature twice, for the odometry and for the map ("none"). To measure the effect, the features can be
-    #: split at random into two halves: one for the odometry and the other for the map ("apart"), or one of them for both
-    #: ("same").
+    limits: MatchLimits = field(default_factory=MatchLimits)  #: for descriptors of two pairs.
+    std_added_rad: NotNegative = 0.0  #: standard deviation added per update (S05 §V) to the rotation, per axis.
+    std_added_m: NotNegative = 0.0  #: likewise to the translation.
+    #: none: each feature is used twice, for the odometry and for the map, as in S05. To measure the effect, features can be
+    #: split at random into two halves. apart: one half is for the odometry, the other for the map. same: one half is for
+    #: both, the other unused.
     split: Literal["none", "apart", "same"] = "none"
-    #: role of the odometry in the filter. "motion" is S05: it moves the particles with its covariance, and the map weighs
-    #: them with the same pixels again. "proposal" uses pixels once: particles move by `prior`, the landmarks weigh, and the
-    #: odometry is the linearisation point of the proposal and the search. Motion information then enters only by the map: it
-    #: needs proposal.kind=ekf, map.weigh=all, and enough landmarks.
+    #: role of the odometry in the filter. motion: as in S05 it moves the particles with its covariance, and the map weighs
+    #: them with the same pixels again. proposal: pixels are used once; particles move by `prior`, landmarks weigh them, and
+    #: the odometry is the linearisation point of the proposal and the search. Motion is then observed only through the map,
+    #: which needs proposal.kind=ekf, map.weigh=all, and enough landmarks.
     role: Literal["motion", "proposal"] = "motion"
-    #: whether errors of consecutive motions are treated as independent, as in S05, although both motions share the pixels of
+    #: whether errors of consecutive motions are treated as independent, as in S05, although both motions use the pixels of
     #: the pair between them.
     independent: bool = False
 
@@ -49,36 +49,35 @@ class MapConfig(Ranged):
     """Which features of a pair are landmarks of the map."""
 
     used: bool = True  #: whether there is a map; without one the filter is odometry with noise.
-    #: one Gaussian of all landmarks and the frame, given the last few updates (joint), which stays consistent; or
-    #: per-particle landmarks, Gaussians given the whole sampled path (particles), as in S05. With a joint map the odometry is
-    #: the proposal, linearised once, and all candidates weigh, regardless of odometry.role, proposal and map.weigh, and the
-    #: likelihood must be normalised. `StereoConfig.s05` has the defaults for particles, also used if the settings select
-    #: them.
+    #: joint: one Gaussian of all landmarks and the frame, given the last few updates, which stays consistent. particles:
+    #: per-particle landmarks, Gaussians given the whole sampled path, as in S05. With a joint map the odometry is the
+    #: proposal, linearised once, and all candidates weigh, regardless of odometry.role, proposal and map.weigh, and the
+    #: likelihood must be normalised. particles also changes other defaults, see `StereoConfig.s05`.
     kind: Literal["particles", "joint"] = "joint"
-    #: of a joint map: maximum updates sampled before they are merged into it; fewer if the effective sample size falls below
-    #: the threshold of resampling, which does not take place.
+    #: for a joint map: number of updates sampled before they are merged into it. Below the effective sample size of the
+    #: resampling threshold they are merged earlier, instead of resampling.
     window: Count = 1
-    #: of a joint map: landmarks beyond which a sub-map ends; those in the pair, and the most recently seen others up to half
-    #: of these, are passed on to the next one; old ones return when they are re-observed. No landmark is dropped.
+    #: for a joint map: maximum number of landmarks of a sub-map. Those in the pair, and the most recently observed others up
+    #: to half of this number, are passed on to the next sub-map; old ones return when re-observed. No landmark is dropped.
     submap: Annotated[Count, Formerly("active")] = 300
-    #: whether candidates, which are not confirmed yet, also weigh the particles; they are in the map in any case.
+    #: whether only confirmed landmarks weigh the particles, or also candidates (all); both are in the map.
     weigh: Literal["landmarks", "all"] = "landmarks"
-    limits: MatchLimits = field(default_factory=MatchLimits)  #: of the descriptors of a feature and a landmark.
-    #: largest squared Mahalanobis distance from the landmark's prediction; 11.3 is the 99 % quantile.
+    limits: MatchLimits = field(default_factory=MatchLimits)  #: for descriptors of a feature and a landmark.
+    #: gate: largest squared Mahalanobis distance from a landmark's prediction; 11.3 is the 99 % quantile.
     gate: Positive = 11.3
-    slack_px: NotNegative = 1.0  #: added to the prediction, standard deviation per axis.
+    slack_px: NotNegative = 1.0  #: standard deviation added to the prediction, per axis.
     #: number of particles, drawn by weight, used to predict landmarks.
     subsample: Annotated[Count, Formerly("cloud")] = 32
     margin_px: float = 20.0  #: margin around the heaviest particle's image within which landmarks may be in view.
     #: a landmark is not searched once its viewing direction has changed by this since its last observation.
     max_turn_deg: Annotated[Angle, Formerly("turn_deg")] = 45.0
-    max_scale_change: Annotated[Ratio, Formerly("scale")] = 2.0  #: nor once its distance has changed by this factor.
-    #: if predictions have a larger standard deviation than this, the gate accepts many matches: they must then agree on one
+    max_scale_change: Annotated[Ratio, Formerly("scale")] = 2.0  #: likewise its distance, by this factor.
+    #: if predictions have a larger standard deviation than this, the gate accepts many matches, which must then agree on one
     #: motion …
     vague_px: Annotated[NotNegative, Formerly("doubt_px")] = 15.0
     #: … and number at least this many, else none is used.
     min_agreeing: Annotated[int, Range(ge=3), Formerly("agreeing")] = 6
-    #: a feature starts a landmark if the standard deviation of its depth is below this fraction of it.
+    #: largest relative standard deviation of depth of a feature that initialises a landmark.
     depth_fraction: Annotated[Positive, Formerly("depth_share")] = 0.1
 
 
@@ -110,7 +109,7 @@ class RecoveryConfig(Ranged):
     lies where they are observed.
     """
 
-    #: whether recovery is used; else such a motion moves the particles like any other, as in S05.
+    #: whether recovery is used; if not, such a motion moves the particles like any other, as in S05.
     used: bool = True
     #: pairs after which mapping continues from the assumed pose, as the camera may be in unmapped surroundings.
     patience: CountOrNone = 60
@@ -141,12 +140,12 @@ class StereoConfig(RunConfig):
     map: MapConfig = field(default_factory=MapConfig)  #: which features are landmarks.
     #: which features become landmarks, and how long they stay.
     new_landmarks: Annotated[NewLandmarkConfig, Formerly("keys")] = field(default_factory=NewLandmarkConfig)
-    #: of a joint map: self-calibration, estimating a common disparity offset with everything else (online); by default only
-    #: once it explains all pairs so far far better (auto).
+    #: for a joint map: self-calibration. online: a common disparity offset is estimated together with the map. auto: only once
+    #: it explains all pairs so far much better.
     calibrate: Literal["auto", "off", "online"] = "auto"
     #: prior of the self-calibration.
     self_calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    #: of a landmark's innovation: with heavy tails, or S05 (6) with per-particle maps.
+    #: likelihood of a landmark's innovation: heavy-tailed, or S05 (6) with per-particle maps.
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("student", outlier_volume=OUTLIER_VOLUME_PX3)
     )
