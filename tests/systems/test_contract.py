@@ -15,6 +15,7 @@ from examples.studies.soak import held_bytes
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.sensors.readers import Frame, ImageFrame
+from rbpf.systems.filtering import LikelihoodConfig
 from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -263,14 +264,32 @@ def test_bad_frames_are_survived_and_said(case):
         assert errors_m(np.array([each.pose for each in told]), pairs(len(told)))[:-3].max() < 0.01
 
 
-@pytest.mark.parametrize("case", [SURVIVED["known points"], (stereo, pairs)], ids=["images", "pairs"])
-def test_a_stamp_before_the_last_one_changes_nothing(case):
-    make, recorded, *_ = case
-    system, frames = make(), list(recorded(5).frames())
-    for frame in frames[:3]:
-        system.take(frame)
-    before = content(system.filter), {name: np.copy(array) for name, array in system.arrays().items()}
-    with pytest.raises(InputError, match="time runs backwards"):
-        system.take(replace(frames[3], stamp_ns=frames[1].stamp_ns))
-    assert same(content(system.filter), before[0]) and same(system.arrays(), before[1])
-    assert system.take(frames[3]).state is TrackingState.TRACKED
+def sure(**options) -> System:
+    return robot(RangeBearingConfig(particles=4, likelihood=LikelihoodConfig("outliers"), **options))[0]
+
+
+def readings() -> Iterable[Frame]:
+    return islice(robot()[1], 5)
+
+
+PAST, NOT_FINITE = ({"stamp_ns": 99}, "time runs backwards"), ({"z": np.full((3, 2), np.nan)}, "not finite")
+REFUSED = {
+    "images": (lambda: mono(KNOWN), lambda: sequence(5).frames(), [PAST]),
+    "pairs": (stereo, lambda: pairs(5).frames(), [PAST]),
+    "robot, joint map": (sure, readings, [PAST, NOT_FINITE]),
+    "robot, own maps": (lambda: sure(map="particles"), readings, [NOT_FINITE]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+def test_a_refused_frame_changes_nothing(case):
+    make, recorded, refused = case
+    system = make()
+    for t, frame in enumerate(recorded()):
+        frame = replace(frame, stamp_ns=100 + frame.stamp_ns)
+        before = content(system.filter), {name: np.copy(array) for name, array in system.arrays().items()}
+        for changed, words in refused if t else []:
+            with pytest.raises(InputError, match=words):
+                system.take(replace(frame, **changed))
+            assert same(content(system.filter), before[0]) and same(system.arrays(), before[1])
+        assert system.take(frame).state is TrackingState.TRACKED
