@@ -272,12 +272,28 @@ def readings() -> Iterable[Frame]:
     return islice(robot()[1], 5)
 
 
-PAST, NOT_FINITE = ({"stamp_ns": 99}, "time runs backwards"), ({"z": np.full((3, 2), np.nan)}, "not finite")
+def wrong(words: str, **given: list[object]) -> list[tuple[dict[str, object], str]]:
+    """Frames with one thing in them wrong, and what is said of it."""
+    return [({name: each}, words) for name, values in given.items() for each in values]
+
+
+PAST = wrong("time runs backwards", stamp_ns=[99])
+READINGS = [
+    *wrong("the array z must hold finite numbers", z=[np.full((3, 2), np.nan)]),
+    *wrong("z must be an array, got lists of different lengths", z=[[[2.0, 0.3], [3.0]]]),
+    *wrong(r"z must hold numbers of shape \(K, 2\), got \((2,)?\)", z=[np.ones(2), None]),
+    *wrong(r"cov_z must hold numbers of shape \(K = 3, 2, 2\), got", cov_z=[np.zeros((n, 2, 2)) for n in (2, 4)]),
+    *wrong(
+        r"landmarks must hold whole numbers of shape \(3\)", landmarks=[range(2), range(4), [0, 1, 3.5], [np.nan] * 3]
+    ),
+    *wrong("landmarks must hold whole numbers from 0 to", landmarks=[[0, 1, -6], [0, 1, 2**62]]),
+    *wrong(r"delta must hold numbers of shape \(3\), got", delta=[np.zeros(2), "left"]),
+]
 REFUSED = {
-    "images": (lambda: mono(KNOWN), lambda: sequence(5).frames(), [PAST]),
-    "pairs": (stereo, lambda: pairs(5).frames(), [PAST]),
-    "robot, joint map": (sure, readings, [PAST, NOT_FINITE]),
-    "robot, own maps": (lambda: sure(map="particles"), readings, [NOT_FINITE]),
+    "images": (lambda: mono(KNOWN), lambda: sequence(5).frames(), PAST),
+    "pairs": (stereo, lambda: pairs(5).frames(), PAST),
+    "robot, joint map": (sure, readings, [*PAST, *READINGS]),
+    "robot, own maps": (lambda: sure(map="particles"), readings, READINGS),
 }
 
 

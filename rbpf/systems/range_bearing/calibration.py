@@ -62,11 +62,9 @@ class RobotCalibration(Kept):
         self.prior = np.zeros(self.learnt.size), scale**2 * self._cov
 
     def driven(self, odometry: Odometry | None) -> Odometry | None:
-        """The odometry with its derivative by them; unchanged if it is invalid, as the motion model refuses it."""
+        """The odometry with its derivative by them."""
         wheels = self.learnt >= self.space.dim
-        if odometry is None or not wheels.any() or np.shape(odometry.delta) != (self.space.size,):
-            return odometry
-        if not np.isfinite(odometry.delta).all():
+        if odometry is None or not wheels.any():
             return odometry
         by_constants = np.zeros((self.space.dim, self.learnt.size))
         by_constants[:, wheels] = wheel_errors(odometry.delta)[:, self.learnt[wheels] - self.space.dim]

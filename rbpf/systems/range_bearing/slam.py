@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rbpf.core.checkpoint import elements, integers, read_one
+from rbpf.core.checkpoint import elements, integers, numbers, read_one, taken
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
@@ -125,9 +126,9 @@ class RangeBearingSlam(System):
 
     def track(
         self,
-        z: np.ndarray,
-        cov_z: np.ndarray,
-        landmarks: np.ndarray | None = None,
+        z: ArrayLike,
+        cov_z: ArrayLike,
+        landmarks: ArrayLike | None = None,
         odometry: Odometry | None = None,
         stamp_ns: int | None = None,
     ) -> Tracked:
@@ -140,9 +141,20 @@ class RangeBearingSlam(System):
             odometry: motion since the last step; None in the first one.
             stamp_ns: time; by default one second after the last step.
 
-        Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
+        Raises InputError: time runs backwards, a type or a shape does not fit, a number is not finite, a name is not a whole
+        number from 0 up, or no particle explains the observations.
         """
-        names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
+        d, e, p = self.space.dim, self.space.size, self.model.dim
+        shapes = {"z": numbers("K", p), "cov_z": numbers("K", p, p)}
+        z, cov_z = taken("the step", {"z": z, "cov_z": cov_z}, shapes).values()
+        named = {"landmarks": np.full(len(z), NULL) if landmarks is None else landmarks}
+        least = 0 if self.hypotheses is None else NULL
+        (names,) = taken("the step", named, {"landmarks": integers(len(z), least=least)}).values()
+        if odometry is not None:
+            if not isinstance(odometry, Odometry):
+                raise InputError(f"odometry must be an Odometry with delta and cov, got a {type(odometry).__name__}")
+            motion = taken("the odometry", vars(odometry), {"delta": numbers(e), "cov": numbers(d, d)})
+            odometry = replace(odometry, **motion)
         self.sensor.model, odometry = self.calibration.tuned(self.filter), self.calibration.driven(odometry)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
@@ -166,7 +178,6 @@ class RangeBearingSlam(System):
         if self.joint is not None and self.joint.old.maps:
             # A landmark re-initialised by a new sub-map has been measured before, which its density does not include.
             report = replace(report, log_evidence=np.nan)
-        d, e = self.space.dim, self.space.size
         return Tracked(
             report.stamp_ns,
             estimate.mean,
