@@ -70,8 +70,9 @@ def test_bad_scans_and_odometry_are_survived_and_said():
     assert said[8][0].startswith("the odometry jumps by 94.") and said[9][0].startswith("the odometry jumps")
     assert tracked[2].state is TrackingState.PREDICTED
     assert errors_m([t.pose for t in tracked], truth).max() < 0.3
-    with pytest.raises(InputError, match="time runs backwards"):
-        slam.track(frames[0].ranges, None, 0)
+    for stamp_ns, words in ((0, "time runs backwards: a scan at 0 ns"), (np.nan, "stamp_ns must be a whole number")):
+        with pytest.raises(InputError, match=words):
+            slam.track(frames[0].ranges, None, stamp_ns)
     with pytest.raises(InputError, match=r"a scan of this scanner has 91 readings, got \(90,\)"):
         slam.track(frames[0].ranges[1:], None, 10**12)
 

@@ -201,9 +201,8 @@ class MonoSlam(System):
 
     def take(self, frame: ImageFrame | FeatureFrame) -> Tracked:
         """Processes a frame, an image or named features; errors as of `track`."""
-        before, stamp_ns = self.filter.stamp_ns, int(frame.stamp_ns)
-        if before is not None and stamp_ns < before:
-            raise InputError(f"time runs backwards: a frame at {stamp_ns} ns after one at {before} ns")
+        last_ns = self.loss.stamp_ns if self.filter.stamp_ns is None else self.filter.stamp_ns
+        stamp_ns = self.checked_stamp(frame.stamp_ns, last_ns)
         started = time.perf_counter()
         sensor, messages = self.sensor, list[str]()
         was_lost, never_found, first_new = sensor.lost, self.loss.never_found, len(sensor.table)
@@ -232,16 +231,17 @@ class MonoSlam(System):
         # 2. The first frame initialises the known points.
         prior: PosePrior | None = None
         if not self.filter.steps:
-            self.loss.stamp_ns = stamp_ns
             if is_empty and isinstance(self.known, KnownPixels):
                 # Before the first usable image the camera is around the pose resected from them.
                 assert self._start is not None
+                self.loss.stamp_ns = stamp_ns
                 pose, cov = self._start.world_from_camera, self.config.start_cov()
                 values = {column.name: column.kind(0) for column in self.columns}
                 messages.append("the run starts with the first image that shows the known points")
                 waiting = TrackingState.INITIALISING, values | {"ess": float(self.config.particles)}
                 return Tracked(stamp_ns, pose, cov, *waiting, self._nothing(), tuple(messages))
             measured, prior = self._begin(measured)
+            self.loss.stamp_ns = stamp_ns
 
         # 3. Pose prior: by the motion model, unless nothing has been observed yet or the camera is lost.
         self.attempt = None

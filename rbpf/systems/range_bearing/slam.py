@@ -144,6 +144,8 @@ class RangeBearingSlam(System):
         Raises InputError: time runs backwards, a type or a shape does not fit, a number is not finite, a name is not a whole
         number from 0 up, or no particle explains the observations.
         """
+        if stamp_ns is not None:
+            stamp_ns = self.checked_stamp(stamp_ns, self.filter.stamp_ns)
         d, e, p = self.space.dim, self.space.size, self.model.dim
         shapes = {"z": numbers("K", p), "cov_z": numbers("K", p, p)}
         z, cov_z = taken("the step", {"z": z, "cov_z": cov_z}, shapes).values()
