@@ -40,6 +40,9 @@ class ObservationKernel:
         self.compiled = compiled  #: Numba's object, which owns the machine code.
         self.address = int(compiled.address)  #: Where the machine code starts.
 
+    def __deepcopy__(self, memo: object) -> "ObservationKernel":
+        return self  # machine code
+
 
 def _function_at(signature: Any, *given: Any) -> Any:
     """Of an intrinsic that gives the function which starts at an address (int64), the first that it is given."""

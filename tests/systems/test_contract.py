@@ -1,5 +1,6 @@
 """What every system that takes frames promises: to go on from any checkpoint, to survive bad frames, to refuse the past."""
 
+import copy
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import count, cycle, islice
@@ -188,19 +189,20 @@ def test_a_recordings_whole_paths_are_kept_where_they_fit(live):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", RESUMED.values(), ids=RESUMED)
-def test_a_checkpoint_after_any_frame_goes_on_with_the_same_bytes(case, tmp_path):
-    system, whole, frames = case.make(), [], list(case.frames())
+def test_a_checkpoint_after_any_frame_and_a_copy_go_on_with_the_same_bytes(case, tmp_path):
+    system, whole, frames, resumed = case.make(), [], list(case.frames()), []
     for t, frame in enumerate(frames):
         whole.append(system.take(frame))
         assert whole[-1].values.keys() == {column.name for column in system.columns}
         assert whole[-1].observed.keys() == {ragged.name for ragged in system.observed}
         if t in case.after:
             system.save(tmp_path / f"{t}.npz", {"of the caller": np.array(t)})
+            resumed.append((t, case.make()))
+            assert resumed[-1][1].load(tmp_path / f"{t}.npz")["of the caller"] == t
+            resumed += [(t, copy.deepcopy(system))] if t == case.after[-2:][0] else []
     assert {each.state for each in whole} >= case.states
     assert case.joint is None or (system.filter.consolidation is not None) is case.joint
-    for t in case.after:
-        again = case.make()
-        assert again.load(tmp_path / f"{t}.npz")["of the caller"] == t
+    for t, again in resumed:
         for frame, theirs in zip(frames[t + 1 :], whole[t + 1 :], strict=True):
             mine = again.take(frame)
             assert mine.pose.tobytes() == theirs.pose.tobytes() and mine.cov.tobytes() == theirs.cov.tobytes()

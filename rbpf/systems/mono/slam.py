@@ -167,14 +167,11 @@ class MonoSlam(System):
             self._add_points(known_map.points)
             appearances = known_map.windows, known_map.first_px, known_map.first_pose
             self.sensor.begin_lost(*appearances, known_map.positions)
-            self.loss = TrackingLoss(self.sensor, config, known_map.views, known_map.size_m)
-        else:
-            self.loss = TrackingLoss(self.sensor, config)
+        views = () if known_map is None else (known_map.views, known_map.size_m)
+        self.loss = TrackingLoss(self.sensor, config, *views)
         self.place_recognition = PlaceRecognition(self.loss.relocaliser, config)
         is_unknown = points is None and wrapped is None
-        self.start = UnknownStart(
-            config, self.features, self.first, lambda: self._new_filter(self.features), is_unknown
-        )
+        self.start = UnknownStart(config, self.features, self.first, self._new_filter, is_unknown)
         self.gauge: Gauge = "none"
         if known_map is not None:
             self.gauge = known_map.alignment
