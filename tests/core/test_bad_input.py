@@ -110,7 +110,10 @@ class TestMeasurements:
 
     def test_no_particle_explains_them(self):
         # Far beyond the range of floating point is still a weight; what cannot be is none.
-        assert on_a_line().step(seen(STATE, [[1e3]], [[[1e-2]]])).log_evidence < -1e5
+        filter_ = on_a_line(resampler=EssTriggered(Systematic(), 0.0))
+        assert filter_.step(seen(STATE, [[1e3]], [[[1e-2]]])).log_evidence < -1e5
+        filter_.step(seen(STATE, [[1e18]], [[[1e-4]]]))  # a logarithm in which that of a sum would be rounded away
+        assert filter_.particles.weights.sum() == pytest.approx(1.0)
         clutter = {"ids": np.array([core.NULL]), "log_clutter": -np.inf}
         groups = seen(RangeBearing(SE2), [[5.0, 0.0]], **clutter)
         fails(in_the_plane(), "step 0: all particle weights are zero, no particle explains", groups)

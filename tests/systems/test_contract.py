@@ -135,6 +135,13 @@ RESUMED = {
     "robot, joint map": Case(
         lambda: robot(RangeBearingConfig(particles=10, window=4))[0], lambda: islice(robot()[1], 16), (0, 5, 9)
     ),
+    "robot, 100,000 km away": Case(
+        lambda: robot(RangeBearingConfig(particles=10))[0],
+        lambda: (
+            replace(f, delta=np.array([0.0, 1e8, 1e8]) if f.stamp_ns == 3 else f.delta) for f in islice(robot()[1], 8)
+        ),
+        (3, 5),
+    ),
     "robot, unnamed": Case(unnamed, lambda: corridor(0).frames, (0, 44, 58, 62)),
     "scans": Case(lambda: laser(), lambda: scans(12), (0, 5, 6, 9), {TrackingState.TRACKED, TrackingState.PREDICTED}),
 }
