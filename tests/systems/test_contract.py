@@ -235,6 +235,7 @@ BAD_IMAGES = {
     "no number": (image(DARK * np.nan), "expected 320x240"),
     "no array": (image("image"), "expected 320x240"),
 }
+NOISE = np.random.default_rng(0).integers(0, 256, (2, 240, 320), dtype=np.uint8)
 BAD_PAIRS = {
     "missing": (missing, "the right image is missing"),
     "black": (flat, "it shows 0 features"),
@@ -242,6 +243,7 @@ BAD_PAIRS = {
     "two sizes": (lambda f: replace(f, image=f.image[:100]), "must be of one size"),
     "wrong type": (lambda f: replace(f, image=f.image.astype(float)), "float64"),
     "colour": (lambda f: replace(f, image=np.dstack([f.image] * 3)), "(240, 320, 3)"),
+    "noise": (lambda f: replace(f, image=NOISE[0], right=NOISE[1]), "it shows 0 features, 8 are needed; 21.9 % of"),
     "same stamp": (lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_666), "it has the stamp of the last one"),
 }
 SURVIVED = {

@@ -140,10 +140,8 @@ class StereoSlam(System):
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
                     "none: set likelihood.kind=student, or map.kind=particles"
                 )
-            joint = JointMap(
-                SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True,
-                constants=int(self._calibration.is_held),
-            )  # fmt: skip
+            options: dict[str, Any] = {"passed_on": True, "constants": int(self._calibration.is_held)}
+            joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, **options)
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
@@ -183,8 +181,7 @@ class StereoSlam(System):
         """`track` with a frame of a recording, an `ImageFrame`, or another one that the front end takes."""
         started, front_end = time.perf_counter(), self.front_end
         if not isinstance(frame, front_end.takes):
-            taken = front_end.takes.__name__
-            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {taken} here")
+            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {front_end.takes.__name__}")
         frame = replace(frame, stamp_ns=self.checked_stamp(frame.stamp_ns))
         # The first frame must fit the cameras.
         if not self.frames and (refusal := front_end.refusal(frame)):
@@ -207,10 +204,8 @@ class StereoSlam(System):
             self._doubted |= bool(doubt)
             messages += filter(None, (problem, doubt, motion.message))
         else:
-            few = "it has the stamp of the last one"
-            if dt > 0.0:
-                few = f"it shows {len(pair)} features, {least} are needed"
-            why = f"{problem}; {few}" if problem and len(pair) else problem or few
+            few = f"it shows {len(pair)} features, {least} are needed" if dt > 0 else "it has the stamp of the last one"
+            why = f"{few}; {problem}" if problem and (len(pair) or pair.images) else problem or few
             expected = last = self.reckoning
             then = "the world begins with the first pair that is measured"
             if last.stamp_ns is not None:  # the next pair has the same reference pair
