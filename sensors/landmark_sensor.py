@@ -73,8 +73,7 @@ class NamedLandmarkSensor(Sensor):
         self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """The first observation of each new landmark; a second one in the same frame is ignored."""
-        # Here and not in `observe`, after which a step can still be refused.
-        self.observed_once.difference_update(frame.landmarks.tolist())
+        self.observed_once.difference_update(frame.landmarks.tolist())  # not in `observe`: the step may be refused
         if self._contradicted.size:
             belief.map.remove(self._contradicted)
         first = np.zeros(frame.landmarks.size, dtype=bool)

@@ -303,8 +303,7 @@ def taken(what: str, values: Mapping[str, Any], schema: Schema) -> dict[str, np.
             array = np.asarray(values[name])
         except ValueError as error:
             raise InputError(f"{what}: {name} must be an array, got lists of different lengths") from error
-        if array.shape == (0,):
-            array = entry.empty()
+        array = entry.empty() if array.shape == (0,) else array
         with np.errstate(invalid="ignore"):
             alike = array.dtype.kind in "biuf" and bool((array.astype(entry.dtype) == array).all())
         arrays[name] = array.astype(entry.dtype, copy=False) if alike else array

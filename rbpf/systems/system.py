@@ -305,15 +305,11 @@ class System(ABC):
 
     def checked_stamp(self, stamp_ns: Any, last_ns: int | None = None) -> int:
         """A frame's time. Raises InputError: it is no whole number that a checkpoint holds, or is before `last_ns`."""
-        try:
-            whole = int(stamp_ns)
-        except (TypeError, ValueError, OverflowError):
-            whole = -1
-        if not 0 <= whole < BEYOND or whole != stamp_ns:
+        if not (isinstance(stamp_ns, int | float | np.integer) and 0 <= stamp_ns < BEYOND and stamp_ns % 1 == 0):
             raise InputError(f"stamp_ns must be a whole number of nanoseconds from 0 to {BEYOND - 1}, got {stamp_ns!r}")
-        if last_ns is not None and whole < last_ns:
-            raise InputError(f"time runs backwards: a {self.frame_word} at {whole} ns after one at {last_ns} ns")
-        return whole
+        if last_ns is not None and stamp_ns < last_ns:
+            raise InputError(f"time runs backwards: a {self.frame_word} at {stamp_ns} ns after one at {last_ns} ns")
+        return int(stamp_ns)
 
     @abstractmethod
     def take(self, frame: Any) -> Tracked:

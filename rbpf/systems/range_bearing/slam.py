@@ -64,12 +64,10 @@ class RangeBearingSlam(System):
         self.robot_from_sensor = space.identity() if robot_from_sensor is None else robot_from_sensor
         unknown = config.unknown
         max_range = np.inf if unknown.max_range_m is None else unknown.max_range_m
-        self.model: RigidPointModel
+        mount, view = self.robot_from_sensor, np.deg2rad(unknown.half_field_of_view_deg)
+        self.model: RigidPointModel = RangeBearing(space, mount, pitch_sign, max_range, view)
         if measurement == "position":
-            self.model = RelativePosition(space, self.robot_from_sensor, max_range)
-        else:
-            view = np.deg2rad(unknown.half_field_of_view_deg)
-            self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
+            self.model = RelativePosition(space, mount, max_range)
         self.point = Point(space.point_dim)
         self.kept_map, self.why_map = config.kept_map()
         is_joint, is_unnamed = self.kept_map == "joint", config.association == "ml"
@@ -81,11 +79,9 @@ class RangeBearingSlam(System):
         landmark_map: JointMap | LandmarkMap
         self.calibration = calibration = RobotCalibration(config, space, self.model, is_joint and not is_unnamed)
         if is_joint:
+            common = space, calibration.prior, config.compiled, config.submap
             unnamed = is_unnamed and config.submap is not None
-            prior = calibration.prior
-            landmark_map = JointMap(
-                space, prior, config.compiled, config.submap, unnamed=unnamed, constants=calibration.learnt.size
-            )
+            landmark_map = JointMap(*common, unnamed=unnamed, constants=calibration.learnt.size)
         else:
             landmark_map = LandmarkMap(space, compiled=config.compiled)
             landmark_map.register(self.point)
@@ -93,9 +89,7 @@ class RangeBearingSlam(System):
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
         motion = OdometryMotion(space, constants=calibration.learnt.size)
         self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
-        self.hypotheses: Hypotheses | None = None
-        if is_unnamed:
-            self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
+        self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations) if is_unnamed else None
         self._odometry = space.identity()
         d, e, p = space.dim, space.size, self.model.dim
         self.columns = (
@@ -121,8 +115,7 @@ class RangeBearingSlam(System):
     ) -> "RangeBearingSlam":
         """The system for the robot and the sensor of a log."""
         kind: Kind = "position" if log.measurement == "position" else "range_bearing"
-        mount, sign = log.robot_from_sensor, log.pitch_sign
-        return cls(config, log.space, kind, mount, sign, keep_associations, log.misread)
+        return cls(config, log.space, kind, log.robot_from_sensor, log.pitch_sign, keep_associations, log.misread)
 
     def track(
         self,
@@ -199,9 +192,8 @@ class RangeBearingSlam(System):
         )
 
     def take(self, frame: Frame) -> Tracked:
-        odometry = None
-        if frame.delta is not None and frame.cov_delta is not None:
-            odometry = Odometry(frame.delta, frame.cov_delta)
+        delta, cov = frame.delta, frame.cov_delta
+        odometry = None if delta is None or cov is None else Odometry(delta, cov)
         return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
 
     def map(self) -> MapEstimate:
