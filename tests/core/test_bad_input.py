@@ -246,8 +246,7 @@ def test_particles_of_weight_zero_do_no_harm():
     filter_.particles.log_weights = np.log([0.5, 0.5, 1e-320, 1e-320, 1e-320, 1e-320])
     filter_.particles.log_weights[2] = -np.inf
     report = filter_.step(seen(STATE, [[0.3]], [[[0.01]]]))
-    assert np.isfinite(report.log_evidence)
-    assert np.isfinite(report.estimate.cov).all()
+    assert np.isfinite(report.log_evidence) and np.isfinite(report.estimate.cov).all()
     assert filter_.particles.weights[2] == 0.0
 
 

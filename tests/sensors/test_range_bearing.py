@@ -96,8 +96,7 @@ def test_planar_measurement_by_hand():
 @given(st.floats(-50.0, 50.0))
 def test_wrapped_angles(angle):
     wrapped = wrap_angle(np.array(angle))
-    assert -np.pi <= wrapped < np.pi
-    assert np.abs(np.exp(1j * wrapped) - np.exp(1j * angle)) < 1e-13
+    assert -np.pi <= wrapped < np.pi and np.abs(np.exp(1j * wrapped) - np.exp(1j * angle)) < 1e-13
 
 
 @pytest.mark.parametrize("model", [RangeBearing(SE2), RangeBearing(SE3)], ids=["planar", "spatial"])
