@@ -8,7 +8,7 @@ as lineages coalesce. See `docs/adr` for the comparison with a tree.
 
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -126,6 +126,10 @@ class Columns:
     def __init__(self) -> None:
         self.next_id = 0  #: One more than the largest id that was ever used.
         self._hold(np.zeros((5, 0), dtype=np.int64))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.next_id = state["next_id"]
+        self._hold(state["_tables"])  # those of a copy, too, are views of one array
 
     def rows(self, ids: np.ndarray | int) -> np.ndarray:
         """Rows (K,) of columns (K,), which must exist; for a single one its number."""

@@ -66,7 +66,6 @@ class NamedLandmarkSensor(Sensor):
             nu = self.model.residual(frame.z[second], predicted)
             assert self.likelihood is not None
             agrees = self.likelihood.inlier(nu, cov + frame.cov_z[second])
-            self.observed_once -= set(frame.landmarks[second].tolist())
             self._contradicted = np.unique(frame.landmarks[second[~agrees]])
         return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids)]
 
@@ -74,6 +73,7 @@ class NamedLandmarkSensor(Sensor):
         self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """The first observation of each new landmark; a second one in the same frame is ignored."""
+        self.observed_once.difference_update(frame.landmarks.tolist())  # not in `observe`: the step may be refused
         if self._contradicted.size:
             belief.map.remove(self._contradicted)
         first = np.zeros(frame.landmarks.size, dtype=bool)

@@ -192,6 +192,7 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 #
 # A named size is equal wherever the name occurs: it is set by the caller, or by the first array that has it.
 
+BEYOND = 2**62  #: Whole numbers, as names and stamps, lie between minus this and this.
 LARGEST = 1e30  #: Largest accepted number, so that squares stay finite.
 
 _WORDS = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "b": "truth values", "U": "text"}
@@ -294,6 +295,22 @@ def require(what: str, values: Mapping[str, Any], schema: Schema, **sizes: int) 
         raise InputError(f"{what}: {error}") from None
 
 
+def taken(what: str, values: Mapping[str, Any], schema: Schema) -> dict[str, np.ndarray]:
+    """Arrays from what a user gives, lists or numbers of another type with the same values; errors as of `require`."""
+    arrays = dict[str, np.ndarray]()
+    for name, entry in schema.items():
+        try:
+            array = np.asarray(values[name])
+        except ValueError as error:
+            raise InputError(f"{what}: {name} must be an array, got lists of different lengths") from error
+        array = entry.empty() if array.shape == (0,) else array
+        with np.errstate(invalid="ignore"):
+            alike = array.dtype.kind in "biuf" and bool((array.astype(entry.dtype) == array).all())
+        arrays[name] = array.astype(entry.dtype, copy=False) if alike else array
+    require(what, arrays, schema)
+    return arrays
+
+
 def split(rows: np.ndarray, counts: Sequence[int], name: str) -> list[np.ndarray]:
     """Splits the rows of an array by `counts`. Raises InputError: the number of rows differs."""
     if sum(counts) != len(rows):
@@ -327,8 +344,8 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
     # Indices, counts, ranges.
     below = sizes[entry.below] if isinstance(entry.below, str) else entry.below
     if wanted.kind == "i":
-        least = -(2**62) if entry.least is None else entry.least
-        below = 2**62 if below is None else below
+        least = -BEYOND if entry.least is None else entry.least
+        below = BEYOND if below is None else below
         _require((array >= least) & (array < below), array, name, f"whole numbers from {least} to {below - 1}")
     elif entry.least is not None:
         _require(array >= entry.least, array, name, f"numbers of at least {entry.least:g}")

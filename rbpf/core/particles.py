@@ -57,8 +57,10 @@ def reweight(log_weights: np.ndarray, log_factors: np.ndarray, what: str) -> tup
             raise InputError(f"{what}: all particle weights are zero, no particle explains the observations")
         weight = f"the weight of particle {bad[0]} is {log_factors[bad[0]]}"
         raise InputError(f"{what}: {weight}; check the models with rbpf.check_model")
-    total = float(high + np.log(np.exp(joint - high).sum()))
-    return joint - total, total
+    log_sum = np.log(np.exp(joint - high).sum())
+    total = float(high + log_sum)
+    # In so large a total the sum is rounded away.
+    return joint - total if abs(high) < 1e9 else joint - high - log_sum, total
 
 
 def effective_sample_size(weights: np.ndarray) -> float:

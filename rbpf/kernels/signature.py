@@ -40,6 +40,9 @@ class ObservationKernel:
         self.compiled = compiled  #: Numba's object that owns the machine code.
         self.address = int(compiled.address)  #: Address of the machine code.
 
+    def __deepcopy__(self, memo: object) -> "ObservationKernel":
+        return self  # machine code
+
 
 def _function_at(signature: Any, *given: Any) -> Any:
     """Implements an intrinsic that returns the function at an address (int64), its first argument."""

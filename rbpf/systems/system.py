@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from rbpf.arrays import Float, Int
-from rbpf.core.checkpoint import elements, fitting, integers, numbers, read, split
+from rbpf.core.checkpoint import BEYOND, elements, fitting, integers, numbers, read, split
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import Conditional, Map, MotionModel, Part, Proposal, Sensor
 from rbpf.core.resampling import Consolidation
@@ -302,6 +302,14 @@ class System(ABC):
             require_memory(float(kept * self.filter.particles.state.nbytes), what)
             self.recorded = True
             self.filter.history.lag = self.lag
+
+    def checked_stamp(self, stamp_ns: Any, last_ns: int | None = None) -> int:
+        """A frame's time. Raises InputError: it is no whole number that a checkpoint holds, or is before `last_ns`."""
+        if not (isinstance(stamp_ns, int | float | np.integer) and 0 <= stamp_ns < BEYOND and stamp_ns % 1 == 0):
+            raise InputError(f"stamp_ns must be a whole number of nanoseconds from 0 to {BEYOND - 1}, got {stamp_ns!r}")
+        if last_ns is not None and stamp_ns < last_ns:
+            raise InputError(f"time runs backwards: a {self.frame_word} at {stamp_ns} ns after one at {last_ns} ns")
+        return int(stamp_ns)
 
     @abstractmethod
     def take(self, frame: Any) -> Tracked:

@@ -48,6 +48,9 @@ class Sift(FeatureExtractor, Descriptor):
         self.config = config or SiftConfig()
         self.length = self.config.length
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"config": self.config, "length": self.length}  # OpenCV's detector cannot be copied
+
     def extract(self, image: np.ndarray) -> Features:
         """A position with two dominant orientations gives two keypoints."""
         config = self.config

@@ -119,8 +119,7 @@ def test_map_and_accuracy_are_those_of_the_run_that_knows_the_names(clutter):
     assert len(accepted) == len(seen)
     mean = np.einsum("n,nkd->kd", weights, landmark_map.read(accepted).mean)
     assert np.linalg.norm(mean[:, None] - world.landmarks, axis=-1).min(axis=1).max() < 0.3
-    assert (len(started) > 0.8 * STEPS) == (clutter > 0.0)
-    assert max(sizes) < 3 * LANDMARKS
+    assert (len(started) > 0.8 * STEPS) == (clutter > 0.0) and max(sizes) < 3 * LANDMARKS
     assert np.mean(sizes[-20:]) < 1.1 * np.mean(sizes[40:60])
 
 
@@ -136,8 +135,7 @@ def test_life_of_a_landmark():
     report = filter_.step(NOTHING)
     assert report.new_landmarks.size == 0 and report.log_evidence == pytest.approx(0.0)
     report = filter_.step(one_sighting())
-    assert report.new_landmarks.tolist() == [0]
-    assert (ids_of(report) == NEW).all()
+    assert report.new_landmarks.tolist() == [0] and (ids_of(report) == NEW).all()
     np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 0.0)
     report = filter_.step(one_sighting())
     assert (ids_of(report) == 0).all()

@@ -110,7 +110,10 @@ class TestMeasurements:
 
     def test_no_particle_explains_them(self):
         # Far beyond the range of floating point is still a weight; what cannot be is none.
-        assert on_a_line().step(seen(STATE, [[1e3]], [[[1e-2]]])).log_evidence < -1e5
+        filter_ = on_a_line(resampler=EssTriggered(Systematic(), 0.0))
+        assert filter_.step(seen(STATE, [[1e3]], [[[1e-2]]])).log_evidence < -1e5
+        filter_.step(seen(STATE, [[1e18]], [[[1e-4]]]))  # a logarithm in which that of a sum would be rounded away
+        assert filter_.particles.weights.sum() == pytest.approx(1.0)
         clutter = {"ids": np.array([core.NULL]), "log_clutter": -np.inf}
         groups = seen(RangeBearing(SE2), [[5.0, 0.0]], **clutter)
         fails(in_the_plane(), "step 0: all particle weights are zero, no particle explains", groups)
@@ -243,8 +246,7 @@ def test_particles_of_weight_zero_do_no_harm():
     filter_.particles.log_weights = np.log([0.5, 0.5, 1e-320, 1e-320, 1e-320, 1e-320])
     filter_.particles.log_weights[2] = -np.inf
     report = filter_.step(seen(STATE, [[0.3]], [[[0.01]]]))
-    assert np.isfinite(report.log_evidence)
-    assert np.isfinite(report.estimate.cov).all()
+    assert np.isfinite(report.log_evidence) and np.isfinite(report.estimate.cov).all()
     assert filter_.particles.weights[2] == 0.0
 
 

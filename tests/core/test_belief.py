@@ -81,8 +81,7 @@ def test_innovations_of_every_pair(rng):
     z = np.array([[3.0, 3.1], [2.0, -3.1]])
     noise = np.stack([np.diag([0.1, 0.2]), np.diag([0.3, 0.4])])
     nu, cov = belief.predictions(model, z, noise, np.array([2, 0]))
-    assert nu.shape == (N, 2, 2, 2)
-    assert cov.shape == (N, 2, 2, 2, 2)
+    assert nu.shape == (N, 2, 2, 2) and cov.shape == (N, 2, 2, 2, 2)
     for i, k, m in np.ndindex(N, 2, 2):
         landmark = records.mean[i, (2, 0)[m]]
         expected = model.residual(z[k], model.predict(belief.state[i], landmark))

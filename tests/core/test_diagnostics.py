@@ -50,8 +50,7 @@ def test_band_holds_as_much_as_it_says():
     band = chi_square_band(dof=3, runs=20, probability=0.9)
     means = np.random.default_rng(0).chisquare(3, size=(20_000, 20)).mean(axis=1)
     assert np.mean((means > band.low) & (means < band.high)) == pytest.approx(0.9, abs=0.01)
-    assert band.expected == 3.0
-    assert chi_square_band(dof=2).high == pytest.approx(chi2.ppf(0.975, 2))
+    assert band.expected == 3.0 and chi_square_band(dof=2).high == pytest.approx(chi2.ppf(0.975, 2))
 
 
 @pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
@@ -103,5 +102,4 @@ def test_ancestors_and_coalescence_follow_the_lineage():
         history.record(step, np.zeros((4, 3)), np.zeros(4))
     # the last generation descends from rows 0, 1, 2 of the third, those from 2 and 3 of the second, these from row 1
     np.testing.assert_array_equal(ancestors_by_step(history), [1, 2, 3, 3, 4])
-    assert coalescence_steps(history) == 4
-    assert coalescence_steps(History(Lineage(2))) is None
+    assert coalescence_steps(history) == 4 and coalescence_steps(History(Lineage(2))) is None

@@ -61,8 +61,7 @@ def test_states_history_clock_and_map_are_those_of_each_given_path():
 def test_one_state_serves_all_particles_and_steps_go_on_from_it():
     filter_, _ = followed(np.repeat(PATH[:, None], 3, axis=1), frames(np.random.default_rng(3))[:3])
     filter_.follow(np.array([9.0, 9.0]), Frame())
-    assert (filter_.particles.state == 9.0).all()
-    assert filter_.step(Frame()).stamp_ns == 4 * STEP
+    assert (filter_.particles.state == 9.0).all() and filter_.step(Frame()).stamp_ns == 4 * STEP
     assert np.abs(filter_.particles.state - 9.0).max() < 1.0
 
 

@@ -55,10 +55,8 @@ def test_counts_are_as_regular_as_each_scheme_promises(weights, seed):
 @given(weights=weight_vectors(), seed=st.integers(0, 2**32 - 1))
 def test_ancestors_are_ascending_and_alive(scheme, weights, seed):
     ancestors = scheme.ancestors(weights, np.random.default_rng(seed))
-    assert ancestors.shape == weights.shape
-    assert ancestors.dtype.kind == "i"
-    assert (np.diff(ancestors) >= 0).all()
-    assert (weights[ancestors] > 0).all()
+    assert ancestors.shape == weights.shape and ancestors.dtype.kind == "i"
+    assert (np.diff(ancestors) >= 0).all() and (weights[ancestors] > 0).all()
 
 
 class Extreme(np.random.Generator):

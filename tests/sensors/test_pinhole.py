@@ -106,15 +106,13 @@ def test_unproject_jacobian_is_the_derivative_and_the_inverse(camera):
 def test_other_ways_to_make_the_same_camera(camera):
     assert Pinhole.from_params(camera.width, camera.height, camera.params) == camera
     listed = replace(camera, distortion=list(camera.distortion))
-    assert listed == camera and hash(listed) == hash(camera)
-    assert pickle.loads(pickle.dumps(camera)) == camera
+    assert listed == camera and hash(listed) == hash(camera) and pickle.loads(pickle.dumps(camera)) == camera
 
 
 @every_camera
 def test_nothing_behind_or_beside_the_camera_is_visible(camera):
     behind = np.array([[0.0, 0.0, -1.0], [0.1, -0.2, -3.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -0.0]])
-    assert not camera.visible(behind).any()
-    assert not camera.visible(np.array([np.nan, 0.0, 1.0]))
+    assert not camera.visible(behind).any() and not camera.visible(np.array([np.nan, 0.0, 1.0]))
     assert camera.visible(np.array([0.0, 0.0, 1e-9]))
 
 
@@ -125,8 +123,7 @@ def test_the_edges_of_an_image():
     assert not camera.inside(corners + np.array([[-1e-9, 0.0], [0.0, 1e-9]])).any()
     assert camera.inside(np.array([[9.5, 9.5], [629.5, 469.5]]), margin_px=10.0).all()
     assert not camera.inside(np.array([[9.4, 100.0], [100.0, 469.6]]), margin_px=10.0).any()
-    assert camera.inside(np.array([-5.0, 10.0]), margin_px=-5.0)
-    assert not camera.inside(np.array([np.nan, 10.0]))
+    assert camera.inside(np.array([-5.0, 10.0]), margin_px=-5.0) and not camera.inside(np.array([np.nan, 10.0]))
 
 
 CAMERA = Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5)
@@ -186,8 +183,7 @@ def test_visible_in_both_images():
     # 0.6 m to the left at 1 m: u_left is 4.5, u_right is −58.5.
     points = np.array([[-0.6, 0.0, 1.0], [-0.4, 0.0, 1.0], [0.0, 0.0, -1.0], [0.7, 0.0, 1.0], [0.0, 0.6, 1.0]])
     np.testing.assert_array_equal(STEREO.visible(points), [False, True, False, False, False])
-    assert STEREO.camera.visible(points[0])
-    assert not STEREO.camera.visible(points[3])
+    assert STEREO.camera.visible(points[0]) and not STEREO.camera.visible(points[3])
     assert not STEREO.visible(points[1], margin_px=50.0)
     np.testing.assert_array_equal(STEREO.inside(STEREO.project(points[:2])), [False, True])
 
@@ -265,8 +261,7 @@ def ray(angle: float | np.ndarray, around: float = 0.7) -> np.ndarray:
 def test_it_sees_75_degrees_from_the_axis_and_no_more():
     camera = Pinhole(2000, 2000, 262.0, 262.0, 1000.0, 1000.0, (0.0, 0.0, 0.0, 0.0), "equidistant")
     near, beyond = ray(np.deg2rad(74.99)), ray(np.deg2rad([75.01, 80.0, 89.9, 90.0, 100.0]))
-    assert camera.visible(near)
-    assert not camera.visible(beyond).any()
+    assert camera.visible(near) and not camera.visible(beyond).any()
     assert np.isfinite(camera.unproject(camera.project(near))).all()
     assert np.isnan(camera.unproject(camera.project(beyond[:3]))).all()
     # The models of landmarks hold the depth positive from `MIN_DEPTH_FRACTION` on: there no pixel may still be taken for it.

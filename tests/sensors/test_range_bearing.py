@@ -96,8 +96,7 @@ def test_planar_measurement_by_hand():
 @given(st.floats(-50.0, 50.0))
 def test_wrapped_angles(angle):
     wrapped = wrap_angle(np.array(angle))
-    assert -np.pi <= wrapped < np.pi
-    assert np.abs(np.exp(1j * wrapped) - np.exp(1j * angle)) < 1e-13
+    assert -np.pi <= wrapped < np.pi and np.abs(np.exp(1j * wrapped) - np.exp(1j * angle)) < 1e-13
 
 
 @pytest.mark.parametrize("model", [RangeBearing(SE2), RangeBearing(SE3)], ids=["planar", "spatial"])
@@ -261,8 +260,10 @@ def test_odometry_may_claim_to_be_exact():
     points, names, step = rng.uniform(-5.0, 5.0, (6, 2)), np.arange(6), np.array([0.0, 0.1, 0.0])
     for t in range(20):
         z = points - [0.1 * t, 0.0] + rng.normal(0.0, 0.02, (6, 2))
-        odometry = Odometry(step, np.zeros((3, 3))) if t else None
-        pose = slam.track(z, np.tile(4e-4 * np.eye(2), (6, 1, 1)), names, odometry).pose
+        odometry = Odometry(step.tolist(), np.zeros((3, 3)).tolist()) if t else None  # lists are taken, too
+        pose = slam.track(z.tolist(), np.tile(4e-4 * np.eye(2), (6, 1, 1)), names.tolist(), odometry).pose
     np.testing.assert_allclose(pose, 19 * step, atol=1e-6)
-    with pytest.raises(InputError, match="holds NaN"):
+    with pytest.raises(InputError, match="the array delta must hold finite numbers"):
         slam.track(z, np.tile(4e-4 * np.eye(2), (6, 1, 1)), names, Odometry(step * np.nan, np.zeros((3, 3))))
+    with pytest.raises(InputError, match="odometry must be an Odometry with delta and cov, got a tuple"):
+        slam.track([], [], [], (step, np.zeros((3, 3))))  # type: ignore[arg-type]

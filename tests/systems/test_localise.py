@@ -36,8 +36,7 @@ def localised(mapped):
 
 
 def test_the_map_is_that_of_the_run(mapped):
-    assert mapped.names.size >= 15 and mapped.alignment == "none"
-    assert mapped.views.shape[0] == 16
+    assert mapped.names.size >= 15 and mapped.alignment == "none" and mapped.views.shape[0] == 16
     # A landmark projects, from where it was seen first, to where it was seen first.
     seen = SE3.inverse_transform(mapped.first_pose, mapped.positions)
     error = np.linalg.norm(CAMERA.project(seen) - mapped.first_px, axis=1)
@@ -45,8 +44,7 @@ def test_the_map_is_that_of_the_run(mapped):
 
 
 def test_the_camera_is_found_at_once_and_followed(localised):
-    assert not localised.log.lost().any()
-    assert localised.messages[0] == "frame 0: the camera is found in the map"
+    assert not localised.log.lost().any() and localised.messages[0] == "frame 0: the camera is found in the map"
     assert np.flatnonzero(localised.log["relocalised"]).tolist() == []
     truth = path(FRAMES)[MAPPED:]
     error = np.linalg.norm(localised.log.poses[:, 4:] - truth[:, 4:], axis=1)

@@ -42,8 +42,7 @@ def test_images_from_anywhere_give_the_bytes_of_a_run_over_a_recording():
     for frame in images(10):
         buffer[:] = frame.image
         log.append(slam.track(buffer, frame.stamp_ns), 0.0)
-    assert log.poses.tobytes() == run.log.poses.tobytes()
-    assert log.covs.tobytes() == run.log.covs.tobytes()
+    assert log.poses.tobytes() == run.log.poses.tobytes() and log.covs.tobytes() == run.log.covs.tobytes()
     for name in ("searched", "found", "ess", "log_evidence", "nis"):
         np.testing.assert_array_equal(log[name], run.log[name])
 
@@ -123,8 +122,7 @@ def test_a_kind_of_feature_of_ones_own():
         slam = MonoSlam(CAMERA, config, unknown_depth=kind)
         slam.take(images(1)[0])
         belief = slam.filter.belief()
-        assert (belief.read(belief.map.ids).mean[..., 2] == rho).all()
-        assert slam.map().is_ray().all()
+        assert (belief.read(belief.map.ids).mean[..., 2] == rho).all() and slam.map().is_ray().all()
 
 
 def test_what_a_system_refuses():

@@ -44,11 +44,9 @@ def chosen(found: list[MotionEstimate], support=(0.0, 0.0, 0.0), informed: bool 
 
 def test_the_group_that_is_the_camera():
     # Where nothing is known the many.
-    assert chosen(candidates(20, 30)) == 1
-    assert chosen(candidates(30, 20)) == 0
+    assert chosen(candidates(20, 30)) == 1 and chosen(candidates(30, 20)) == 0
     # Three standard deviations of a velocity that was measured are exp(4.5) = 90 to one; twice as many do not make up for it.
-    assert chosen(candidates(20, 40), informed=True) == 0
-    assert chosen(candidates(20, 40), informed=False) == 1
+    assert chosen(candidates(20, 40), informed=True) == 0 and chosen(candidates(20, 40), informed=False) == 1
     assert chosen(candidates(2, 400), informed=True) == 1
     # Landmarks that no motion explains, and a wide prior does: as likely as one match more, whatever was expected.
     assert chosen(candidates(10, 200), (0.0, 0.0, np.log(201) + 0.1)) == -1

@@ -85,12 +85,10 @@ def test_recovers_after_a_blackout(tracked, tmp_path):
         return np.zeros_like(image) if START <= t < START + DARK else image
 
     run = resumed(tracked, tmp_path, dark)
-    assert run.log.lost()[START + 3 : START + DARK].all()
-    assert not run.log.lost()[START + DARK + 3 :].any()
+    assert run.log.lost()[START + 3 : START + DARK].all() and not run.log.lost()[START + DARK + 3 :].any()
     assert len(np.flatnonzero(run.log["relocalised"]).tolist()) == 1
     assert any("lost" in problem for problem in run.messages)
-    assert sum("shows nothing" in problem for problem in run.messages) == 1
-    assert errors(run)[-10:].max() < 0.03
+    assert sum("shows nothing" in problem for problem in run.messages) == 1 and errors(run)[-10:].max() < 0.03
     assert np.trace(run.log.covs[START + DARK - 1][3:, 3:]) > np.trace(run.log.covs[START][3:, 3:])
 
 
@@ -99,8 +97,7 @@ def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
     other = Pictures(texture(seed=7), path(FRAMES), lambda t, image: image)
     images = {t: frame.image for t, frame in enumerate(other.frames(0))}
     run = resumed(tracked, tmp_path, lambda t, image: images[t] if t >= START else image)
-    assert run.log.lost()[START + 3 :].all()
-    assert not np.flatnonzero(run.log["relocalised"]).tolist()
+    assert run.log.lost()[START + 3 :].all() and not np.flatnonzero(run.log["relocalised"]).tolist()
     last = SE3.translation(run.log.poses[START - 1])
     assert np.linalg.norm(SE3.translation(run.log.poses[-1]) - last) < 0.1
 
@@ -174,8 +171,7 @@ def test_corners_are_found_again_on_their_lines(last, motion):
 
 def test_where_the_last_view_is_not_seen_again(last):
     """In another place, without landmarks in view, which tell the depth, and where it has no corners."""
-    assert matched(last, view(texture(seed=7), HERE)) is None
-    assert matched(last, GREY) is None
+    assert matched(last, view(texture(seed=7), HERE)) is None and matched(last, GREY) is None
     assert matched(last, view(texture(), HERE), np.array([[0.0, 0.0, -3.0]])) is None
     assert matched(LastView(SENSOR, GREY, HERE, RECOVERY), view(texture(), HERE)) is None
 
@@ -186,6 +182,5 @@ def test_few_landmarks_are_enough_where_most_corners_agree():
     assert not is_confirmed(few - 1, 100, 100, RECOVERY)  # these give the scale
     assert not is_confirmed(30, 60, 100, RECOVERY)  # most show another motion
     assert not is_confirmed(30, MIN_VIEW_CORNERS - 1, MIN_VIEW_CORNERS - 1, RECOVERY)
-    assert most_agree(np.arange(100) < 90)
-    assert not most_agree(np.arange(100) < 60)
+    assert most_agree(np.arange(100) < 90) and not most_agree(np.arange(100) < 60)
     assert not most_agree(np.ones(MIN_VIEW_CORNERS - 1, dtype=bool))

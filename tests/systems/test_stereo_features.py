@@ -74,10 +74,8 @@ def test_beside_the_batch(log, run):
     batch = solve_features(log, InitialEstimate(run.log.poses, {}), marginals=False).world_from_body
     batch = SE3.between(batch[0], batch)
     ours, best, alone = (rmse(log, poses) for poses in (run.log.poses, batch, run.log["odometry"]))
-    assert ours < 2.5 * best
-    assert ours < 0.8 * alone
-    assert np.isfinite(run.log["log_evidence"]).all()
-    assert run.system.map().ids.size > 100
+    assert ours < 2.5 * best and ours < 0.8 * alone
+    assert np.isfinite(run.log["log_evidence"]).all() and run.system.map().ids.size > 100
 
 
 def test_what_was_measured_is_told_as_it_came(log, run):
@@ -107,8 +105,7 @@ def test_nees_of_the_pose():
     for config in (once, twice, JOINT):
         nees.append(np.mean([nees_of(filtered(log, config)) for log in logs]))
     assert 0.75 < nees[0] < 1.25  # 1.20 with a standard error of 0.10
-    assert nees[1] > 1.2 * nees[0]
-    assert 0.75 < nees[2] < 1.25
+    assert nees[1] > 1.2 * nees[0] and 0.75 < nees[2] < 1.25
 
 
 def test_a_loop_closes_on_landmarks_of_old_sub_maps():
@@ -124,8 +121,7 @@ def test_a_loop_closes_on_landmarks_of_old_sub_maps():
     assert off[1][-40:].mean() < 0.5 * off[1][20:60].max()
     ours, whole = (run.system.map().named() for run in runs[::-1])
     assert ours.keys() == whole.keys() and max(sizes[120:]) < 60 < len(ours)
-    assert len(runs[1].system.joint.old.maps) > 5
-    assert nees_of(runs[1]) < 2.0
+    assert len(runs[1].system.joint.old.maps) > 5 and nees_of(runs[1]) < 2.0
 
 
 def test_wrong_pixels_in_a_joint_map():
@@ -209,8 +205,7 @@ def test_found_again_by_what_was_put_away(log):
         told = slam.take(frame)
         poses.append(told.pose)
         messages += told.messages
-    assert any("found again by" in message for message in messages)
-    assert rmse(log, np.array(poses)) < 0.05
+    assert any("found again by" in message for message in messages) and rmse(log, np.array(poses)) < 0.05
 
 
 def test_found_again_by_names(log):

@@ -39,16 +39,13 @@ class TestPath:
     def test_the_path(self, plain):
         """The camera goes 17 cm; an error of the pixels of 0.1 px at 1.5 m is 0.6 mm."""
         assert plain.messages == [] and plain.failure is None
-        assert np.linalg.norm(SE3.translation(plain.log.poses[-1])) > 0.08
-        assert rms_m(plain.log.poses) < 0.003
-        assert rms_m(plain.log["odometry"]) < 0.004
-        assert np.all(plain.log.covs[-1].diagonal() > 0.0)
+        assert np.linalg.norm(SE3.translation(plain.log.poses[-1])) > 0.08 and rms_m(plain.log.poses) < 0.003
+        assert rms_m(plain.log["odometry"]) < 0.004 and np.all(plain.log.covs[-1].diagonal() > 0.0)
         assert set(plain.log.states) == {TrackingState.TRACKED}
 
     def test_landmarks_are_found_again(self, plain):
         manager, found = plain.system.front_end.landmarks.manager, plain.system.map()
-        assert manager.confirmed.sum() > 15
-        assert plain.log["observed"][3:].mean() > 10
+        assert manager.confirmed.sum() > 15 and plain.log["observed"][3:].mean() > 10
         assert (~manager.confirmed).sum() <= CONFIG.new_landmarks.max_candidates
         np.testing.assert_array_equal(manager.names, found.ids)
         np.testing.assert_array_equal(found.columns["landmark"], manager.confirmed)
@@ -60,8 +57,7 @@ class TestPath:
         points = SE3.transform(pairs(COUNT).truth.poses[0], found.mean[often])
         side, down = points[:, 0] / 0.004, points[:, 1] / (0.004 * np.cos(0.35))
         off = points[:, 2] - (1.5 + down * 0.004 * np.sin(0.35) + 0.3 * side * 0.004)
-        assert often.sum() > 10
-        assert np.median(np.abs(off)) < 0.01
+        assert often.sum() > 10 and np.median(np.abs(off)) < 0.01
 
     def test_between_updates_the_odometry_moves_the_estimate(self):
         run = filtered(pairs(COUNT), replace(CONFIG, trigger=TriggerConfig(0.03, 1.0)))
@@ -127,8 +123,7 @@ class TestBadPairs:
             filtered(pairs(3, lambda t, frame: swapped(frame)), CONFIG)
         run = filtered(pairs(4, lambda t, frame: swapped(frame) if t == 2 else frame), CONFIG)
         assert run.failure is not None and run.failure.startswith("pair 2 of plane: ")
-        assert "swapped" in run.failure
-        assert len(run.log) == 2
+        assert "swapped" in run.failure and len(run.log) == 2
 
 
 class TestParts:
@@ -198,8 +193,7 @@ def settled(keypoints_once: None) -> StereoSlam:
 def test_found_again(found):
     """It errs by centimetres and says how much it may err; the first sharp pair mends it."""
     log, error = found.log, off_m(found)
-    assert error[SHARP - 1] > 3.0 * RIGHT_M
-    assert error[SHARP:].max() < RIGHT_M
+    assert error[SHARP - 1] > 3.0 * RIGHT_M and error[SHARP:].max() < RIGHT_M
     assert not log["updated"][FIRST:SHARP].any() and log["updated"][SHARP]
     std = np.sqrt(np.trace(log.covs[:, 3:, 3:], axis1=1, axis2=2))
     assert std[SHARP - 1] > 0.5 * error[SHARP - 1] and std[SHARP] < RIGHT_M

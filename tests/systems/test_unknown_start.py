@@ -209,8 +209,7 @@ def test_a_camera_that_seems_to_stand_still_is_found_to_have_moved():
     window, truth = scene()
     still = np.broadcast_to(SE3.identity(), truth.path.shape).copy()
     best = optimum(window, EXPECTED, Structure(still, truth.direction, np.full(FEATURES, 0.8)))  # all equally far
-    assert best is not None
-    assert best.cost <= Linearised(window, EXPECTED, truth).cost
+    assert best is not None and best.cost <= Linearised(window, EXPECTED, truth).cost
     assert best.structure.inverse.mean() == pytest.approx(0.8, abs=0.8 * 5.0 * SCALE_STD)
     off = SE3.local(best.structure.path[1:], truth.path[1:]).ravel()
     cov = np.linalg.inv(best.information)[: off.size, : off.size]

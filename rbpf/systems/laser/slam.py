@@ -101,12 +101,9 @@ class LaserSlam(Kept, System):
         Raises InputError: time runs backwards, the numbers of readings and beams differ, or the map outgrows the memory.
         """
         previous, last_ns = self._stamp_ns, self.filter.stamp_ns
-        stamp_ns = previous + 1_000_000_000 if stamp_ns is None else int(stamp_ns)
-        begun = previous >= 0
-        if begun and stamp_ns < previous:
-            raise InputError(f"time runs backwards: a scan has stamp {stamp_ns} ns after {previous} ns")
+        stamp_ns = self.checked_stamp(previous + 1_000_000_000 if stamp_ns is None else stamp_ns, previous)
         beams, messages = self.scanner.beams(ranges, self.config.correlation_m), list[str]()
-        self._move(odometry, (stamp_ns - previous) * 1e-9 if begun else 0.0, messages)
+        self._move(odometry, (stamp_ns - previous) * 1e-9 if previous >= 0 else 0.0, messages)
         self._stamp_ns = stamp_ns
 
         # Use the scan if it has enough returns and the robot has moved.

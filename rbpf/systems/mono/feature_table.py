@@ -3,7 +3,7 @@
 These are common to all particles. A feature's number is its row here, in all reports of a run.
 """
 
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -59,6 +59,10 @@ class FeatureTable:
     def __init__(self) -> None:
         self._room: dict[str, np.ndarray] = {name: entry.empty() for name, entry in _COLUMNS.items()}
         self._use(0)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._use(len(self.alive))  # columns of a copy, too, are views
 
     def __len__(self) -> int:
         return len(self.alive)

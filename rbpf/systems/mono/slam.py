@@ -167,14 +167,11 @@ class MonoSlam(System):
             self._add_points(known_map.points)
             appearances = known_map.windows, known_map.first_px, known_map.first_pose
             self.sensor.begin_lost(*appearances, known_map.positions)
-            self.loss = TrackingLoss(self.sensor, config, known_map.views, known_map.size_m)
-        else:
-            self.loss = TrackingLoss(self.sensor, config)
+        views = () if known_map is None else (known_map.views, known_map.size_m)
+        self.loss = TrackingLoss(self.sensor, config, *views)
         self.place_recognition = PlaceRecognition(self.loss.relocaliser, config)
         is_unknown = points is None and wrapped is None
-        self.start = UnknownStart(
-            config, self.features, self.first, lambda: self._new_filter(self.features), is_unknown
-        )
+        self.start = UnknownStart(config, self.features, self.first, self._new_filter, is_unknown)
         self.gauge: Gauge = "none"
         if known_map is not None:
             self.gauge = known_map.alignment
@@ -201,9 +198,8 @@ class MonoSlam(System):
 
     def take(self, frame: ImageFrame | FeatureFrame) -> Tracked:
         """Processes a frame, an image or named features; errors as of `track`."""
-        before, stamp_ns = self.filter.stamp_ns, int(frame.stamp_ns)
-        if before is not None and stamp_ns < before:
-            raise InputError(f"time runs backwards: a frame at {stamp_ns} ns after one at {before} ns")
+        last_ns = self.loss.stamp_ns if self.filter.stamp_ns is None else self.filter.stamp_ns
+        stamp_ns = self.checked_stamp(frame.stamp_ns, last_ns)
         started = time.perf_counter()
         sensor, messages = self.sensor, list[str]()
         was_lost, never_found, first_new = sensor.lost, self.loss.never_found, len(sensor.table)
@@ -232,16 +228,17 @@ class MonoSlam(System):
         # 2. The first frame initialises the known points.
         prior: PosePrior | None = None
         if not self.filter.steps:
-            self.loss.stamp_ns = stamp_ns
             if is_empty and isinstance(self.known, KnownPixels):
                 # Before the first usable image the camera is around the pose resected from them.
                 assert self._start is not None
+                self.loss.stamp_ns = stamp_ns
                 pose, cov = self._start.world_from_camera, self.config.start_cov()
                 values = {column.name: column.kind(0) for column in self.columns}
                 messages.append("the run starts with the first image that shows the known points")
                 waiting = TrackingState.INITIALISING, values | {"ess": float(self.config.particles)}
                 return Tracked(stamp_ns, pose, cov, *waiting, self._nothing(), tuple(messages))
             measured, prior = self._begin(measured)
+            self.loss.stamp_ns = stamp_ns
 
         # 3. Pose prior: by the motion model, unless nothing has been observed yet or the camera is lost.
         self.attempt = None

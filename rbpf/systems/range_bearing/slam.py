@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rbpf.core.checkpoint import elements, integers, read_one
+from rbpf.core.checkpoint import elements, integers, numbers, read_one, taken
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
@@ -63,12 +64,10 @@ class RangeBearingSlam(System):
         self.robot_from_sensor = space.identity() if robot_from_sensor is None else robot_from_sensor
         unknown = config.unknown
         max_range = np.inf if unknown.max_range_m is None else unknown.max_range_m
-        self.model: RigidPointModel
+        mount, view = self.robot_from_sensor, np.deg2rad(unknown.half_field_of_view_deg)
+        self.model: RigidPointModel = RangeBearing(space, mount, pitch_sign, max_range, view)
         if measurement == "position":
-            self.model = RelativePosition(space, self.robot_from_sensor, max_range)
-        else:
-            view = np.deg2rad(unknown.half_field_of_view_deg)
-            self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
+            self.model = RelativePosition(space, mount, max_range)
         self.point = Point(space.point_dim)
         self.kept_map, self.why_map = config.kept_map()
         is_joint, is_unnamed = self.kept_map == "joint", config.association == "ml"
@@ -80,11 +79,9 @@ class RangeBearingSlam(System):
         landmark_map: JointMap | LandmarkMap
         self.calibration = calibration = RobotCalibration(config, space, self.model, is_joint and not is_unnamed)
         if is_joint:
+            common = space, calibration.prior, config.compiled, config.submap
             unnamed = is_unnamed and config.submap is not None
-            prior = calibration.prior
-            landmark_map = JointMap(
-                space, prior, config.compiled, config.submap, unnamed=unnamed, constants=calibration.learnt.size
-            )
+            landmark_map = JointMap(*common, unnamed=unnamed, constants=calibration.learnt.size)
         else:
             landmark_map = LandmarkMap(space, compiled=config.compiled)
             landmark_map.register(self.point)
@@ -92,9 +89,7 @@ class RangeBearingSlam(System):
         self.sensor = sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
         motion = OdometryMotion(space, constants=calibration.learnt.size)
         self.filter = self.new_filter(motion, sensor, [landmark_map], config.proposal.build(), config.window)
-        self.hypotheses: Hypotheses | None = None
-        if is_unnamed:
-            self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations)
+        self.hypotheses = Hypotheses(self.filter, self.model, unknown, keep_associations) if is_unnamed else None
         self._odometry = space.identity()
         d, e, p = space.dim, space.size, self.model.dim
         self.columns = (
@@ -120,14 +115,13 @@ class RangeBearingSlam(System):
     ) -> "RangeBearingSlam":
         """The system for the robot and the sensor of a log."""
         kind: Kind = "position" if log.measurement == "position" else "range_bearing"
-        mount, sign = log.robot_from_sensor, log.pitch_sign
-        return cls(config, log.space, kind, mount, sign, keep_associations, log.misread)
+        return cls(config, log.space, kind, log.robot_from_sensor, log.pitch_sign, keep_associations, log.misread)
 
     def track(
         self,
-        z: np.ndarray,
-        cov_z: np.ndarray,
-        landmarks: np.ndarray | None = None,
+        z: ArrayLike,
+        cov_z: ArrayLike,
+        landmarks: ArrayLike | None = None,
         odometry: Odometry | None = None,
         stamp_ns: int | None = None,
     ) -> Tracked:
@@ -140,9 +134,22 @@ class RangeBearingSlam(System):
             odometry: motion since the last step; None in the first one.
             stamp_ns: time; by default one second after the last step.
 
-        Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
+        Raises InputError: time runs backwards, a type or a shape does not fit, a number is not finite, a name is not a whole
+        number from 0 up, or no particle explains the observations.
         """
-        names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
+        if stamp_ns is not None:
+            stamp_ns = self.checked_stamp(stamp_ns, self.filter.stamp_ns)
+        d, e, p = self.space.dim, self.space.size, self.model.dim
+        shapes = {"z": numbers("K", p), "cov_z": numbers("K", p, p)}
+        z, cov_z = taken("the step", {"z": z, "cov_z": cov_z}, shapes).values()
+        named = {"landmarks": np.full(len(z), NULL) if landmarks is None else landmarks}
+        least = 0 if self.hypotheses is None else NULL
+        (names,) = taken("the step", named, {"landmarks": integers(len(z), least=least)}).values()
+        if odometry is not None:
+            if not isinstance(odometry, Odometry):
+                raise InputError(f"odometry must be an Odometry with delta and cov, got a {type(odometry).__name__}")
+            motion = taken("the odometry", vars(odometry), {"delta": numbers(e), "cov": numbers(d, d)})
+            odometry = replace(odometry, **motion)
         self.sensor.model, odometry = self.calibration.tuned(self.filter), self.calibration.driven(odometry)
         if self.hypotheses is None:
             report = self.filter.step(FeatureFrame(stamp_ns or 0, names, z, cov_z), odometry, stamp_ns)
@@ -166,7 +173,6 @@ class RangeBearingSlam(System):
         if self.joint is not None and self.joint.old.maps:
             # A landmark re-initialised by a new sub-map has been measured before, which its density does not include.
             report = replace(report, log_evidence=np.nan)
-        d, e = self.space.dim, self.space.size
         return Tracked(
             report.stamp_ns,
             estimate.mean,
@@ -186,9 +192,8 @@ class RangeBearingSlam(System):
         )
 
     def take(self, frame: Frame) -> Tracked:
-        odometry = None
-        if frame.delta is not None and frame.cov_delta is not None:
-            odometry = Odometry(frame.delta, frame.cov_delta)
+        delta, cov = frame.delta, frame.cov_delta
+        odometry = None if delta is None or cov is None else Odometry(delta, cov)
         return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
 
     def map(self) -> MapEstimate:

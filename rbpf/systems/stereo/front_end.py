@@ -156,7 +156,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         if features is None:
             nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
             descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
-            features = StereoFeatures.measured(self.rig, *nothing, descriptors)
+            return self.pair(frame.stamp_ns, StereoFeatures.measured(self.rig, *nothing, descriptors)), problem
         pair = self.pair(frame.stamp_ns, features)
         return replace(pair, images=self.matcher.images, offset_px=self.matcher.offset_px), problem
 

@@ -56,7 +56,7 @@ from rbpf.systems.system import (
 )
 
 _STEREO = {
-    "frames": integers(2, least=0),
+    "frames": integers(3, least=0),
     "at_update": poses(),
     "cov_at_update": numbers(6, 6),
     "since_update": poses(),
@@ -140,10 +140,8 @@ class StereoSlam(System):
                     f"map.kind=joint needs a likelihood that is a density, and likelihood.kind={config.likelihood.kind} is "
                     "none: set likelihood.kind=student, or map.kind=particles"
                 )
-            joint = JointMap(
-                SE3, self._calibration.prior, config.compiled, config.map.submap, passed_on=True,
-                constants=int(self._calibration.is_held),
-            )  # fmt: skip
+            options: dict[str, Any] = {"passed_on": True, "constants": int(self._calibration.is_held)}
+            joint = JointMap(SE3, self._calibration.prior, config.compiled, config.map.submap, **options)
         self._once = joint is not None or config.odometry.role == "proposal"
         self._proposal = ProposalConfig("ekf", 1) if joint else config.proposal
         refined = joint is not None or (config.proposal.kind == "ekf" and config.map.weigh == "all")
@@ -162,7 +160,7 @@ class StereoSlam(System):
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
         #: motion from the filter's last update to the last pair, including assumed motions.
         self.since_update = SE3.identity()
-        self._last_update = 0
+        self._last_update, self._last_ns = 0, 0  # of `frames`, and time of the last one
         self._kept: Pair[Any] | None = None
         # Decaying counts of negative-disparity matches and of all; whether the warning was given.
         self._impossible, self._doubted = np.zeros(2), False
@@ -183,8 +181,8 @@ class StereoSlam(System):
         """`track` with a frame of a recording, an `ImageFrame`, or another one that the front end takes."""
         started, front_end = time.perf_counter(), self.front_end
         if not isinstance(frame, front_end.takes):
-            taken = front_end.takes.__name__
-            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {taken} here")
+            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {front_end.takes.__name__}")
+        frame = replace(frame, stamp_ns=self.checked_stamp(frame.stamp_ns))
         # The first frame must fit the cameras.
         if not self.frames and (refusal := front_end.refusal(frame)):
             raise InputError(refusal)
@@ -197,8 +195,7 @@ class StereoSlam(System):
 
         # 2. Estimate the motion since the last measured pair; with too few features predict it.
         dt, least = self.reckoning.seconds(pair.stamp_ns), config.odometry.estimate.min_matches
-        if dt < 0.0:
-            raise InputError(f"time runs backwards: a pair has the stamp {stamp_ns} ns, the last one a later one")
+        last_ns = self.checked_stamp(pair.stamp_ns, self._last_ns)
         measured = len(pair) >= least and dt > 0.0
         if measured:
             pair, motion = self._motion_to(pair, dt)
@@ -207,10 +204,8 @@ class StereoSlam(System):
             self._doubted |= bool(doubt)
             messages += filter(None, (problem, doubt, motion.message))
         else:
-            few = "it has the stamp of the last one"
-            if dt > 0.0:
-                few = f"it shows {len(pair)} features, {least} are needed"
-            why = f"{problem}; {few}" if problem and len(pair) else problem or few
+            few = f"it shows {len(pair)} features, {least} are needed" if dt > 0 else "it has the stamp of the last one"
+            why = f"{few}; {problem}" if problem and (len(pair) or pair.images) else problem or few
             expected = last = self.reckoning
             then = "the world begins with the first pair that is measured"
             if last.stamp_ns is not None:  # the next pair has the same reference pair
@@ -260,7 +255,7 @@ class StereoSlam(System):
                 left_over[landmarks.ids != NULL] = 0.0
                 self.reckoning = replace(self.reckoning, left_over=left_over)
             self._kept = replace(pair, features=features, images=None, labels=motion.labelled(len(pair), static))
-        self.frames += 1
+        self.frames, self._last_ns = self.frames + 1, last_ns
 
         # 5. Report: between updates the pose is extrapolated by the odometry.
         pose, cov = self.at_update.mean, self.at_update.cov
@@ -357,7 +352,7 @@ class StereoSlam(System):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The last measured pair, the landmarks' descriptors or names, and the odometry."""
-        frames, doubted = np.array([self.frames, self._last_update]), np.array(self._doubted)
+        frames, doubted = np.array([self.frames, self._last_update, self._last_ns]), np.array(self._doubted)
         own = frames, self.at_update.mean, self.at_update.cov, self.since_update, self._impossible, doubted
         return {
             **({} if self._kept is None else self.front_end.arrays(self._kept)),
@@ -369,7 +364,7 @@ class StereoSlam(System):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         found = read(arrays, _STEREO, "stereo/")
-        self.frames, self._last_update = found["frames"].tolist()
+        self.frames, self._last_update, self._last_ns = found["frames"].tolist()
         self.at_update = Estimate(found["at_update"], found["cov_at_update"])
         self.since_update = found["since_update"]
         self._impossible, self._doubted = found["impossible"], bool(found["doubted"])

@@ -15,6 +15,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import Kept, integers, numbers, truths
 from rbpf.core.filter import Filter
+from rbpf.core.models import Sensor
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
@@ -36,7 +37,7 @@ DISCONNECTED = (
 class UnknownStart(Kept):
     """Adjusts the first frames when it is due, and resamples the particles.
 
-    `new_filter` creates a filter without a past, with `features` as its sensor; `needed`: the run starts without known points
+    `new_filter` creates a filter without a past for a sensor, here `features`; `needed`: the run starts without known points
     and without a map.
     """
 
@@ -53,7 +54,7 @@ class UnknownStart(Kept):
         config: MonoConfig,
         features: FeatureSensor,
         first: FirstFrames,
-        new_filter: Callable[[], Filter],
+        new_filter: Callable[[Sensor], Filter],
         needed: bool,
     ) -> None:
         self.config, self.features, self.first, self.new_filter = config, features, first, new_filter
@@ -125,7 +126,7 @@ class UnknownStart(Kept):
 
     def _along(self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]) -> Filter:
         """A filter run along paths (T, N, 7), with the observations of the frames from which they were drawn."""
-        new = self.new_filter()
+        new = self.new_filter(self.features)
         new.rng, new.log_evidence = old.rng, old.log_evidence
         at_rest = PosePrior(SE3.identity(), np.zeros((6, 6)), self.config.velocity.start_std())
         first = min(steps)
