@@ -93,6 +93,13 @@ def test_recovers_after_a_blackout(tracked, tmp_path):
 
 
 @slow
+def test_the_map_keeps_its_frame_in_the_dark(tracked, tmp_path):
+    run = resumed(tracked, tmp_path, lambda t, image: np.zeros_like(image) if t >= START else image)
+    joint = run.system.filter.belief().map
+    assert np.sqrt(np.diagonal(joint.cov)[:3]).max() < 0.03  # rad, of the frame's rotation
+
+
+@slow
 def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
     other = Pictures(texture(seed=7), path(FRAMES), lambda t, image: image)
     images = {t: frame.image for t, frame in enumerate(other.frames(0))}
