@@ -15,7 +15,7 @@ import numpy as np
 from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.files import GRID
+from rbpf.runs.files import BATCH, GRID
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH
@@ -212,8 +212,8 @@ def error_figure(found: RunFolder) -> Any | None:
     unit, word = (1e3, "mm") if np.abs(error).max(initial=0.0) < 1.0 else (1.0, "m")
     figure, panels = stacked_axes(len(used), f"{found.name}: error of the position, {name}")
     batch = None
-    if (found.folder / "batch.tum").is_file():
-        batch, true = associate(read_tum(found.folder / "batch.tum"), reference, 0)
+    if (found.folder / BATCH).is_file():
+        batch, true = associate(read_tum(found.folder / BATCH), reference, 0)
         at_batch = np.searchsorted(path.stamps_ns, true.stamps_ns)
         batch_error = fit(how, batch.positions, true.positions).transform(batch.positions) - true.positions
     lost = lost_frames(found)

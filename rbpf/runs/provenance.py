@@ -20,7 +20,7 @@ from rbpf.systems.settings import HEADER
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"  #: Libraries whose version may change a run's results.
-_FILES = "recording", "known_points", "calibration", "known_map"  #: Entries that name input files or folders.
+INPUTS = "recording", "known_points", "calibration", "known_map"  #: Entries that name input files or folders.
 _FLAGS = ("localize",)
 _OUTPUTS = "video", "batch"  #: Optional outputs of a run.
 _HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
@@ -49,7 +49,7 @@ def require_own_version(config: Mapping[str, Any], folder: Path) -> None:
 
 def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
     """Writes config.yaml: everything that is needed to repeat a run; `recording` is one of its sources."""
-    digest = digest_of({name: Path(str(sources[name])) for name in _FILES if name in sources}, out)
+    digest = digest_of({name: Path(str(sources[name])) for name in INPUTS if name in sources}, out)
     head = {"rbpf": __version__, "system": system, **sources}
     if digest is not None:
         head["input_sha256"] = digest
@@ -114,7 +114,7 @@ def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for name, value in sources.items():
         path = Path(str(value))
-        if name not in _FILES:
+        if name not in INPUTS:
             found[name] = json.dumps(value)
         elif path.resolve() != out.resolve():
             digest = digest_of({name: path}, out)
@@ -148,7 +148,7 @@ def read_origin(config: Path) -> list[str]:
     require_own_version(entries, config.parent)
     if "recording" not in entries:
         raise InputError(f"{config} names no recording: it is no run's, give it with --config instead")
-    files = {name: Path(str(entries[name])) for name in _FILES if name in entries}
+    files = {name: Path(str(entries[name])) for name in INPUTS if name in entries}
     for name, path in files.items():
         if not path.exists():
             raise InputError(f"{config}: its {name} {path} is not there: repeat from the folder the run was started in")

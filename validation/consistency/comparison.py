@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.runs.files import write_text
+from rbpf.runs.files import COMPARISON, write_text
 from rbpf.runs.plots import lost_frames
 from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, NOISE_FACTOR, Statistic, motion_statistics, step_ratio
@@ -24,7 +24,6 @@ from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, NOISE_FACTOR, 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 #: By system, where its configuration holds the one standard deviation of all measurements, px.
 SETTINGS = {"mono": ("search", "noise_px")}
-COMPARISON = "validation_"  #: What the names of their files begin with.
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from matplotlib.colors import to_hex
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs import plots
-from rbpf.runs.files import GRID, write_text
+from rbpf.runs.files import GRID, PAGE, VIDEO, write_text
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import SYSTEMS
@@ -31,8 +31,6 @@ from rbpf.systems.settings import defaults_of
 from rbpf.validation.consistency import comparison as verdicts
 from rbpf.validation.consistency.comparison import Comparison, Verdict
 
-PAGE = "report.html"
-VIDEO = "annotated.mp4"
 _TITLES = {
     "groundtruth": "Against the ground truth", "gtsam": "Against the batch optimum", "colmap": "Against COLMAP",
     "itself": "Innovations", "relations": "Against known relations", "path": "Against another path",
