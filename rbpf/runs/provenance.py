@@ -14,7 +14,7 @@ import yaml
 
 from rbpf import __version__
 from rbpf.errors import InputError
-from rbpf.runs.files import write_text
+from rbpf.runs.files import holds_run, write_text
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
 from rbpf.systems.settings import HEADER
 
@@ -74,16 +74,16 @@ def instruction_set() -> str:
 def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str | None:
     """SHA-256 over names and contents of all input files; None if one is missing.
 
-    Files in the folder `without`, such as the run's own inside its recording, are excluded.
+    The folder `without`, such as the run's own, and other runs' folders inside a recording are excluded.
     """
     whole = hashlib.sha256()
     for name, path in sorted(sources.items()):
         if not path.exists():
             return None
         whole.update(f"{name}\n".encode())
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-        if without is not None and path.is_dir() and without.resolve() != path.resolve():
-            files = [file for file in files if not file.resolve().is_relative_to(without.resolve())]
+        inside, own = sorted(path.rglob("*")), None if without is None else without.resolve()
+        runs = {place for place in inside if place.is_dir() and (holds_run(place) or place.resolve() == own)}
+        files = [path] if path.is_file() else [f for f in inside if f.is_file() and runs.isdisjoint(f.parents)]
         for file in files:
             relative = "" if path.is_file() else file.relative_to(path).as_posix()
             whole.update(f"{relative}\n{file.stat().st_size}\n".encode())

@@ -133,9 +133,10 @@ def test_a_run_goes_on_with_what_it_began_with(began, log, tmp_path, capsys, spo
 
 
 def test_a_run_goes_on_with_what_cannot_change_its_results(began, log, tmp_path):
-    """Other checkpoints, other threads, another place of the same recording."""
+    """Other checkpoints, other threads, another place of the same recording, another run in it."""
     shutil.copytree(began, tmp_path / "run")
     shutil.copytree(log, tmp_path / "moved")
+    shutil.copytree(began, tmp_path / "moved" / "run-2")
     changed = ["--set", "checkpoint_every=7", "--threads", "1", "--resume"]
     assert run(tmp_path / "moved", tmp_path / "run", *changed) == 0
     for name in ("trajectory.tum", "map.csv", "diagnostics.csv"):
