@@ -139,11 +139,12 @@ def test_a_folder_that_is_no_run_is_refused(run_folder, command, spoil, message,
     assert message in sentence(capsys)
 
 
-def test_a_damaged_comparison_is_said_on_the_page(run_folder):
+def test_a_damaged_comparison_is_said_and_the_others_count(run_folder):
     (run_folder / "validation_groundtruth.json").write_text("{}")
     (run_folder / "diagnostics.csv").write_text("a,b\n1\n")
     verdict = write_report(run_folder)
-    assert verdict.trust == "cannot tell" and page(run_folder).count('class="problem"') == 2
+    assert "from the batch optimum" in verdict.path.sentence and page(run_folder).count('class="problem"') == 2
+    assert "validation_groundtruth.json is no comparison of this version" in verdict.said[0]
 
 
 def test_a_run_without_truth_is_judged_by_the_batch_posterior_that_it_found_or_by_nothing(run_folder):

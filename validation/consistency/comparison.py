@@ -45,21 +45,20 @@ def write_comparison(folder: Path, comparison: Comparison) -> Path:
     return path
 
 
-def read_comparisons(folder: Path) -> list[Comparison]:
-    """All comparisons in a folder, by name. Raises InputError: a file is not one; it is named."""
-    found = []
+def read_comparisons(folder: Path) -> tuple[list[Comparison], list[str]]:
+    """All comparisons in a folder, by name; and a sentence on each file that is not one."""
+    found, problems = [], []
     for path in sorted(folder.glob(f"{COMPARISON}*.json")):
         try:
             entries = json.loads(path.read_text(encoding="utf-8"))
             against, accuracy, figures = str(entries["against"]), str(entries["accuracy"]), dict(entries["figures"])
             statistics = [Statistic.of_entries(item) for item in entries["statistics"]]
             pictures = [Path(name).name for name in entries["pictures"]]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"{path} is no comparison of this version of rbpf: delete it and validate again"
-            ) from error
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            problems.append(f"{path} is no comparison of this version of rbpf: delete it and validate again.")
+            continue
         found.append(Comparison(against, accuracy, figures, statistics, pictures))
-    return found
+    return found, problems
 
 
 def innovation_statistics(
@@ -212,11 +211,12 @@ class Verdict:
     reason: str  #: why, a clause.
     leaning: Leaning = ""  #: direction in which an untrusted uncertainty is wrong, if known.
     advice: str = ""  #: what to try next, a sentence; empty where there is nothing to say.
+    problems: tuple[str, ...] = ()  #: files that could not be taken into account, a sentence each.
 
     @property
     def said(self) -> list[str]:
-        """The sentences on path and uncertainty, and the advice, if any."""
-        return [text for text in (*self.sentences, self.advice) if text]
+        """The problems, the sentences on path and uncertainty, and the advice, if any."""
+        return [text for text in (*self.problems, *self.sentences, self.advice) if text]
 
     @property
     def sentences(self) -> tuple[str, str]:
