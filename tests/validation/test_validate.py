@@ -129,11 +129,20 @@ def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(run_f
     [
         (["report"], lambda folder: shutil.rmtree(folder), "no such folder"),
         (["report"], lambda folder: (folder / "summary.json").write_text("{"), "damaged"),
+        (["report"], lambda run: (run / "summary.json").write_text('{"problems": 7}'), "expected a list of sentences"),
+        (
+            ["plot"],
+            lambda run: (run / "diagnostics.csv").write_text("x\n1\n"),
+            "diagnostics.csv: expected a table with",
+        ),
+        (["plot"], lambda run: (run / "timings.csv").write_text("x\n"), "timings.csv: expected a header, and rows of"),
+        (["plot"], lambda run: (run / "diagnostics.csv").write_text("lost\n1\n"), "a row of each frame, found 1"),
         (["export", "--format", "tum"], lambda run: (run / "config.yaml").unlink(), "no config.yaml: expected the"),
         (["validate", "--against", "gtsam", "--truth-std-m", "0.01"], lambda run: None, "are of the ground truth, not"),
     ],
 )
-def test_a_folder_that_is_no_run_is_refused(run_folder, command, spoil, message, capsys):
+def test_a_folder_that_is_no_run_is_refused(run_folder, command, spoil, message, capsys, monkeypatch):
+    monkeypatch.chdir(run_folder.parent)
     spoil(run_folder)
     assert main([*command, str(run_folder)]) == 2 and not (run_folder / "export").exists()
     assert message in sentence(capsys)

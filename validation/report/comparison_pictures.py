@@ -120,7 +120,7 @@ def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
             errors = truth_errors(run)
             curves[name], dim = _nees(run, errors), errors.whitened.errors.shape[1]
         else:
-            table = run.table("diagnostics.csv")
+            table = run.table("diagnostics.csv", "nis", "nis_dof")
             rows = np.flatnonzero((table["nis_dof"] > 0) & np.isfinite(table["nis"]))
             curves[name] = rows, table["nis"][rows] / table["nis_dof"][rows]
     words = NEES if all(known) else "NIS per degree of freedom"
