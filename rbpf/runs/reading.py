@@ -117,7 +117,7 @@ class RunFolder:
         """The filtered poses, without landmarks."""
         file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
         if not file.is_file():
-            raise InputError(f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}")
+            raise InputError(f"{self.folder} has no {file.name}, which every finished run leaves; {again}")
         arrays = load_arrays(file)
         version = arrays.get("version", np.array(0))
         if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
