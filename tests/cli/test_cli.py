@@ -22,9 +22,7 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulat
 from tests.cli.run_outputs import FILES, REQUIRED, STEPS, layout, names, outputs
 from tests.cli.sequences import sentence
 
-OWN_FILES = {
-    "odometry.tum", "observations_odometry.csv", "ess.png", "groundtruth_landmarks.png", "groundtruth_map.png"
-}  # fmt: skip
+OWN_FILES = {"odometry.tum", "observations_odometry.csv", "ess.png", "groundtruth_landmarks.png", "groundtruth_map.png"}
 OWN_ENTRIES = {
     "landmarks", "resamplings", "ess_mean", "log_evidence", "path_rmse_m", "landmark_error_mean_m",
     "landmark_error_aligned_mean_m",
@@ -45,8 +43,7 @@ def began(log, tmp_path_factory):
 
 def test_a_run_leaves_everything(began):
     assert names(began) == FILES | OWN_FILES
-    summary = json.loads((began / "summary.json").read_text())
-    assert summary.keys() >= REQUIRED | OWN_ENTRIES
+    assert (summary := json.loads((began / "summary.json").read_text())).keys() >= REQUIRED | OWN_ENTRIES
     assert (summary["frames"], summary["particles"], summary["seed"]) == (STEPS, 30, 0)
     assert summary["path_rmse_m"] < summary["odometry_path_rmse_m"]
     assert set(summary["ms_per_frame"]) == {"median", "p95"}
