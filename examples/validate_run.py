@@ -36,7 +36,7 @@ def main(
     verdicts = {against: validate(run, against) for against in ("groundtruth", "gtsam")}
     rows = [
         [comparison.against, s.name, s.value, s.low, s.high, s.outcome]
-        for comparison in read_comparisons(run)
+        for comparison in read_comparisons(run)[0]
         for s in comparison.statistics
     ]
     write_table(out / "statistics.csv", ["against", "statistic", "value", "from", "to", "says"], rows)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rbpf.errors import InputError
-from rbpf.runs.files import OnDone, prepare_folder
+from rbpf.runs.files import BATCH, VIDEO, OnDone, prepare_folder
 from rbpf.runs.folder import write_run, write_summary
 from rbpf.runs.plots import World, draw_run
 from rbpf.runs.reading import RunFolder
@@ -23,11 +23,11 @@ from rbpf.runs.truth import EXACT, LEAST, TRUTH, Precision
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.consistency import comparison as verdicts
-from rbpf.validation.consistency.comparison import COMPARISON, Comparison, Verdict
+from rbpf.validation.consistency.comparison import Comparison, Verdict
 from rbpf.validation.metrics.accuracy import ate, rpe
-from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
+from rbpf.validation.metrics.scores import is_anonymous, score_landmarks, score_run
 from rbpf.validation.report.live import write_rerun
-from rbpf.validation.report.page import VIDEO, write_report
+from rbpf.validation.report.page import write_report
 from rbpf.validation.report.video import PICTURES, annotated_frames, write_video
 
 if TYPE_CHECKING:
@@ -62,10 +62,6 @@ def finish_run(
         wanted, batch = {}, False
     # Omitted results are an entry of config.yaml, so that a repetition omits them, too.
     entries = write_run(run, out, dict(sources) | {name: False for name, asked in wanted.items() if not asked})
-    (out / BATCH).unlink(missing_ok=True)
-    for path in out.glob(f"{COMPARISON}*.json"):  # of an earlier run, with their pictures
-        for old in (path, *out.glob(f"{path.stem.removeprefix(COMPARISON)}_*.p[nd][gf]")):
-            old.unlink()
     if batch:
         try:
             entries |= add_batch(RunFolder.open(out), most_iterations, on_iteration)
@@ -76,8 +72,6 @@ def finish_run(
     draw_run(RunFolder.open(out))
     if video and run.system.name in PICTURES:
         write_video(annotated_frames(run), run.log.stamps_ns, out / VIDEO, on_frame)
-    else:
-        (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:
         write_rerun(run, rerun)
     verdict = validate(out, "groundtruth") if (out / TRUTH).is_file() else write_report(out)

@@ -1,8 +1,11 @@
 """A group of commands that checks names and options itself: the parser's error messages are long, or off the point."""
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import redirect_stderr
 from dataclasses import dataclass, is_dataclass
 from difflib import get_close_matches
+from io import StringIO
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
@@ -28,7 +31,7 @@ class Commands:
         Raises InputError: there is no such command or option, or a value is out of its range.
         """
         if not arguments or arguments[0].startswith("-"):
-            tyro.cli(self._parsed(), prog=before, description=self.help, args=arguments)
+            _parse(self._parsed(), arguments, before, self.help)
             return
         name = arguments[0].replace("_", "-")
         if name not in self.kinds:
@@ -42,7 +45,7 @@ class Commands:
             option = word.partition("=")[0].replace("_", "-")
             if len(option) > 2 and option.startswith("--") and option not in options:
                 raise InputError(f"`{before}` has no option {option}: {_nearest(option, options)}")
-        command = tyro.cli(kind, prog=before, args=arguments)
+        command = _parse(kind, arguments, before)
         try:
             for options_of in (command, *filter(is_dataclass, vars(command).values())):
                 check_ranges(options_of)
@@ -62,6 +65,21 @@ class Commands:
             else:
                 parts.append(Annotated[Any, tyro.conf.subcommand(name, constructor=kind)])
         return Annotated[Union[tuple(parts)], tyro.conf.arg(help="")]  # noqa: UP007
+
+
+def _parse(kind: Any, arguments: list[str], before: str, description: str | None = None) -> Any:
+    """What the parser makes of the arguments; its errors, boxes of several lines, become a sentence."""
+    try:
+        with redirect_stderr(StringIO()) as box:
+            return tyro.cli(kind, prog=before, description=description, args=arguments)
+    except SystemExit as ended:
+        if not ended.code:
+            raise
+    plain = re.sub(r"\x1b\[[\d;]*m|[│|─╭╮╰╯+]|-{3,}", "", box.getvalue()).partition("\n")[2]
+    said = " ".join(re.split(r"\n\s*\n", plain)[0].split()).rstrip(".").replace(". Expected", ", expected")
+    said = re.sub(r"Error parsing (\S+): no type .*\{None\}(\w+) could .*\['(.*)'\]", r"\1 takes \2, got '\3'", said)
+    said = re.sub(r"'None', |, 'None'", "", said)
+    raise InputError(f"{said}; `{before} --help` says more")
 
 
 def _options(kind: Any) -> Iterator[str]:

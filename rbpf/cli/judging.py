@@ -47,7 +47,7 @@ class Validate(Printed):
         with CONSOLE.status(f"comparing with {file or against} …"):
             verdict = compare(self.run, against, self.out, file, truth)
         # The page's first sentence is about the truth if there is one; here that of the requested comparison is shown.
-        asked = [c.accuracy for c in read_comparisons(self.run) if c.against == against]
+        asked = [c.accuracy for c in read_comparisons(self.run)[0] if c.against == against]
         _answer(verdict, self.run, self.json, *(found for found in asked if found not in verdict.path.sentence))
 
 

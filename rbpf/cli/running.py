@@ -267,20 +267,22 @@ It is refused if the recording has changed. Further options are those of the run
 
 def repeated(arguments: list[str]) -> list[str]:
     """`run --from RUN/config.yaml …` as the command that the run was started with, and its settings."""
-    if arguments[:1] != ["run"] or "--from" not in arguments[:2]:
+    given = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--from=") else [word])]
+    if given[:1] != ["run"] or "--from" not in given or not given[1].startswith("--"):
         return arguments
-    if len(arguments) < 3:
+    at = given.index("--from")
+    if len(given) < at + 2:
         raise InputError("--from takes the config.yaml of a run: rbpf run --from RUN/config.yaml")
     from rbpf.runs.files import numbered
     from rbpf.runs.provenance import read_origin
 
-    config = Path(arguments[2])
+    config, more = Path(given[at + 1]), given[1:at] + given[at + 2 :]
     words, out = read_origin(config), list[str]()
-    if not any(word.partition("=")[0] == "--out" for word in arguments):
-        last = "--resume" in arguments or "--overwrite" in arguments
+    if not any(word.partition("=")[0] == "--out" for word in more):
+        last = "--resume" in more or "--overwrite" in more
         folder = config if config.is_dir() else config.parent
         out = ["--out", str(numbered(Path(f"{folder}-again"), last))]
-    return ["run", *words, *out, *arguments[3:]]
+    return ["run", *words, *out, *more]
 
 
 #: Columns of a system with the numbers of matches and of searched features.

@@ -15,7 +15,9 @@ from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 
 CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajectory.npz", "map.npz"
-POSTERIOR, GRID = "posterior.npz", "grid.npz"
+POSTERIOR, GRID, ODOMETRY, BATCH = "posterior.npz", "grid.npz", "odometry.tum", "batch.tum"
+PAGE, VIDEO = "report.html", "annotated.mp4"
+COMPARISON = "validation_"  #: What the names of a comparison's files begin with.
 LOCK = ".lock"  #: Lock file in a run's folder while a process writes there; holds its id.
 VERSION = 1  #: Of trajectory.npz.
 OnDone = Callable[[int, int], None]  #: Called with the number of parts done, and their total.

@@ -4,7 +4,7 @@ import json
 import math
 import resource
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,17 +15,26 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays, whole
 from rbpf.lie import SE3
-from rbpf.runs import files
-from rbpf.runs.measurement_files import write_measurements
-from rbpf.runs.provenance import write_config
+from rbpf.runs import files, measurement_files
+from rbpf.runs.plots import FIGURES, VECTORS
+from rbpf.runs.provenance import CONFIG, INPUTS, write_config
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space, write_tum
-from rbpf.runs.truth import write_truth
+from rbpf.runs.truth import TRUTH, write_truth
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.readers.images.calibration import NAME as CAMERA
 from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.mono.known_map import NAME as KNOWN_MAP
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
 
+#: Names of all files that a run may leave, besides its checkpoint, and its comparisons with their pictures.
+RESULTS = (
+    files.TRAJECTORY, "trajectory.tum", TRUTH, files.ODOMETRY, files.BATCH, files.MAP, "map.csv", files.POSTERIOR,
+    "posterior.tum", KNOWN_MAP, CAMERA, files.GRID, "grid.pgm", "grid.yaml", TIMINGS, DIAGNOSTICS, CONFIG, files.SUMMARY,
+    files.VIDEO, files.PAGE, *measurement_files.FILES,
+    *(f"{Path(name).stem}.{ending}" for name in (*FIGURES, "ess.png") for ending in ("png", VECTORS)),
+)  # fmt: skip
 #: Bytes of grid.pgm: occupied, free, unknown.
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 #: Extent of a path, relative to the landmarks' distance, below which depth is hardly observable.
@@ -41,16 +50,18 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
     Raises InputError: the folder cannot be written to, or the disk is full.
     """
     files.prepare_folder(out)
+    remove_results(out, [Path(str(sources[name])) for name in INPUTS if name in sources])
     log, system = run.log, run.system
-    write_tum(out / "trajectory.tum", in_space(log.stamps_ns, log.poses))
     more = {name: log[name] for name in ("correction", "cov_correction") if name in log}
     more |= {"particles": system.particle_poses(), "weights": system.filter.particles.weights}
     write_trajectory(out, log.stamps_ns, log.poses, log.covs, **more)
-    write_truth(out, run.truth)
+    write_tum(out / "trajectory.tum", in_space(log.stamps_ns, log.poses))
+    if run.truth is not None:
+        write_truth(out, run.truth)
     if "odometry" in log:
-        write_tum(out / "odometry.tum", in_space(log.stamps_ns, log["odometry"]))
+        write_tum(out / files.ODOMETRY, in_space(log.stamps_ns, log["odometry"]))
     write_map(out, system.map())
-    write_measurements(out, system.measurements(run.name, log))
+    measurement_files.write_measurements(out, system.measurements(run.name, log))
     for table in (TIMINGS, DIAGNOSTICS):
         header, columns = log.table(table)
         files.write_csv(out / table, header, zip(*columns, strict=True))
@@ -71,6 +82,19 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
     entries = {"finished": datetime.now(UTC).isoformat(timespec="seconds")} | summarise(run)
     write_summary(out, entries)
     return entries
+
+
+def remove_results(out: Path, inputs: Iterable[Path] = ()) -> None:
+    """Removes what an earlier run left in a folder, but for a checkpoint and for the inputs of the present run."""
+    if not any((out / name).exists() for name in (files.TRAJECTORY, files.SUMMARY)):
+        return
+    kept = {place.resolve() for path in inputs for place in (path, path / CAMERA, path.parent / CAMERA)}
+    compared = [*out.glob(f"{files.COMPARISON}*.json")]
+    about = [path.stem.removeprefix(files.COMPARISON) for path in compared]
+    pictures = [path for name in about for path in out.glob(f"{name}_*.p[nd][gf]")]
+    for path in (*(out / name for name in RESULTS), *compared, *pictures):
+        if path.resolve() not in kept:
+            path.unlink(missing_ok=True)
 
 
 def summarise(run: Run) -> dict[str, Any]:
@@ -174,16 +198,9 @@ def write_grid(out: Path, grid: Mapping[str, np.ndarray]) -> None:
     height, width = cells.shape
     with whole(out / "grid.pgm") as temporary:
         temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode() + cells[::-1].tobytes())
-    words = {
-        "image": "grid.pgm",
-        "mode": "trinary",
-        "resolution": f"{float(grid['cell_m']):g}",
-        "origin": f"[{x:.6f}, {y:.6f}, 0.0]",
-        "negate": "0",
-        "occupied_thresh": "0.65",
-        "free_thresh": "0.196",
-    }
-    files.write_text(out / "grid.yaml", "".join(f"{name}: {value}\n" for name, value in words.items()))
+    place = f"resolution: {float(grid['cell_m']):g}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
+    limits = "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    files.write_text(out / "grid.yaml", f"image: grid.pgm\nmode: trinary\n{place}{limits}")
 
 
 def peak_memory_mb() -> float:

@@ -28,8 +28,8 @@ FRAMES = "observations_frames.csv"
 KNOWN = "observations_known_points.csv"
 PLAIN = "radial-tangential"  #: The lens of files that name none.
 
-_FILES = {OBSERVATIONS: "observations", ODOMETRY: "odometry", FRAMES: "frames", KNOWN: "known points"}
-_TITLES = {name: f"rbpf {what} 1" for name, what in _FILES.items()}
+FILES = {OBSERVATIONS: "observations", ODOMETRY: "odometry", FRAMES: "frames", KNOWN: "known points"}
+_TITLES = {name: f"rbpf {what} 1" for name, what in FILES.items()}
 _HINT = "a file that every filter run writes into its folder"
 _COVARIANCE = "a positive semi-definite covariance"
 _SPACES: dict[str, SE2Group | SE3Group] = {"SE2": SE2, "SE3": SE3}
@@ -40,13 +40,11 @@ _INT64 = np.iinfo(np.int64)
 
 
 def write_measurements(folder: Path, m: Measurements | FeatureLog | None) -> None:
-    """Writes the files atomically; those of an earlier run are replaced or removed."""
+    """Writes the files atomically."""
     texts = {} if m is None else _camera_texts(m) if isinstance(m, FeatureLog) else _robot_texts(m)
     with ExitStack() as together:
         for name, text in texts.items():
             together.enter_context(whole(folder / name)).write_text(text, encoding="utf-8")
-    for name in _TITLES.keys() - texts.keys():
-        (folder / name).unlink(missing_ok=True)
 
 
 def read_measurements(folder: Path) -> Measurements | FeatureLog:

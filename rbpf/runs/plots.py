@@ -15,7 +15,7 @@ import numpy as np
 from rbpf.core.checkpoint import whole
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.files import GRID
+from rbpf.runs.files import BATCH, GRID
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH
@@ -212,8 +212,8 @@ def error_figure(found: RunFolder) -> Any | None:
     unit, word = (1e3, "mm") if np.abs(error).max(initial=0.0) < 1.0 else (1.0, "m")
     figure, panels = stacked_axes(len(used), f"{found.name}: error of the position, {name}")
     batch = None
-    if (found.folder / "batch.tum").is_file():
-        batch, true = associate(read_tum(found.folder / "batch.tum"), reference, 0)
+    if (found.folder / BATCH).is_file():
+        batch, true = associate(read_tum(found.folder / BATCH), reference, 0)
         at_batch = np.searchsorted(path.stamps_ns, true.stamps_ns)
         batch_error = fit(how, batch.positions, true.positions).transform(batch.positions) - true.positions
     lost = lost_frames(found)
@@ -256,7 +256,7 @@ def plot_error(*runs: RunFolder, ax: Any = None) -> Any:
 
 def tracking_figure(found: RunFolder) -> Any:
     """Counts of observations, effective sample size and innovations, frame by frame."""
-    table = found.table("diagnostics.csv")
+    table = found.table("diagnostics.csv", "step", "ess", "nis", "nis_dof")
     counts = {name: values for name, values in table.items() if name not in _NOT_COUNTS}
     shares = {name: counts.pop(name) for name, values in list(counts.items()) if (np.mod(values, 1.0) > 0.0).any()}
     # Columns after `updated` are valid only for frames with an update.
@@ -291,7 +291,7 @@ def tracking_figure(found: RunFolder) -> Any:
 
 def timings_figure(found: RunFolder) -> Any:
     """Milliseconds per frame by stage, one over the other; frames that include compilation are cut off."""
-    table = found.table("timings.csv")
+    table = found.table("timings.csv", "step", "milliseconds")
     stages = {n.removesuffix("_ms").replace("_", " "): v for n, v in table.items() if n.endswith("_ms")}
     waiting = stages.pop("waiting for image", None)
     stages = stages or {"filter": table["milliseconds"]}
@@ -377,7 +377,10 @@ def lost_frames(found: RunFolder) -> np.ndarray:
         table = found.table("diagnostics.csv")
     except InputError:
         table = {}
-    return table.get("lost", table.get("assumed", np.zeros(len(found.trajectory)))) > 0
+    lost = table.get("lost", table.get("assumed", np.zeros(len(found.trajectory))))
+    if lost.size != len(found.trajectory):
+        raise InputError(f"{found.folder / 'diagnostics.csv'}: expected a row of each frame, found {lost.size}")
+    return lost > 0
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ import yaml
 
 from rbpf import __version__
 from rbpf.errors import InputError
-from rbpf.runs.files import write_text
+from rbpf.runs.files import holds_run, write_text
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
 from rbpf.systems.settings import HEADER
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"  #: Libraries whose version may change a run's results.
-_FILES = "recording", "known_points", "calibration", "known_map"  #: Entries that name input files or folders.
+INPUTS = "recording", "known_points", "calibration", "known_map"  #: Entries that name input files or folders.
 _FLAGS = ("localize",)
 _OUTPUTS = "video", "batch"  #: Optional outputs of a run.
 _HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
@@ -49,7 +49,7 @@ def require_own_version(config: Mapping[str, Any], folder: Path) -> None:
 
 def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
     """Writes config.yaml: everything that is needed to repeat a run; `recording` is one of its sources."""
-    digest = digest_of({name: Path(str(sources[name])) for name in _FILES if name in sources}, out)
+    digest = digest_of({name: Path(str(sources[name])) for name in INPUTS if name in sources}, out)
     head = {"rbpf": __version__, "system": system, **sources}
     if digest is not None:
         head["input_sha256"] = digest
@@ -74,16 +74,16 @@ def instruction_set() -> str:
 def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str | None:
     """SHA-256 over names and contents of all input files; None if one is missing.
 
-    Files in the folder `without`, such as the run's own inside its recording, are excluded.
+    The folder `without`, such as the run's own, and other runs' folders inside a recording are excluded.
     """
     whole = hashlib.sha256()
     for name, path in sorted(sources.items()):
         if not path.exists():
             return None
         whole.update(f"{name}\n".encode())
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-        if without is not None and path.is_dir() and without.resolve() != path.resolve():
-            files = [file for file in files if not file.resolve().is_relative_to(without.resolve())]
+        inside, own = sorted(path.rglob("*")), None if without is None else without.resolve()
+        runs = {place for place in inside if place.is_dir() and (holds_run(place) or place.resolve() == own)}
+        files = [path] if path.is_file() else [f for f in inside if f.is_file() and runs.isdisjoint(f.parents)]
         for file in files:
             relative = "" if path.is_file() else file.relative_to(path).as_posix()
             whole.update(f"{relative}\n{file.stat().st_size}\n".encode())
@@ -114,7 +114,7 @@ def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for name, value in sources.items():
         path = Path(str(value))
-        if name not in _FILES:
+        if name not in INPUTS:
             found[name] = json.dumps(value)
         elif path.resolve() != out.resolve():
             digest = digest_of({name: path}, out)
@@ -148,7 +148,7 @@ def read_origin(config: Path) -> list[str]:
     require_own_version(entries, config.parent)
     if "recording" not in entries:
         raise InputError(f"{config} names no recording: it is no run's, give it with --config instead")
-    files = {name: Path(str(entries[name])) for name in _FILES if name in entries}
+    files = {name: Path(str(entries[name])) for name in INPUTS if name in entries}
     for name, path in files.items():
         if not path.exists():
             raise InputError(f"{config}: its {name} {path} is not there: repeat from the folder the run was started in")

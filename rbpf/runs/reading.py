@@ -98,6 +98,9 @@ class RunFolder:
             raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
         if not isinstance(summary, dict):
             raise InputError(f"{path} is damaged: expected names with values")
+        for name in ("remarks", "problems"):
+            if not isinstance(summary.get(name, []), list):
+                raise InputError(f"{path} is damaged: expected a list of sentences as {name}, got {summary[name]!r}")
         return cls(folder, config, summary)
 
     @property
@@ -114,7 +117,7 @@ class RunFolder:
         """The filtered poses, without landmarks."""
         file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
         if not file.is_file():
-            raise InputError(f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}")
+            raise InputError(f"{self.folder} has no {file.name}, which every finished run leaves; {again}")
         arrays = load_arrays(file)
         version = arrays.get("version", np.array(0))
         if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
@@ -194,12 +197,14 @@ class RunFolder:
         require_own_version(self.config, self.folder)
         return replace(self.path, landmarks=self.map.points())
 
-    def table(self, name: str) -> dict[str, np.ndarray]:
-        """A table of numbers by its columns' names: diagnostics.csv, timings.csv."""
+    def table(self, name: str, *needed: str) -> dict[str, np.ndarray]:
+        """A table of numbers by its columns' names, with those `needed`: diagnostics.csv, timings.csv."""
         path = self.folder / name
         rows = list(csv.reader(StringIO(read_text(path))))
-        if not rows or any(len(row) != len(rows[0]) for row in rows):
-            raise InputError(f"{path}: expected a table whose rows have as many cells as its header")
+        if len(rows) < 2 or any(len(row) != len(rows[0]) for row in rows):
+            raise InputError(f"{path}: expected a header, and rows of as many cells below it")
+        if missing := [column for column in needed if column not in rows[0]]:
+            raise InputError(f"{path}: expected a table with the columns {', '.join(needed)}, found no {missing[0]}")
         try:
             values = np.array(rows[1:], dtype=float).reshape(len(rows) - 1, len(rows[0]))
         except ValueError as error:

@@ -141,6 +141,8 @@ def drive(
             if not len(run.log):
                 raise
             run.failure = f"{run.system.frame_word} {len(run.log)} of {run.name}: {error}"
+            if checkpoint is not None and not resume and len(run.log) < every:  # it can only be an earlier run's
+                checkpoint.unlink(missing_ok=True)
             break
         if checkpoint is not None and len(run.log) % every == 0:
             _keep(run, checkpoint)

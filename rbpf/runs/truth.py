@@ -88,11 +88,8 @@ def poses_at(
     return rows, space.interpolate(poses[before[rows]], poses[after[rows]], fraction)
 
 
-def write_truth(out: Path, truth: RunTruth | None) -> None:
-    """Writes truth.npz, or removes that of an earlier run if there is no truth."""
-    if truth is None:
-        (out / TRUTH).unlink(missing_ok=True)
-        return
+def write_truth(out: Path, truth: RunTruth) -> None:
+    """Writes truth.npz."""
     points = np.array(list(truth.landmarks.values()), dtype=float)
     arrays = {
         "rows": truth.rows,

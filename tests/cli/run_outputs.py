@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rbpf.runs.folder import RESULTS
+
 STEPS = 20  #: Of the robot that is simulated.
 #: What a run of every system leaves, of one with ground truth.
 FILES = {
@@ -35,6 +37,7 @@ def names(folder: Path) -> set[str]:
     found = {path.name for path in folder.iterdir()}
     pictures, vectors = ({name[:-4] for name in found if name.endswith(ending)} for ending in (".png", ".pdf"))
     assert pictures == vectors
+    assert {name for name in found if "_" not in name} <= {*RESULTS, "checkpoint.npz", "notes.txt"}
     return {name for name in found if not name.endswith(".pdf")}
 
 

@@ -13,6 +13,7 @@ from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.runs.files import numbered, own_folder, write_text
+from rbpf.runs.folder import RESULTS, remove_results
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import RobotRecording, part_of_log
 from rbpf.sensors.readers import Part, open_log
@@ -21,9 +22,7 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulat
 from tests.cli.run_outputs import FILES, REQUIRED, STEPS, layout, names, outputs
 from tests.cli.sequences import sentence
 
-OWN_FILES = {
-    "odometry.tum", "observations_odometry.csv", "ess.png", "groundtruth_landmarks.png", "groundtruth_map.png"
-}  # fmt: skip
+OWN_FILES = {"odometry.tum", "observations_odometry.csv", "ess.png", "groundtruth_landmarks.png", "groundtruth_map.png"}
 OWN_ENTRIES = {
     "landmarks", "resamplings", "ess_mean", "log_evidence", "path_rmse_m", "landmark_error_mean_m",
     "landmark_error_aligned_mean_m",
@@ -44,8 +43,7 @@ def began(log, tmp_path_factory):
 
 def test_a_run_leaves_everything(began):
     assert names(began) == FILES | OWN_FILES
-    summary = json.loads((began / "summary.json").read_text())
-    assert summary.keys() >= REQUIRED | OWN_ENTRIES
+    assert (summary := json.loads((began / "summary.json").read_text())).keys() >= REQUIRED | OWN_ENTRIES
     assert (summary["frames"], summary["particles"], summary["seed"]) == (STEPS, 30, 0)
     assert summary["path_rmse_m"] < summary["odometry_path_rmse_m"]
     assert set(summary["ms_per_frame"]) == {"median", "p95"}
@@ -132,9 +130,10 @@ def test_a_run_goes_on_with_what_it_began_with(began, log, tmp_path, capsys, spo
 
 
 def test_a_run_goes_on_with_what_cannot_change_its_results(began, log, tmp_path):
-    """Other checkpoints, other threads, another place of the same recording."""
+    """Other checkpoints, other threads, another place of the same recording, another run in it."""
     shutil.copytree(began, tmp_path / "run")
     shutil.copytree(log, tmp_path / "moved")
+    shutil.copytree(began, tmp_path / "moved" / "run-2")
     changed = ["--set", "checkpoint_every=7", "--threads", "1", "--resume"]
     assert run(tmp_path / "moved", tmp_path / "run", *changed) == 0
     for name in ("trajectory.tum", "map.csv", "diagnostics.csv"):
@@ -142,14 +141,20 @@ def test_a_run_goes_on_with_what_cannot_change_its_results(began, log, tmp_path)
 
 
 def test_a_run_is_written_over_only_where_that_is_asked_for(began, log, tmp_path, capsys):
-    shutil.copytree(began, tmp_path / "run")
-    before = outputs(tmp_path / "run")
-    assert run(log, tmp_path / "run", "--seed", "9") == 2
-    assert "holds a run already" in " ".join(capsys.readouterr().err.split())
-    assert outputs(tmp_path / "run") == before
-    assert run(log, tmp_path / "run", "--resume", "--overwrite") == 2
-    assert run(log, tmp_path / "run", "--seed", "9", "--overwrite") == 0
-    assert outputs(tmp_path / "run") != before
+    """Nothing that the earlier run left is there then, but what it did not write, and inputs."""
+    out = shutil.copytree(began, tmp_path / "run")
+    for name in {*RESULTS, "validation_path.json", "path_xy.png", "notes.txt"} - {path.name for path in out.iterdir()}:
+        (out / name).touch()
+    before = outputs(out)
+    for arguments, message in (
+        (("--seed", "9"), "holds a run already"),
+        (("--resume", "--overwrite"), "leave out one of"),
+    ):
+        assert run(log, out, *arguments) == 2 and message in " ".join(capsys.readouterr().err.split())
+    assert outputs(out) == before and run(log, out, "--seed", "9", "--overwrite") == 0
+    assert names(out) == names(began) | {"notes.txt"} and outputs(out) != before
+    remove_results(out, [out / "map.csv"])
+    assert {path.name for path in out.iterdir()} == {"checkpoint.npz", "notes.txt", "map.csv"}
 
 
 def test_only_runs_of_one_camera_are_recalibrated(began, tmp_path, capsys):

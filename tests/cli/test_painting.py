@@ -37,8 +37,6 @@ def test_a_robot_among_landmarks_one_camera_and_two(desk, room, tmp_path):
     log, out = tmp_path / "log", tmp_path / "run"
     assert main(["simulate", "range-bearing", "--out", str(log), "--steps", "20", "--landmarks", "30"]) == 0
     assert main(["run", "range-bearing", str(log), "--out", str(out), "--particles", "30"]) == 0
-    check(out)
-    assert run(desk, tmp_path / "one") == 0
-    assert run_stereo(room, tmp_path / "two", "--no-video", "--no-batch") == 0
-    check(tmp_path / "one")
-    check(tmp_path / "two")
+    assert run(desk, tmp_path / "one") == run_stereo(room, tmp_path / "two", "--no-video", "--no-batch") == 0
+    for each in (out, tmp_path / "one", tmp_path / "two"):
+        check(each)

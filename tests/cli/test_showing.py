@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import MISSING, fields, is_dataclass
+from unittest.mock import Mock
 
 import pytest
 
@@ -25,6 +26,13 @@ from rbpf.cli.simulating import SIMULATE
         ("export x --xyz", "`rbpf export` has no option --xyz: there are --help, --json, --format, --out"),
         ("simulate dsek --out x", "no command `rbpf simulate dsek`: did you mean desk?"),
         ("nonsense", "nonsense`: there are "),
+        ("run laser x --seed 1e3", "rbpf: --seed takes INT, got '1e3'; `rbpf run laser --help` says more"),
+        ("run range-bearing x --association foo", "'foo' for argument '--association', expected one of ("),
+        ("run mono x --out", ", expected 1 values; `rbpf run mono --help` says more"),
+        ("run stereo", "rbpf: Missing from rbpf run stereo: PAIRS images of a rectified pair, or"),
+        ("plot x --format bmp", "invalid choice 'bmp' for argument '--format', expected one of ("),
+        ("run --from=nothing/config.yaml", "rbpf: nothing holds no config.yaml"),
+        ("run --out x --from nothing/config.yaml", "rbpf: nothing holds no config.yaml"),
         *((f"{words} --help", "nonsense`: there are ") for words in ("nonsense", "run nonsense", "simulate nonsense")),
     ],
 )
@@ -51,24 +59,17 @@ def test_a_bar_begins_with_what_is_told(capsys):
     with progress() as bar:
         bar("waiting"), bar("filtering")(1, 2)
     said = capsys.readouterr().err
-    assert "filtering" in said and "1/2" in said and "waiting" not in said
-    assert tell is not None
+    assert "filtering" in said and "1/2" in said and "waiting" not in said and tell is not None
 
 
 def test_ctrl_c_before_anything_is_done_is_said(monkeypatch, capsys):
-    def stopped(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("rbpf.cli.repeated", stopped)
+    monkeypatch.setattr("rbpf.cli.repeated", Mock(side_effect=KeyboardInterrupt))
     assert main(["report", "x"]) == 130
     assert capsys.readouterr().err == "rbpf: stopped\n"
 
 
 def test_only_a_run_that_fails_is_told_of_resume(monkeypatch, capsys):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("rbpf.cli.repeated", full)
+    monkeypatch.setattr("rbpf.cli.repeated", Mock(side_effect=OSError(28, "No space left on device")))
     assert main(["simulate", "desk", "--out", "x"]) == 2
     assert capsys.readouterr().err == "rbpf: [Errno 28] No space left on device\n"
     assert main(["run", "mono", "x"]) == 2
@@ -159,8 +160,7 @@ def test_shells_complete_commands(tmp_path, capsys, shell):
     script = tmp_path / "completion"
     script.write_text(capsys.readouterr().out)
     assert "calibrate" in script.read_text()
-    program = shutil.which(shell)
-    if program is None:
+    if (program := shutil.which(shell)) is None:
         pytest.skip(f"{shell} is not installed")
     ask = [program, *(["-f"] if shell == "zsh" else []), "-c", ASKS[shell].format(script)]
     found = subprocess.run(ask, capture_output=True, text=True, check=False, env=os.environ | {"HOME": str(tmp_path)})

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
+from rbpf.runs.files import BATCH
 from rbpf.runs.plots import moved_map
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
@@ -168,8 +169,8 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
         }
         statistics.append(statistic.map_ratio(LANDMARKS, found.truth, found.white))
     # The batch optimum's positions at the same steps, aligned in the same way, where the run has one.
-    if (record.folder / "batch.tum").is_file():
-        batch, beside = associate(read_tum(record.folder / "batch.tum"), reference, 0)
+    if (record.folder / BATCH).is_file():
+        batch, beside = associate(read_tum(record.folder / BATCH), reference, 0)
         if 2 * batch.stamps_ns.size >= truth.rows.size:  # an alignment fits a few poses anywhere
             rmse = ate(batch, beside, truth.alignment).rmse
             figures["batch_position_rmse_m"] = rmse

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.runs.files import write_text
+from rbpf.runs.files import COMPARISON, write_text
 from rbpf.runs.plots import lost_frames
 from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, NOISE_FACTOR, Statistic, motion_statistics, step_ratio
@@ -24,7 +24,6 @@ from rbpf.validation.consistency.statistic import BIAS_OF_MOTION, NOISE_FACTOR, 
 INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 #: By system, the setting with the common standard deviation of all measurements, px.
 SETTINGS = {"mono": ("search", "noise_px")}
-COMPARISON = "validation_"  #: Prefix of their files' names.
 
 
 @dataclass(frozen=True)
@@ -46,21 +45,20 @@ def write_comparison(folder: Path, comparison: Comparison) -> Path:
     return path
 
 
-def read_comparisons(folder: Path) -> list[Comparison]:
-    """All comparisons in a folder, by name. Raises InputError: a file is not one; it is named."""
-    found = []
+def read_comparisons(folder: Path) -> tuple[list[Comparison], list[str]]:
+    """All comparisons in a folder, by name; and a sentence on each file that is not one."""
+    found, problems = [], []
     for path in sorted(folder.glob(f"{COMPARISON}*.json")):
         try:
             entries = json.loads(path.read_text(encoding="utf-8"))
             against, accuracy, figures = str(entries["against"]), str(entries["accuracy"]), dict(entries["figures"])
             statistics = [Statistic.of_entries(item) for item in entries["statistics"]]
             pictures = [Path(name).name for name in entries["pictures"]]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"{path} is no comparison of this version of rbpf: delete it and validate again"
-            ) from error
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            problems.append(f"{path} is no comparison of this version of rbpf: delete it and validate again.")
+            continue
         found.append(Comparison(against, accuracy, figures, statistics, pictures))
-    return found
+    return found, problems
 
 
 def innovation_statistics(
@@ -81,9 +79,7 @@ def innovation_statistics(
 
 def compare_with_itself(record: RunFolder) -> Comparison:
     """A run's `innovation_statistics`, from its diagnostics, as a comparison without accuracy."""
-    table = record.table("diagnostics.csv")
-    if not {"nis", "nis_dof"} <= table.keys():
-        raise InputError(f"{record.folder / 'diagnostics.csv'} has no columns nis and nis_dof")
+    table = record.table("diagnostics.csv", "nis", "nis_dof")
     correction, cov = np.zeros((0, 0)), np.zeros((0, 0, 0))
     with suppress(InputError):  # a folder of another version has no such file; readers that need the poses report it
         correction, cov = record.corrections
@@ -213,11 +209,12 @@ class Verdict:
     reason: str  #: the reason, a clause.
     leaning: Leaning = ""  #: direction in which an untrusted uncertainty is wrong, if known.
     advice: str = ""  #: suggestion for the next run, a sentence; or empty.
+    problems: tuple[str, ...] = ()  #: files that could not be taken into account, a sentence each.
 
     @property
     def said(self) -> list[str]:
-        """The sentences on path and uncertainty, and the advice, if any."""
-        return [text for text in (*self.sentences, self.advice) if text]
+        """The problems, the sentences on path and uncertainty, and the advice, if any."""
+        return [text for text in (*self.problems, *self.sentences, self.advice) if text]
 
     @property
     def sentences(self) -> tuple[str, str]:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.runs.files import ODOMETRY
 from rbpf.runs.trajectory import MAX_DIFFERENCE_NS, Trajectory
 from rbpf.sensors.readers.text import parse_time, read_columns
 from rbpf.validation.metrics.accuracy import RelativeError
-from rbpf.validation.metrics.scores import ODOMETRY
 
 #: Times (R, 2) of both ends, and poses (R, 7) at the second time, relative to that at the first.
 Relations = tuple[NDArray[np.int64], Array]

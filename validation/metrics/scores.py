@@ -12,12 +12,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from rbpf.errors import InputError
+from rbpf.runs.files import BATCH, ODOMETRY
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Trajectory, align, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
-BATCH, ODOMETRY = "batch.tum", "odometry.tum"
 #: Prefix of the odometry's figures, by system; by default `odometry_`.
 ODOMETRY_PREFIX = {"stereo": "vo_"}
 

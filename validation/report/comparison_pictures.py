@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbpf.core.diagnostics import chi_square_band, chi_square_quantile
+from rbpf.errors import InputError
 from rbpf.runs import plots
 from rbpf.runs.plots import COLOURS, Views, World, draw_map, moved_map, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap, RunFolder
@@ -41,9 +42,13 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
 
 def draw_beside(runs: Sequence[RunFolder], out: Path, formats: Sequence[str]) -> list[str]:
     """Draws runs of one recording together into a folder: paths, errors if there is truth, consistency; returns the names."""
-    figures = {"path": plots.plot_trajectory(*runs), "consistency": plot_consistency(*runs)}
-    if (runs[0].folder / TRUTH).is_file():
-        figures["error"] = plots.plot_error(*runs)
+    try:
+        figures = {"path": plots.plot_trajectory(*runs), "consistency": plot_consistency(*runs)}
+        if (runs[0].folder / TRUTH).is_file():
+            figures["error"] = plots.plot_error(*runs)
+    except InputError as error:
+        them = " and ".join(str(run.folder) for run in runs)
+        raise InputError(f"{them} cannot be drawn together, as those of one recording can: {error}") from error
     return save_figures({f"{name}.{ending}": figure for ending in formats for name, figure in figures.items()}, out)
 
 
@@ -120,7 +125,7 @@ def plot_consistency(*runs: RunFolder, ax: Any = None) -> Any:
             errors = truth_errors(run)
             curves[name], dim = _nees(run, errors), errors.whitened.errors.shape[1]
         else:
-            table = run.table("diagnostics.csv")
+            table = run.table("diagnostics.csv", "nis", "nis_dof")
             rows = np.flatnonzero((table["nis_dof"] > 0) & np.isfinite(table["nis"]))
             curves[name] = rows, table["nis"][rows] / table["nis_dof"][rows]
     words = NEES if all(known) else "NIS per degree of freedom"

@@ -11,7 +11,8 @@ import shlex
 import struct
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -23,16 +24,14 @@ from matplotlib.colors import to_hex
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs import plots
-from rbpf.runs.files import GRID, write_text
+from rbpf.runs.files import GRID, PAGE, VIDEO, write_text
 from rbpf.runs.provenance import command_of
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import SYSTEMS
 from rbpf.systems.settings import defaults_of
 from rbpf.validation.consistency import comparison as verdicts
-from rbpf.validation.consistency.comparison import Comparison, Verdict
+from rbpf.validation.consistency.comparison import Verdict
 
-PAGE = "report.html"
-VIDEO = "annotated.mp4"
 _TITLES = {
     "groundtruth": "Against the ground truth", "gtsam": "Against the batch optimum", "colmap": "Against COLMAP",
     "itself": "Innovations", "relations": "Against known relations", "path": "Against another path",
@@ -81,27 +80,22 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
 
     record, problems = RunFolder.open(folder), list(problems or ())
     # Comparisons in the folder, the truth's first, and the run's own statistics.
-    comparisons: list[Comparison] = []
-    try:
-        comparisons = sorted(verdicts.read_comparisons(folder), key=lambda c: (c.against != "groundtruth", c.against))
-    except InputError as error:
-        problems.append(f"{error}.")
+    comparisons, damaged = verdicts.read_comparisons(folder)
+    comparisons.sort(key=lambda c: (c.against != "groundtruth", c.against))
+    problems += damaged
     try:
         comparisons.append(verdicts.compare_with_itself(record))
     except InputError as error:
         problems.append(f"{error}.")
-    verdict = verdicts.verdict_of(record, comparisons)
+    verdict = replace(verdicts.verdict_of(record, comparisons), problems=tuple(problems))
     drawn = {name for comparison in comparisons for name in comparison.pictures}
     own = {path.name for path in folder.glob("*.png")} - drawn
     ordered = [name for name in plots.FIGURES if name in own] + sorted(own - plots.FIGURES.keys())
-    try:
+    world, turned = plots.World(), ""  # where truth, path or map are damaged
+    with suppress(InputError):
         world = plots.World.of(record)
-    except InputError:
-        world = plots.World()  # the truth is damaged, which is reported as a problem
-    try:
+    with suppress(InputError):
         turned = scene(record, world)
-    except InputError:
-        turned = ""  # path or map are damaged
     # Do not repeat the sentence at the top.
     sections = [
         {
@@ -128,7 +122,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         "facts": ", ".join([record.system, *counted, *([day] if day else []), f"rbpf {record.config.get('rbpf', '')}"]),
         # The command that repeats the run; none for a system that is not on the command line.
         "command": "" if kind is None else shlex.join(command_of(record.config, *usual)),
-        "remarks": [*record.summary.get("remarks", ()), *problems],
+        "remarks": [*record.summary.get("remarks", ()), *verdict.problems],
         "on_frames": record.summary.get("problems", ()),
         "sections": [each for each in sections if any(each.get(part) for part in each if part != "title")],
         "video": VIDEO if (folder / VIDEO).is_file() else None,
