@@ -81,10 +81,7 @@ def test_tracking_is_not_disturbed(tracked):
 
 @slow
 def test_recovers_after_a_blackout(tracked, tmp_path):
-    def dark(t, image):
-        return np.zeros_like(image) if START <= t < START + DARK else image
-
-    run = resumed(tracked, tmp_path, dark)
+    run = resumed(tracked, tmp_path, lambda t, image: image * np.uint8(not START <= t < START + DARK))
     assert run.log.lost()[START + 3 : START + DARK].all() and not run.log.lost()[START + DARK + 3 :].any()
     assert len(np.flatnonzero(run.log["relocalised"]).tolist()) == 1
     assert any("lost" in problem for problem in run.messages)
