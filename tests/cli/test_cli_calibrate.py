@@ -82,7 +82,7 @@ def damaged(folder):
     [
         (blank, "9x6", "no chessboard of 9x6 inner corners is found in 1 images"),
         (few, "10x7", "a chessboard of 9x6 corners is seen: --board counts the places where four"),
-        (few, "9x6", "found in 2 images, expected at least 5, better 15"),
+        (few, "9x6", "detected in 2 images, expected at least 5, better 15"),
         (mixed, "9x6", "9.png has 480x360 px, the images before it 640x480"),
         (damaged, "9x6", "none of its images can be read"),
         (lambda folder: None, "9x6", "expected images in it"),

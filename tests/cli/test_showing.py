@@ -29,7 +29,7 @@ from rbpf.cli.simulating import SIMULATE
         ("run laser x --seed 1e3", "rbpf: --seed takes INT, got '1e3'; `rbpf run laser --help` says more"),
         ("run range-bearing x --association foo", "'foo' for argument '--association', expected one of ("),
         ("run mono x --out", ", expected 1 values; `rbpf run mono --help` says more"),
-        ("run stereo", "rbpf: Missing from rbpf run stereo: PAIRS images of a rectified pair, or"),
+        ("run stereo", "rbpf: Missing from rbpf run stereo: PAIRS image pairs, rectified or"),
         ("plot x --format bmp", "invalid choice 'bmp' for argument '--format', expected one of ("),
         ("run --from=nothing/config.yaml", "rbpf: nothing holds no config.yaml"),
         ("run --out x --from nothing/config.yaml", "rbpf: nothing holds no config.yaml"),
