@@ -78,7 +78,7 @@ def _parse(kind: Any, arguments: list[str], before: str, description: str | None
     plain = re.sub(r"\x1b\[[\d;]*m|[│|─╭╮╰╯+]|-{3,}", "", box.getvalue()).partition("\n")[2]
     said = " ".join(re.split(r"\n\s*\n", plain)[0].split()).rstrip(".").replace(". Expected", ", expected")
     said = re.sub(r"Error parsing (\S+): no type .*\{None\}(\w+) could .*\['(.*)'\]", r"\1 takes \2, got '\3'", said)
-    said = re.sub(r"'None', |, 'None'", "", said)
+    said = re.sub(r"'None', |, 'None'", "", said).replace(" takes INT,", " takes a whole number,")
     raise InputError(f"{said}; `{before} --help` says more")
 
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def remove_results(out: Path, inputs: Iterable[Path] = ()) -> None:
     kept = {place.resolve() for path in inputs for place in (path, path / CAMERA, path.parent / CAMERA)}
     compared = [*out.glob(f"{files.COMPARISON}*.json")]
     about = [path.stem.removeprefix(files.COMPARISON) for path in compared]
-    pictures = [path for name in about for path in out.glob(f"{name}_*.p[nd][gf]")]
+    pictures = [path for name in about for path in out.glob(f"{escape(name)}_*.p[nd][gf]")]
     for path in (*(out / name for name in RESULTS), *compared, *pictures):
         if path.resolve() not in kept:
             path.unlink(missing_ok=True)

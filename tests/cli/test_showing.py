@@ -26,7 +26,7 @@ from rbpf.cli.simulating import SIMULATE
         ("export x --xyz", "`rbpf export` has no option --xyz: there are --help, --json, --format, --out"),
         ("simulate dsek --out x", "no command `rbpf simulate dsek`: did you mean desk?"),
         ("nonsense", "nonsense`: there are "),
-        ("run laser x --seed 1e3", "rbpf: --seed takes INT, got '1e3'; `rbpf run laser --help` says more"),
+        ("run laser x --seed 1e3", "rbpf: --seed takes a whole number, got '1e3'; `rbpf run laser --help` says more"),
         ("run range-bearing x --association foo", "'foo' for argument '--association', expected one of ("),
         ("run mono x --out", ", expected 1 values; `rbpf run mono --help` says more"),
         ("run stereo", "rbpf: Missing from rbpf run stereo: PAIRS image pairs, rectified or"),
