@@ -28,6 +28,7 @@ BOUNDS: dict[str, dict[str, tuple[float, float]]] = {
     },
     "mono_comes_back": {"before": (0.2, 1.0), "after": (0.0, 0.25), "wrong": NONE},
     "mono_desk": {"ratio": (0.9, 2.0), "ratio_joint": (0.9, 2.0), "nees": (0.5, 2.5), "nees_joint": (0.5, 2.0)},
+    "mono_loop": {"sub-maps": (0.001, 0.04), "batch so far": (0.001, 0.02), "batch": (0.001, 0.02)},
     "mono_video": {"frames_tracked": (20.0, 20.0), "ate_rmse_m": (0.0, 0.02)},
     "own_landmark": {"findings": NONE, "located": (25.0, 1e3), "map": (0.0, 0.5), "path": (0.0, 0.2)},
     "gps_imu": {"rmse": (0.0, 0.6), "gone": (0.0, 6.0), "nees": (0.5, 2.0), "least": (0.5, 2.0), "findings": NONE},

@@ -259,7 +259,7 @@ class FeatureSensor(Sensor):
     def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """As `start`; a full joint map puts features away, and brings back those whose names are observed."""
+        """As `start`; a full joint map puts features away."""
         started = self.start(frame, belief, observed)
         self.make_room(belief, frame.landmarks)
         return started
@@ -303,6 +303,11 @@ class FeatureSensor(Sensor):
         amiss[away] = ~(np.linalg.norm(seen - frame.z[away], axis=1) <= LINEAR * self._reach_px)
         return amiss
 
+    def bring_back(self, joint: JointMap, frame: FeatureFrame, belief: Belief) -> bool:
+        """Adds features of old sub-maps that a frame observes, at the end of the window; whether any can be added."""
+        is_old = np.isin(frame.landmarks, joint.old.ids) & ~joint.holds(frame.landmarks)
+        return joint.bring_back(frame.landmarks[is_old & ~self.amiss(belief, frame)])
+
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """Promotes features of known depth to points; initialises one for every new name."""
         if self.noise is not None:
@@ -313,9 +318,7 @@ class FeatureSensor(Sensor):
         belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
         is_new = (self.members(frame.landmarks) < 0) & ~belief.map.holds(frame.landmarks)
         if isinstance(belief.map, JointMap):
-            is_old = is_new & np.isin(frame.landmarks, belief.map.old.ids)
-            belief.map.bring_back(frame.landmarks[is_old & ~self.amiss(belief, frame)])
-            is_new &= ~is_old
+            is_new &= ~np.isin(frame.landmarks, belief.map.old.ids)
         if not is_new.any():
             return []
         new = np.flatnonzero(is_new & self.camera.inside(frame.z))

@@ -260,14 +260,20 @@ class MonoSlam(System):
             frame_of_states = self.joint.world(SE3.identity((self.filter.n,)))
             prior = replace(prior, mean=SE3.between(frame_of_states, prior.mean))
 
-        # 4. The filter's step: active search, proposal, weights, samples, landmarks; see `ImageSensor`.
+        # 4. Named features of old sub-maps return in the frame that observes them, for which the window ends.
+        if self.joint is not None and isinstance(measured, FeatureFrame):
+            expected = self.filter.expect(prior, stamp_ns)
+            if self.features.bring_back(self.joint, measured, expected):
+                self.filter.consolidate()
+
+        # 5. The filter's step: active search, proposal, weights, samples, landmarks; see `ImageSensor`.
         report = self.report = self.filter.step(measured, prior, stamp_ns)
         if isinstance(measured, Measurement):
             self.measurement = measured
             if not sensor.bad_frames:
                 self.loss.trust(self.filter, measured.image)
 
-        # 5. Report.
+        # 6. Report.
         world = world_of(self.filter)
         if self.joint is not None:
             estimate = self.joint.estimate(self.filter.particles)
@@ -286,7 +292,7 @@ class MonoSlam(System):
 
         seen = measured.features if isinstance(measured, Measurement) else frame
         assert isinstance(seen, FeatureFrame)
-        # 6. Until depths are known: batch adjustment of the frames so far, and particles drawn from it; then the joint map,
+        # 7. Until depths are known: batch adjustment of the frames so far, and particles drawn from it; then the joint map,
         # if configured. Its frame is fixed from the first frame without measurements on.
         revision: Revision | None = None
         if not self.start.over or self.hand_over.is_ahead:
@@ -318,7 +324,7 @@ class MonoSlam(System):
                 estimate = self.joint.estimate(self.filter.particles)
                 pose, cov = estimate.mean, estimate.cov
 
-        # 7. Tracking state.
+        # 8. Tracking state.
         if sensor.lost and not was_lost:
             messages.append(LOST)
         is_found = was_lost and not sensor.lost
