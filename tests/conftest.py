@@ -66,9 +66,8 @@ def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def plain_pictures() -> Iterator[None]:
-    """Pictures are painted small and without ticks and words, which takes a tenth of the time.
-    They still depend on what they show, so that runs can be compared by their bytes, and are painted once, not as vectors
-    again. Who asks for a run whose pictures are looked at does without this fixture."""
+    """Pictures are small, without ticks and words, and painted once, not as vectors again: in a tenth of the time.
+    They still depend on what they show, so that runs can be compared by bytes; it is not for pictures that are looked at."""
     with pytest.MonkeyPatch.context() as patch:
         paint_plainly(patch)
         yield

@@ -95,10 +95,15 @@ class Rows(NamedTuple):
         return np.array([row for _, *rows in sorted(found, key=lambda each: each[0]) for row in rows], dtype=np.int64)
 
     def factor(self) -> tuple[np.ndarray | slice, np.ndarray]:
-        """The `inliers`, and the Cholesky factor of their covariance."""
+        """The `inliers`, and the Cholesky factor of their covariance. Raises InputError: it is not positive definite."""
         inside = self.inliers()
         cov = self.cov[inside][:, inside]
-        return inside, gaussian.cholesky(cov) if len(cov) else cov
+        try:
+            return inside, gaussian.cholesky(cov) if len(cov) else cov
+        except InputError as error:
+            std = np.sqrt(np.abs(np.diagonal(cov)).max())
+            words = f"an observation is predicted with a standard deviation of {std:.1e}: the map diverged"
+            raise InputError(f"{words}; observe more landmarks in a step, or begin with known ones") from error
 
     def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
         """Adds to the state Jacobian that the map moves with the state, by gain (n, d) times turn (N, d, d), in place."""

@@ -295,11 +295,12 @@ def test_more_landmarks_than_a_covariance_can_hold():
 def test_what_a_joint_map_does_not_take(world):
     z, covs, one = np.zeros((1, 2)), NOISE[None], np.zeros(1, dtype=np.int64)
     group = Observations(z, covs, Relative(), ids=one)
-    first = Frame([], [NewLandmarks(z, covs, Relative(), Point(2))])
+    first = Frame([], [NewLandmarks(z, cov, Relative(), Point(2)) for cov in (covs, 1e30 * np.ones((1, 2, 2)))])
     refused = {
         "one association for all particles": replace(group, ids=np.zeros((12, 1), dtype=np.int64)),
         "update state and landmarks": replace(group, updates=frozenset({Part.STATE})),
         "has no landmark 7": replace(group, ids=one + 7),
+        "with a standard deviation of .*: the map diverged": replace(group, ids=one + 1),
     }
     for words, wrong in refused.items():
         filter_ = plane(Consolidation(1))
