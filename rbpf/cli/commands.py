@@ -28,7 +28,7 @@ class Commands:
 
         For a group, or its help, the parser lists the commands.
 
-        Raises InputError: there is no such command or option, or a value is out of its range.
+        Raises InputError: there is no such command or option, or a value is missing or out of its range.
         """
         if not arguments or arguments[0].startswith("-"):
             _parse(self._parsed(), arguments, before, self.help)
@@ -46,6 +46,9 @@ class Commands:
             if len(option) > 2 and option.startswith("--") and option not in options:
                 raise InputError(f"`{before}` has no option {option}: {_nearest(option, options)}")
         command = _parse(kind, arguments, before)
+        for name, value in vars(command).items():
+            if isinstance(value, tuple) and not value and (option := f"--{name.replace('_', '-')}") in arguments:
+                raise InputError(f"{option} is named without a value")
         try:
             for options_of in (command, *filter(is_dataclass, vars(command).values())):
                 check_ranges(options_of)
