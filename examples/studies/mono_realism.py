@@ -134,6 +134,9 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
 
     run = filter_opened(open_mono(sequence, config, known), [note])
     table = run.system.sensor.table
+    searched_for = np.flatnonzero(table.attempts)
+    dropped = np.zeros(len(table), dtype=bool)  # as they were not found; others leave the view, and a joint map
+    dropped[searched_for] = table.failing(searched_for, config.search)
     noise, contrast = np.median(looks, axis=0).tolist()
     return SearchStatistics(
         name or folder.name,
@@ -143,7 +146,7 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
         np.concatenate(found),
         config.search.min_correlation,
         table.attempts.copy(),
-        ~table.alive,
+        dropped,
         noise,
         contrast,
     )
