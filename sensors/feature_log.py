@@ -17,7 +17,7 @@ _KNOWN = {"names": integers("M", distinct=True), "positions": numbers("M", 3), "
 
 @dataclass(frozen=True)
 class FeatureFrame(RowByRow):
-    """One image: which landmarks were observed, at which pixels. The `FeatureLog` validates it."""
+    """One image: which landmarks were observed, at which pixels. The `FeatureLog` and `MonoSlam` validate it."""
 
     stamp_ns: int  #: time of the image, integer nanoseconds.
     landmarks: np.ndarray  #: (K,) int64 names, each once.
@@ -28,6 +28,10 @@ class FeatureFrame(RowByRow):
     def cov(self) -> np.ndarray:
         """(K, p, p) `cov_z`, under the name that all kinds of features share."""
         return self.cov_z
+
+    def check(self, where: str, dim: int) -> None:
+        """Raises InputError: shapes do not fit so many numbers per pixel, a number is not finite, a name occurs twice."""
+        require(where, vars(self), _FRAME, p=dim)
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class FeatureLog:
             stamp_ns: object = frame.stamp_ns
             if not isinstance(stamp_ns, Integral):
                 raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
-            require(where, vars(frame), _FRAME, p=self.camera.dim)
+            frame.check(where, self.camera.dim)
             before = self.frames[max(index - 1, 0)].stamp_ns
             if frame.stamp_ns < before:
                 order = f"at {frame.stamp_ns} ns is before the frame it follows ({before} ns)"

@@ -26,6 +26,8 @@ from rbpf.maps.rows import GAUSSIAN
 
 QUICK = 30_000_000
 """Multiplications up to which products are independent of the number of threads; beyond, BLAS is ten times as fast."""
+DIVERGED = 1e7
+"""Ratio of predicted standard deviations beyond which rounding leaves nothing of the smaller one's variance."""
 WHOLE = 128
 """Rows below which splitting a covariance into quarters does not pay."""
 TINY = float(np.finfo(float).tiny)
@@ -101,9 +103,11 @@ class Rows(NamedTuple):
         try:
             return inside, gaussian.cholesky(cov) if len(cov) else cov
         except InputError as error:
-            std = np.sqrt(np.abs(np.diagonal(cov)).max())
-            words = f"an observation is predicted with a standard deviation of {std:.1e}: the map diverged"
-            raise InputError(f"{words}; observe more landmarks in a step, or begin with known ones") from error
+            std = np.sqrt(np.abs(np.diagonal(cov)))
+            if not std.max() > DIVERGED * std.min():
+                raise
+            words = f"observations are predicted with standard deviations from {std.min():.1e} to {std.max():.1e}"
+            raise InputError(f"{words}: the map diverged; observe more landmarks in a step") from error
 
     def moving(self, gain: np.ndarray, turn: np.ndarray) -> "Rows":
         """Adds to the state Jacobian that the map moves with the state, by gain (n, d) times turn (N, d, d), in place."""

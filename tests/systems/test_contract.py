@@ -287,9 +287,7 @@ def wrong(words: str, **given: list[object]) -> list[tuple[dict[str, object], st
     return [({name: each}, words) for name, values in given.items() for each in values]
 
 
-NO_STAMPS = wrong(
-    "stamp_ns must be a whole number of nanoseconds from 0", stamp_ns=[np.nan, "x", -1, 0.5, 2**62, 10**30]
-)
+NO_STAMPS = wrong("stamp_ns must be a whole number of nanoseconds", stamp_ns=[np.nan, "x", -1, 0.5, 2**62, 10**30])
 PAST = [*wrong("time runs backwards", stamp_ns=[99]), *NO_STAMPS]
 UNSTAMPED = [*PAST, *wrong("whole number of nanoseconds", stamp_ns=[None])]
 READINGS = [
@@ -297,16 +295,16 @@ READINGS = [
     *wrong("z must be an array, got lists of different lengths", z=[[[2.0, 0.3], [3.0]]]),
     *wrong(r"z must hold numbers of shape \(K, 2\), got \((2,)?\)", z=[np.ones(2), None]),
     *wrong(r"cov_z must hold numbers of shape \(K = 3, 2, 2\), got", cov_z=[np.zeros((n, 2, 2)) for n in (2, 4)]),
-    *wrong(
-        r"landmarks must hold whole numbers of shape \(3\)", landmarks=[range(2), range(4), [0, 1, 3.5], [np.nan] * 3]
-    ),
+    *wrong(r"must hold whole numbers of shape \(3\)", landmarks=[range(2), range(4), [0, 1, 3.5], [np.nan] * 3]),
     *wrong("landmarks must hold whole numbers from 0 to", landmarks=[[0, 1, -6], [0, 1, 2**62]]),
     *wrong(r"delta must hold numbers of shape \(3\), got", delta=[np.zeros(2), "left"]),
 ]
+FEATURES = wrong("frame at .* ns: ", z=[np.full((20, 2), np.nan)], cov_z=[-np.ones((20, 2, 2))], landmarks=[[1] * 20])
 REFUSED = {
     "images": (lambda: mono(KNOWN), lambda: sequence(5).frames(), UNSTAMPED),
     "images, waiting": (lambda: mono(KNOWN), lambda: sequence(4, lambda t, i: i if t > 1 else None).frames(), PAST),
     "pairs": (stereo, lambda: pairs(5).frames(), UNSTAMPED),
+    "features": (lambda: MonoSlam(LOG.camera, SMALL, LOG.known), lambda: LOG.frames[:9], [*UNSTAMPED, *FEATURES]),
     "robot, joint map": (sure, readings, [*PAST, *READINGS]),
     "robot, own maps": (lambda: sure(map="particles"), readings, READINGS),
 }

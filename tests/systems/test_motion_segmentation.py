@@ -8,15 +8,8 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VoConfig, candidate_motions
-from rbpf.systems.stereo.motion_segmentation import (
-    CHANGES,
-    MISTAKEN,
-    MOVING,
-    STATIC,
-    UNKNOWN,
-    camera_motion,
-    contradicts,
-)
+from rbpf.systems.stereo import motion_segmentation
+from rbpf.systems.stereo.motion_segmentation import CHANGES, MISTAKEN, MOVING, STATIC, UNKNOWN, camera_motion
 from tests.motion.stereo_pairs import LEAP, ROOM, joined, simulate
 
 PRIOR = Odometry(SE3.identity(), np.diag(np.repeat(0.1**2, 6)))
@@ -83,11 +76,11 @@ def test_the_past_is_no_proof():
 
 def test_when_a_single_motion_is_doubted():
     agree = np.array([1, 1, 1, 1, 0, 0, 0], dtype=bool)
-    assert not contradicts(agree[:0], np.zeros(0), False)
-    assert not contradicts(agree, np.array([1, 1, 1, 0, 1, 0, 0]), False)
-    assert contradicts(agree, np.array([1, 0, 0, 0, 1, 1, 0]), False)
-    assert contradicts(agree, np.array([-1, -1, 0, 0, 0, 0, 0]), False)
-    assert contradicts(agree, np.zeros(7), hidden=True)
+    assert not motion_segmentation.contradicts(agree[:0], np.zeros(0), False)
+    assert not motion_segmentation.contradicts(agree, np.array([1, 1, 1, 0, 1, 0, 0]), False)
+    assert motion_segmentation.contradicts(agree, np.array([1, 0, 0, 0, 1, 1, 0]), False)
+    assert motion_segmentation.contradicts(agree, np.array([-1, -1, 0, 0, 0, 0, 0]), False)
+    assert motion_segmentation.contradicts(agree, np.zeros(7), hidden=True)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -305,8 +305,8 @@ class FeatureSensor(Sensor):
 
     def bring_back(self, joint: JointMap, frame: FeatureFrame, belief: Belief) -> bool:
         """Adds features of old sub-maps that a frame observes, at the end of the window; whether any can be added."""
-        is_old = np.isin(frame.landmarks, joint.old.ids) & ~joint.holds(frame.landmarks)
-        return joint.bring_back(frame.landmarks[is_old & ~self.amiss(belief, frame)])
+        known = joint.holds(frame.landmarks) | np.isin(frame.landmarks, joint.old.ids)
+        return joint.bring_back(frame.landmarks[known & self.camera.inside(frame.z) & ~self.amiss(belief, frame)])
 
     def start(self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """Promotes features of known depth to points; initialises one for every new name."""

@@ -88,7 +88,7 @@ class MonoSlam(System):
         detector: detects corners for new features and for relocalisation; by default FAST corners with the Shi-Tomasi score.
         descriptor: descriptor for relocalisation; by default SIFT.
         wrapped: wraps the sensor of named features, to change its observations or new landmarks. Adjustments of the first
-            frames use the original features, and only a joint map starts from one.
+            frames, and returns of old landmarks, use the original features; only a joint map starts from one.
 
     Raises InputError: known points do not determine the camera, or the map is of another camera.
     """
@@ -213,6 +213,7 @@ class MonoSlam(System):
             raise InputError("a run takes images or named features, not both")
         measured: Measurement | FeatureFrame
         if isinstance(frame, FeatureFrame):
+            frame.check(f"the frame at {stamp_ns} ns", self.camera.dim)
             if (frame.landmarks < 0).any():
                 raise InputError("a landmark has a negative name, number the landmarks from 0 on")
             measured, is_empty = frame, frame.landmarks.size == 0
@@ -260,9 +261,9 @@ class MonoSlam(System):
             frame_of_states = self.joint.world(SE3.identity((self.filter.n,)))
             prior = replace(prior, mean=SE3.between(frame_of_states, prior.mean))
 
-        # 4. Named features of old sub-maps return in the frame that observes them, for which the window ends.
-        if self.joint is not None and isinstance(measured, FeatureFrame):
-            expected = self.filter.expect(prior, stamp_ns)
+        # 4. Named features of old sub-maps return before the frame that observes them, which ends the window.
+        if self.joint is not None and self.joint.old.maps and isinstance(measured, FeatureFrame):
+            expected = self.filter.expect(stamp_ns=stamp_ns)
             if self.features.bring_back(self.joint, measured, expected):
                 self.filter.consolidate()
 
