@@ -17,7 +17,7 @@ _KNOWN = {"names": integers("M", distinct=True), "positions": numbers("M", 3), "
 
 @dataclass(frozen=True)
 class FeatureFrame(RowByRow):
-    """One image: which landmarks were observed, at which pixels. The `FeatureLog` and `MonoSlam` validate it."""
+    """One image: which landmarks were observed, at which pixels. A `FeatureLog` and the systems validate it."""
 
     stamp_ns: int  #: time of the image, integer nanoseconds.
     landmarks: np.ndarray  #: (K,) int64 names, each once.
@@ -29,9 +29,9 @@ class FeatureFrame(RowByRow):
         """(K, p, p) `cov_z`, under the name that all kinds of features share."""
         return self.cov_z
 
-    def check(self, where: str, dim: int) -> None:
+    def check(self, dim: int, where: str = "") -> None:
         """Raises InputError: shapes do not fit so many numbers per pixel, a number is not finite, a name occurs twice."""
-        require(where, vars(self), _FRAME, p=dim)
+        require(where or f"the frame at {self.stamp_ns} ns", vars(self), _FRAME, p=dim)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class FeatureLog:
             stamp_ns: object = frame.stamp_ns
             if not isinstance(stamp_ns, Integral):
                 raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
-            frame.check(where, self.camera.dim)
+            frame.check(self.camera.dim, where)
             before = self.frames[max(index - 1, 0)].stamp_ns
             if frame.stamp_ns < before:
                 order = f"at {frame.stamp_ns} ns is before the frame it follows ({before} ns)"

@@ -135,9 +135,8 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
     run = filter_opened(open_mono(sequence, config, known), [note])
     table = run.system.sensor.table
     searched_for = np.flatnonzero(table.attempts)
-    dropped = np.zeros(
-        len(table), dtype=bool
-    )  # for failing; those that left the view or the present sub-map are censored
+    # Dropped for failing; those that left the view or the present sub-map are censored.
+    dropped = np.zeros(len(table), dtype=bool)
     dropped[searched_for] = table.failing(searched_for, config.search)
     noise, contrast = np.median(looks, axis=0).tolist()
     return SearchStatistics(

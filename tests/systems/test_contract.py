@@ -305,6 +305,7 @@ REFUSED = {
     "images, waiting": (lambda: mono(KNOWN), lambda: sequence(4, lambda t, i: i if t > 1 else None).frames(), PAST),
     "pairs": (stereo, lambda: pairs(5).frames(), UNSTAMPED),
     "features": (lambda: MonoSlam(LOG.camera, SMALL, LOG.known), lambda: LOG.frames[:9], [*UNSTAMPED, *FEATURES]),
+    "features of pairs": (named_pairs, lambda: PIXELS.frames[:9], [*UNSTAMPED, *FEATURES]),
     "robot, joint map": (sure, readings, [*PAST, *READINGS]),
     "robot, own maps": (lambda: sure(map="particles"), readings, READINGS),
 }

@@ -213,7 +213,7 @@ class MonoSlam(System):
             raise InputError("a run takes images or named features, not both")
         measured: Measurement | FeatureFrame
         if isinstance(frame, FeatureFrame):
-            frame.check(f"the frame at {stamp_ns} ns", self.camera.dim)
+            frame.check(self.camera.dim)
             if (frame.landmarks < 0).any():
                 raise InputError("a landmark has a negative name, number the landmarks from 0 on")
             measured, is_empty = frame, frame.landmarks.size == 0

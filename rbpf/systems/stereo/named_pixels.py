@@ -89,6 +89,7 @@ class NamedFrontEnd(FrontEnd[FeatureFrame]):
         self._offset_px = 0.0
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[FeatureFrame], str]:
+        frame.check(self.rig.dim)
         calibrated = replace(frame, z=frame.z - [0.0, 0.0, self._offset_px])
         return self.pair(self.ns_per_stamp * frame.stamp_ns, calibrated), ""
 
